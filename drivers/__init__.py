@@ -1,4 +1,4 @@
-"""Devices of splatline: their Protocols, and the drivers of real devices."""
+"""Device drivers of splatline, and the Protocols (interfaces) of all devices."""
 
 from pkgutil import extend_path
 

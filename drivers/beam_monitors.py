@@ -129,10 +129,10 @@ class PageSource:
                 while len(data) < MOST_BYTES and (piece := getattr(page, "read1", page.read)(_PIECE)):
                     data += piece
                     if self._clock.now() > deadline:
-                        raise TimeoutError("the page does not end")
+                        raise TimeoutError("the page is longer than a page of a beam monitor can be")
         except urllib.error.HTTPError as error:
             error.close()
-            raise self._error(DeviceError, f"the server answers {error.code} {error.reason}") from error
+            raise self._error(DeviceError, f"the server answered {error.code} {error.reason}") from error
         except TimeoutError as error:
             raise self._error(DeviceTimeout, f"no whole page within {self._timeout:g} s") from error
         except urllib.error.URLError as error:
@@ -165,7 +165,11 @@ def url_problem(url: str) -> str:
         legal = parts.scheme == "file" or (parts.scheme in ("http", "https") and bool(parts.hostname))
     except ValueError:
         legal = False
-    return "" if legal else f"{url!r} is not the address of a page: http://host/..., https://host/... or file:///..."
+    return (
+        ""
+        if legal
+        else f"{url!r} is not the address of a page; expected http://host/..., https://host/... or file:///..."
+    )
 
 
 OVERFLOW = 9.9e37
@@ -223,7 +227,7 @@ class TextBeamMonitor:
         match = self._pattern.search(text)
         number = "" if match is None else match[1] or ""
         if not _NUMBER.fullmatch(number):
-            raise self._error("the answer holds no number", text)
+            raise self._error("the answer contains no number", text)
         value = float(number)
         if abs(value) >= OVERFLOW:
             raise self._error("the instrument is over range, or has no valid reading", text)
@@ -238,7 +242,7 @@ class TextBeamMonitor:
             problem,
             request=self._source.request,
             reply=text[:_SHOWN].strip(),
-            expected=f"a number where {self._pattern.pattern!r} has its group",
+            expected=f"a number in the group of {self._pattern.pattern!r}",
             advice="Check the instrument's range and state, and the pattern in the configuration",
         )
 

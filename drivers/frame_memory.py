@@ -1,4 +1,6 @@
-"""FrameMemory: reused memory of frames. New memory for each frame would cost more than copying its pixels."""
+"""FrameMemory: memory for frames that is used again, because new memory for each frame would cost more time than
+copying its pixels.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Devices that move in the beam by others: a stage with named places, a shutter on an output, and manual devices."""
+"""Devices that move in the beam by means of another device: a stage with named positions, a shutter on a digital
+output; and devices moved by hand.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ class StagePlaces:
 
     places: Mapping[str, float]
     speed: float
-    failed: str = "the filter did not come to"
+    failed: str = "the filter did not move to"
 
 
 class PlacedStage:
@@ -51,7 +53,7 @@ class PlacedStage:
         return next((name for name in self._places.places if self._is_at(name)), None)
 
     def put(self, place: str, beside: float = 0.0) -> None:
-        """Move to a place, or `beside` radians beside it. Raises DeviceError if the stage did not arrive."""
+        """Move to a place, or `beside` radians next to it. Raises DeviceError if the stage did not arrive."""
         stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
         try:
             if self._stands_at(target):
@@ -68,7 +70,7 @@ class PlacedStage:
                 raise
             stage.wait(POLL)
         except DeviceError as cause:
-            advice = cause.advice or "Look where it is before the next scan"
+            advice = cause.advice or "Check its position before the next scan"
             problem = f"{self._places.failed} {place}: {cause.device}: {cause.problem}"
             raise cause.told_by(self.name, problem, advice=advice) from cause
 
@@ -81,7 +83,7 @@ class PlacedStage:
                 return ""
             now, place = self._stage.position(), self.place()
             named = f" ({place})" if place else ""
-            return f"it stood at {math.degrees(before):.4f} deg, and is at {math.degrees(now):.4f} deg{named}"
+            return f"it was at {math.degrees(before):.4f} deg, and is now at {math.degrees(now):.4f} deg{named}"
 
         return moved
 
@@ -116,7 +118,7 @@ class StageSampleMover:
         self._motor.put(INSIDE, aside * self._rad_per_mm if aside else 0.0)
 
 
-NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
 
 
 class OutputShutter:
@@ -155,7 +157,7 @@ class OutputShutter:
         self._put(False)
 
     def is_open(self) -> bool:
-        """Whether the output holds the open level; without read-back, whether `open` was the last command sent.
+        """True if the output holds the open level; without read-back, whether `open` was the last command sent.
 
         False before the first command. Raises DeviceError.
         """
@@ -184,7 +186,7 @@ class OutputShutter:
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
-                f"{self._output.name} is not at the level that was set",
+                f"{self._output.name} does not have the level that was set",
                 request="high" if level else "low",
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",
@@ -253,8 +255,8 @@ class ManualSampleMover(_Manual):
 
     def back(self, aside: float = 0.0) -> None:
         if aside:
-            advice = "Name a stage that moves it (devices.sample_mover)."
-            raise DeviceError("sample mover", f"nobody moves it by hand {aside:g} mm aside", advice=advice)
+            advice = "Configure a stage that moves it (devices.sample_mover)."
+            raise DeviceError("sample mover", f"it cannot be moved {aside:g} mm sideways by hand", advice=advice)
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 

@@ -1,9 +1,10 @@
-"""ORCA-Quest: limits of settings and timing by the data sheet, for planning without a camera, and its options.
+"""ORCA-Quest: limits of its settings and its timing from the data sheet, for planning without a camera, and its
+options.
 
 C15550-20UP (ORCA-Quest): limits and line times from the vendor's property table. C15550-22UP (ORCA-Quest 2) has the
-same sensor. Its line time in ultra quiet follows from 25.4 full frames a second. No public source states that of photon
-number resolving; the same is assumed. The values of a connected camera take precedence. Two rows are read together
-in one line time, so row r starts r / 2 line times after row 0.
+same sensor. Its line time in ultra quiet follows from 25.4 full frames per second. No public source states that of
+photon number resolving; the same is assumed. The values of a connected camera take precedence. Two rows are read
+together in one line time, so row r starts r / 2 line times after row 0.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class LightPath:
             ("transmission", 1e-6, 1.0), ("wavelength_nm", QE_NM[0], QE_NM[-1]),
         ):  # fmt: skip
             if not low <= (value := getattr(self, name)) <= high:
-                raise ValueError(f"{name} lies in {low:g} ... {high:g}, got {value:g}")
+                raise ValueError(f"{name} must be {low:g} ... {high:g}, got {value:g}")
 
     @property
     def collected(self) -> float:
@@ -100,16 +101,16 @@ def refusal(settings: CameraSettings, model: str = MODEL) -> str:
     if settings.readout not in LINE_TIME:
         return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:
-        return f"binning {settings.binning} is not offered; legal: {', '.join(map(str, BINNINGS))}"
+        return f"binning {settings.binning} does not exist; legal: {', '.join(map(str, BINNINGS))}"
     shortest = LINE_TIMES[model][settings.readout]
     if not shortest <= settings.exposure <= MAX_EXPOSURE:
-        return f"exposure {settings.exposure:g} s lies outside {shortest:g} ... {MAX_EXPOSURE:g} s ({settings.readout})"
+        return f"exposure {settings.exposure:g} s is outside {shortest:g} ... {MAX_EXPOSURE:g} s ({settings.readout})"
     row0, col0, rows, cols = settings.roi or (0, 0, *SENSOR_SHAPE)
     if any(value % ROI_STEP for value in (row0, col0, rows, cols)):
         return f"roi {[row0, col0, rows, cols]} must be in steps of {ROI_STEP} pixels"
     if not (0 <= row0 < row0 + rows <= SENSOR_SHAPE[0] and 0 <= col0 < col0 + cols <= SENSOR_SHAPE[1]):
         return (
-            f"roi {[row0, col0, rows, cols]} (row0, col0, rows, cols) does not lie on the sensor of "
+            f"roi {[row0, col0, rows, cols]} (row0, col0, rows, cols) extends beyond the sensor of "
             f"{SENSOR_SHAPE[0]} x {SENSOR_SHAPE[1]}"
         )
     return ""
@@ -198,30 +199,40 @@ class DcamOptions(CheckedSettings):
 
     trigger_active: TriggerActive = setting(
         TriggerActive.EDGE,
-        "edge: a pulse begins an exposure of exposure_s. level: the pulse's length is the exposure; set exposure_s to "
-        "it. sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan "
-        "takes.",
+        "edge: a pulse starts an exposure of exposure_s. level: the exposure lasts as long as the pulse; "
+        "set exposure_s to that. sync_readout: a pulse ends an exposure and starts the next; n pulses "
+        "give n - 1 frames, so fly scans do not allow it.",
     )
     trigger_mode: TriggerMode = setting(
-        TriggerMode.NORMAL, "start: the first pulse begins a free run, which no fly scan takes."
+        TriggerMode.NORMAL, "start: the first pulse starts a free run, so fly scans do not allow it."
     )
     trigger_polarity: TriggerPolarity = setting(
         TriggerPolarity.POSITIVE,
-        "The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here.",
+        "Edge of the trigger pulse that starts an exposure. A camera that was just switched on uses "
+        "negative; the driver sets the value given here.",
     )
-    trigger_times: int = setting(1, "Every so many pulses make one frame; a fly scan takes 1.", ge=1, le=10_000)
+    trigger_times: int = setting(1, "Number of pulses per frame; a fly scan needs 1.", ge=1, le=10_000)
     trigger_delay: float = setting(
-        0.0, "From a pulse to the exposure; the angle in the file stays that of the pulse.", unit="s", ge=0, le=10
+        0.0,
+        "Delay from a pulse to the exposure; the angle in the file remains that of the pulse.",
+        unit="s",
+        ge=0,
+        le=10,
     )
     global_exposure: GlobalExposure = setting(
         GlobalExposure.DELAYED,
-        "delayed: rolling shutter. global_reset: all rows begin at once, later rows expose longer unless light is cut.",
+        "delayed: rolling shutter. global_reset: all rows start together, and later rows are exposed "
+        "longer unless the beam is cut off.",
     )
     hot_pixels: HotPixelMode | None = setting(
         None,
-        "null: counts as measured; else the camera repairs defects with this sensitivity, which alters data.",
+        "null: counts as measured. Otherwise the camera repairs defects with this sensitivity, which alters data.",
     )
     exposure_tolerance: float = setting(
-        0.01, "By which fraction (and one line time) the camera may change an exposure before it is refused.", ge=0
+        0.01,
+        "By what fraction (and one line time) the camera may change an exposure before the driver stops with an error.",
+        ge=0,
     )
-    ring: int = setting(1000, "Most memory for the ring; a full frame has 18.9 MB.", unit="mb", gt=0, le=1_000_000)
+    ring: int = setting(
+        1000, "Memory limit of the ring buffer; a full frame has 18.9 MB.", unit="mb", gt=0, le=1_000_000
+    )

@@ -1,4 +1,4 @@
-"""The clock of tests: the same number of steps on any machine."""
+"""A clock for tests: it counts steps, so that it is the same on any machine."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class SteppedClock:
-    """Time (s) that passes when somebody sleeps, and by a tick with each look at it; what is `due` by then happens.
+    """A time in s that advances with each sleep, and by a tick each time it is read; events that are `due` then happen.
 
     It is a `drivers.base.clock.Clock`, and is called as `time.perf_counter` is.
     """
@@ -32,7 +32,7 @@ class SteppedClock:
 
 
 def wait_until(done: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait in real time for another thread or process; it must be done within so many s."""
+    """Wait in real time for another thread or process; fails if it takes longer than `seconds`."""
     end = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < end

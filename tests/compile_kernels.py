@@ -1,7 +1,7 @@
 """Compile the kernels that most tests use, in two processes at once: python -m tests.compile_kernels fits | rest.
 
-With an empty cache every worker of pytest-xdist would compile the same kernels at the same time; the halves share few.
-With a full one it takes some seconds.
+Without this, every worker of pytest-xdist would compile the same kernels at the same time if the cache is empty. The
+two halves share few kernels. With a full cache it takes some seconds.
 """
 
 import sys

@@ -1,8 +1,9 @@
 """python -m tests.compiled_kernels [CHECKOUT ...]: compiles the kernels for every level, and packs them.
 
-Which kernels, and for which types, is taken from the archive, and from what numba has compiled for this checkout and
-for others that are named: after the tests, all that they call. So a kernel that is edited or new is compiled here for
-all levels, and everything else keeps its bytes. No kernel runs, so the machine need not have a level's instructions.
+The list of kernels and types comes from the archive, and from what numba has compiled in this checkout and in others
+that are named. After the tests have run, this is everything that they call. An edited or new kernel is compiled here
+for all levels; all others keep their bytes. No kernel is run, so the machine need not support the instructions of a
+level.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main() -> int:
         return 2
     for level in LEVELS:
         begin = time.perf_counter()
-        # numba before recon: the level holds although this processor may have another
+        # import numba before recon, so that this level is used although the processor may have another one
         run = "import numba, sys; from tests.compiled_kernels import compile_for; compile_for(sys.argv[1:])"
         words = [sys.executable, "-c", run, *(str(Path(checkout).resolve()) for checkout in sys.argv[1:])]
         done = subprocess.run(words, cwd=ROOT, env=os.environ | level.environment, check=False)
@@ -69,7 +70,7 @@ def main() -> int:
 
 
 def compile_for(checkouts: Sequence[str]) -> None:
-    """Compile every kernel for the types that it is known with; what does not compile any more is left out."""
+    """Compile every kernel for its known types; types with which it no longer compiles are left out."""
     import numba
     from numba.core.dispatcher import Dispatcher
 
@@ -91,7 +92,7 @@ def compile_for(checkouts: Sequence[str]) -> None:
 
 
 def _modules(root: Path) -> list[str]:
-    """Modules beside whose source numba has compiled something."""
+    """Modules for which numba has stored compiled code next to the source."""
     modules = set()
     for package in PACKAGES:
         for index in (root / package).rglob("__pycache__/*.nbi"):
@@ -102,7 +103,7 @@ def _modules(root: Path) -> list[str]:
 
 
 def _compiled_here(module: str, root: Path) -> dict[str, bytes]:
-    """What numba has compiled for the kernels of a module and keeps beside it, by name."""
+    """The files, by name, that numba has stored next to a module for its kernels."""
     source = root.joinpath(*module.split("."))
     found = {}
     for path in (source.parent / "__pycache__").glob(f"{source.name}.*.{_tag()}.*nb[ic]"):
@@ -116,14 +117,14 @@ def _tag() -> str:
 
 
 def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
-    """Types that kernels were compiled for, by module and name."""
+    """The types for which kernels were compiled, by module and name."""
     signatures = defaultdict[tuple[str, str], set[Any]](set)
     members = [(name, member(ARCHIVE, name)) for name in (read_sources(ARCHIVE) if ARCHIVE.is_file() else ())]
     members += [(name, _compiled_here(name, root)) for root in roots for name in _modules(root)]
     packed = [(module, *each) for module, files in members for each in files.items() if each[0].endswith(".nbi")]
     for module, name, content in packed:
         try:
-            importlib.import_module(module)  # its types
+            importlib.import_module(module)  # unpickling the types needs the module
             _, index = _read(content)
         except (ImportError, AttributeError):  # a module or a type has another name now
             continue
@@ -145,10 +146,10 @@ def _read(content: bytes) -> tuple[Any, Index]:
 
 
 def _packed(module: str, carried: Mapping[str, bytes]) -> dict[str, bytes]:
-    """The cache's files for the kernels of a module: what was compiled for a level, from the source as it is now.
+    """The cache files for the kernels of a module that were compiled for a level from the present source.
 
     Args:
-        carried: those in the archive that are still right; their bytes stay where nothing was added.
+        carried: files in the archive that are still valid; they stay unchanged if nothing was added.
     """
     from numba import __version__
     from numba.core.serialize import dumps

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from recon.compiled import ROOT  # before numba: it says what processor numba compiles for
+from recon.compiled import ROOT  # before numba, because it sets the processor for which numba compiles
 
 # isort: split
 import numba
@@ -27,7 +27,7 @@ from recon.compiled.archive import ARCHIVE, PYTHONS, fresh_members, read_sources
 from tests.features import folders, table
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
-# No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
+# No deadline, because a busy machine sometimes makes an example slow, which is not an error of the code.
 # The default draws the same examples in every run, so that the gate's verdict repeats; the other profiles explore.
 settings.register_profile("few", deadline=None, derandomize=True, max_examples=25)
 settings.register_profile("explore", deadline=None, print_blob=True)
@@ -35,35 +35,35 @@ settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True
 settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
-# The suite starts some hundred processes, and rewrites the asserts of 600 files: from bytecode both take half the time.
+# The suite starts some hundred processes and rewrites the asserts of 600 files; with bytecode both take half the time.
 # Containers often ask for none.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# What stages of tests were found with is kept in a folder of their own, also by the processes that they start.
+# The settings that stage drivers find are stored in a separate folder for tests and the processes that they start.
 _STATE = TemporaryDirectory(prefix="splatline-state-", ignore_cleanup_errors=True)
 os.environ["XDG_STATE_HOME"] = os.environ["LOCALAPPDATA"] = _STATE.name
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work, and
-    threads of OpenBLAS burn the time of a core while they wait.
+    """Give each worker one thread, and restore SIGINT.
 
-    SIGINT is as at a terminal, here and in the processes that tests start: where a script or a CI starts pytest in the
-    background it is ignored, which commands respect.
+    Workers share the cores. Tiny fits would wait for a second thread longer than they work, and waiting threads of
+    OpenBLAS would use a core. SIGINT works as in a terminal, here and in the processes that tests start. If a script or
+    a CI starts pytest in the background, SIGINT is ignored, and commands would respect that.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     config.addinivalue_line("markers", "feature: of a feature's folder, see [tool.splatline.features]")
-    # `pytest` alone runs the core's tests; a path, or another -m, runs what it names. The environment tells workers.
+    # `pytest` alone runs the tests of the core; a path or another -m runs what it names. Workers read the environment.
     if not hasattr(config, "workerinput"):
         alone = config.args_source is pytest.Config.ArgsSource.TESTPATHS and "not slow" in config.option.markexpr
         os.environ["SPLATLINE_CORE_ONLY"] = "1" if alone else ""
     if getattr(config.option, "numprocesses", None):
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # workers, which begin later, and their processes have it
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for workers, which start later, and their processes
     if hasattr(config, "workerinput"):
         numba.set_num_threads(max(1, numba.get_num_threads() // config.workerinput["workercount"]))
-        import torch  # here, as tests without it start in half the time
+        import torch  # imported here, because tests without torch start in half the time
 
         torch.set_num_threads(1)
 
@@ -76,15 +76,17 @@ def _is_of_a_feature(path: Path) -> bool:
     return not _FEATURES.isdisjoint((path, *path.parents))
 
 
-# Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of
-# one process writes them. Only their order matters, so that they need not be those of this machine.
+# Processor seconds of the quick tests in each file that takes a second or more, as written by
+# `SPLATLINE_DURATIONS=FILE pytest` in one process. Only their order matters, so another machine's values will do.
 _DURATIONS = Path(__file__).parent / "durations.json"
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the tests of features, which mirror their folders; workers take the longest files first, so that they end
-    together."""
+    """Mark the tests of features (their folders mirror those of the features), and sort the longest files first.
+
+    With the longest files first, all workers end at about the same time.
+    """
     for item in items:
         if _is_of_a_feature(item.path):
             item.add_marker("feature")
@@ -115,19 +117,19 @@ def pytest_sessionfinish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """The tests of a file go to one worker, which alone makes its fixtures and compiles its kernels.
+    """Send all tests of a file to one worker, so that only this worker makes its fixtures and compiles its kernels.
 
-    Not the slow ones: few files have most of their time.
+    Slow tests are not kept together, because a few files take most of their time.
     """
     from xdist.scheduler import LoadFileScheduling
 
-    config.option.loadscopereorder = False  # by the number of tests, which says nothing of their time
+    config.option.loadscopereorder = False  # it would sort by the number of tests, which says nothing about their time
     by_file = config.option.dist == "load" and "not slow" in config.option.markexpr
     return LoadFileScheduling(config, log) if by_file else None
 
 
 def _kernels_are_carried() -> bool:
-    """All of these sources, compiled for this processor: nothing is left to compile."""
+    """Whether the archive contains compiled code of all these sources for this processor."""
     if (
         not ARCHIVE.is_file()
         or sys.version_info[:2] not in PYTHONS
@@ -138,7 +140,7 @@ def _kernels_are_carried() -> bool:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Before workers run the whole suite: kernels are compiled once, not by each of them (see compile_kernels)."""
+    """Compile the kernels once before the workers start, instead of in each worker (see compile_kernels)."""
     config = session.config
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     if getattr(config.option, "numprocesses", None) and whole and not _kernels_are_carried():
@@ -155,9 +157,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Of the whole suite, files without a test of the kind that is asked for are not imported, as most of the time of
-    collecting is imports: measurements; features, where only the core is tested; files that name no slow test, where
-    these and features are asked for."""
+    """Do not import files without a test of the requested kind, because imports take most of the collection time.
+
+    In a run of the whole suite, these are: measurements; features, if only the core is tested; and files without a slow
+    test, if slow tests and features are requested.
+    """
     if [Path(argument).name for argument in config.args] != ["tests"]:
         return None
     asked = config.option.markexpr
@@ -171,28 +175,28 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if of_a_feature and "slow or feature" in asked:
         return None
     text = collection_path.read_text(encoding="utf-8")
-    return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
+    return None if "slow" in text or "Conformance" in text else True  # a conformance suite contains slow tests
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection(session: pytest.Session) -> None:
-    """A tenth of the time of collecting went into looking for garbage."""
-    if not getattr(session.config.option, "numprocesses", None):  # workers collect, not who leads them
+    """Turn the garbage collector off during collection, where it took a tenth of the time."""
+    if not getattr(session.config.option, "numprocesses", None):  # the workers collect, not the main process
         gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """What is loaded now lives to the end: the garbage collector need not look through it time and again."""
+    """Exclude everything loaded so far from garbage collection, because it lives until the end."""
     gc.freeze()
     gc.enable()
 
 
-# Not in processes that tests start, some of which run tests of another folder.
+# Not in processes that tests start, because some of them run tests of another folder.
 _SKIPPED = os.environ.pop("SPLATLINE_SKIPPED", None) if "PYTEST_XDIST_WORKER" in os.environ else None
 
 
 def _note_skipped(report: pytest.CollectReport | pytest.TestReport) -> None:
-    """The gate runs what a worker skipped again, with all extras: it names a file for that in SPLATLINE_SKIPPED."""
+    """Record skipped tests in the file SPLATLINE_SKIPPED, because the gate runs them again with all extras."""
     if _SKIPPED and report.skipped and not hasattr(report, "wasxfail"):
         with Path(_SKIPPED).open("a", encoding="utf-8") as file:
             file.write(report.nodeid + "\n")
@@ -206,14 +210,15 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """A generator with a fixed seed: a failing test fails again."""
+    """A random generator with a fixed seed, so that a failing test fails again."""
     return np.random.default_rng(20261120)
 
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Tiny fits on one thread: on a busy machine, waiting for a second one takes ten times as long as the work."""
-    import torch  # here: most tests need none
+    """Run tiny fits on one thread: on a busy machine, waiting for a second thread takes ten times as long as the
+    work."""
+    import torch  # imported here, because most tests do not need it
 
     before = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(1)
@@ -225,7 +230,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def shared_data() -> Path:
-    """Folder of real scans beside the checkout; tests that need it skip where it is absent."""
+    """Folder of real scans next to the checkout; tests that need it are skipped if it is absent."""
     if not SHARED_DATA.is_dir():
-        pytest.skip("real scans are not beside this checkout (../shared/data)")
+        pytest.skip("there are no real scans next to this checkout (../shared/data)")
     return SHARED_DATA

@@ -1,5 +1,7 @@
-"""Extensions of each kind: files, lines of registries, and a program that proves that it works. But for the stage they
-are those of the site's package (tests/site), each in the place of one of ours."""
+"""Dummy extensions of each kind: their files, registry lines, and a program that proves that they work.
+
+Except for the stage, they are those of the site package (tests/site), each in the place of one of ours.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,9 +15,9 @@ class Extension:
     """An extension.
 
     Attributes:
-        files: its own, by path.
-        lines: the registries: path, the line above, and the line that is added.
-        proof: a program that ends without an error only where the dummy works.
+        files: its files, by path.
+        lines: additions to registries: path, the line above, and the new line.
+        proof: a program that ends without an error only if the dummy works.
     """
 
     files: Mapping[str, str]

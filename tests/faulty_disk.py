@@ -1,8 +1,8 @@
-"""A disk that fails at the n-th write: a program is run under a small library (Linux; needs a C compiler, `cc`).
+"""A disk that fails at the n-th write: runs a program with a small preloaded library (Linux; needs `cc`).
 
-It counts the calls that change files whose path contains a text (write, pwrite, writev, fwrite, sendfile,
-copy_file_range, ftruncate, posix_fallocate, fsync, msync, rename, unlink), in the program and in those that it starts.
-What goes through a memory map is not seen but for its msync. Writes are counted from 1.
+It counts the calls that change files whose path contains a given text (write, pwrite, writev, fwrite, sendfile,
+copy_file_range, ftruncate, posix_fallocate, fsync, msync, rename, unlink), in the program and in its child processes.
+Writes through a memory map are not counted, except msync. Writes are counted from 1.
 
     n = faulty_disk.writes([python, "-c", code], "scan.h5")
     done = faulty_disk.run([python, "-c", code], "scan.h5", kill_at=n - 3)          # the write does not happen
@@ -29,12 +29,12 @@ needed = pytest.mark.skipif(
     not sys.platform.startswith("linux") or shutil.which("cc") is None,
     reason="a disk that fails needs Linux and a C compiler (cc)",
 )
-"""Mark of the tests that use this module."""
+"""Marker for the tests that use this module."""
 
 
 @functools.cache
 def library() -> Path:
-    """The compiled library; made once in this process."""
+    """The library, compiled once per process."""
     folder = Path(tempfile.mkdtemp(prefix="faulty_disk_"))
     made = folder / "faulty_disk.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-w", "-o", made, _SOURCE, "-ldl"], check=True, timeout=120)
@@ -52,32 +52,35 @@ def run(
     torn: bool = False,
     **options: Any,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program to its end, with one fault of its disk; 0: none of that kind.
+    """Run a program to its end with one disk fault; a value of 0 means no fault of that kind.
 
     Args:
         path_pattern: text in the paths of the files that are watched.
-        kill_at: the process is killed (SIGKILL) in place of this write.
+        kill_at: the process is killed (SIGKILL) instead of this write.
         fail_from: this write and all after it fail with `errno`.
-        fail_at: only this one does.
+        fail_at: only this write fails.
         torn: half of the first of these writes reaches the file.
-        options: of subprocess.run; `env` is added to.
+        options: options for subprocess.run; variables are added to `env`.
 
     Returns:
-        what subprocess.run returns, with the output as text.
+        The result of subprocess.run, with the output as text.
     """
     return _run(command, path_pattern, (kill_at, fail_from, fail_at, errno, torn), options)[0]
 
 
 def writes(command: Sequence[str | Path], path_pattern: str, **options: Any) -> int:
-    """How many writes a program makes without a fault; it must end well."""
+    """Number of writes that a program makes without a fault; it must end without an error."""
     done, n = _run(command, path_pattern, (0, 0, 0, 0, False), options)
     assert done.returncode == 0, done.stderr
     return n
 
 
 def environment(path_pattern: str) -> dict[str, str]:
-    """For a program that sets its faults itself: `faulty_disk_arm(kill_at, fail_from, fail_at, errno, torn)` in the
-    library begins to count anew, `faulty_disk_count()` gives the count."""
+    """Environment for a program that sets its faults itself.
+
+    `faulty_disk_arm(kill_at, fail_from, fail_at, errno, torn)` in the library restarts the count, and
+    `faulty_disk_count()` returns it.
+    """
     return {"LD_PRELOAD": str(library()), "FAULTY_DISK_PATTERN": path_pattern}
 
 

@@ -1,5 +1,4 @@
-"""The features of `[tool.splatline.features]`: where they are, and how many statements the core, each of them and each
-add-on have.
+"""The features of `[tool.splatline.features]`: their folders, and the number of statements of core, features, add-ons.
 
 python -m tests.features [ROOT]
 """
@@ -16,7 +15,7 @@ PACKAGES = ("beamline", "recon", "drivers", "simulators")
 
 @cache
 def table(root: Path = ROOT) -> dict[str, list[str]]:
-    """Folders and modules of each feature, which its tests mirror."""
+    """Folders and modules of each feature; its tests have the same structure."""
     features: dict[str, list[str]] = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
         "splatline"
     ]["features"]
@@ -24,7 +23,7 @@ def table(root: Path = ROOT) -> dict[str, list[str]]:
 
 
 def folders(feature: str, root: Path = ROOT) -> list[Path]:
-    """Of a feature, its modules, and those of its tests, as far as they exist."""
+    """The existing folders and modules of a feature and of its tests."""
     own = [root / folder for folder in table(root)[feature]]
     tests = [root / "tests" / each.relative_to(root).with_suffix("") for each in own]
     return [path for each in (*own, *tests) for path in (each, each.with_name(f"test_{each.name}.py")) if path.exists()]
@@ -35,7 +34,7 @@ def statements(path: Path) -> int:
 
 
 def counted(root: Path = ROOT) -> dict[str, int]:
-    """Statements of the four packages by feature, "core": of what belongs to none; and of each add-on."""
+    """Number of statements in the four packages by feature ("core": the rest), and of each add-on."""
     owners = {root / folder: feature for feature, own in table(root).items() for folder in own}
     add_ons = {folder: folder.parent.name for folder in sorted(root.glob("packages/*/splatline_*"))}
     owners |= add_ons

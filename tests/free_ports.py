@@ -1,4 +1,4 @@
-"""Ports for servers of tests."""
+"""Free ports for test servers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ _GIVEN = set[int]()
 
 
 def free_ports(n: int) -> list[int]:
-    """Ports that are free for TCP and UDP, below those that the system gives to clients: nobody else takes one before
-    it is used. Processes of tests begin to look at different ones."""
+    """Ports that are free for TCP and UDP, below the range that the system gives to clients.
+
+    So no client takes one of them before it is used. Processes of tests start at different ports.
+    """
     ports = list[int]()
     for i in range(LAST_PORT - FIRST_PORT):
         port = FIRST_PORT + (16 * os.getpid() + i) % (LAST_PORT - FIRST_PORT)

@@ -1,4 +1,4 @@
-"""Licences of all that an installation brings, from the metadata of what is installed here; writes docs/licences.md.
+"""Writes docs/licences.md: the licences of all installed packages, from their metadata.
 
 python -m tests.licences        # in an environment with all extras
 
@@ -20,7 +20,7 @@ PAGE = ROOT / "docs" / "licences.md"
 ADD_ONS = ("areadetector", "cluster", "emission", "models", "neural", "spectral", "structure", "tango")
 FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "txrm", "zarr", *ADD_ONS)
 
-# Where the metadata name no licence, or only a family: read in the licence file of the package.
+# The metadata of these packages name no licence or only a family; these are from their licence files.
 READ = {
     "bluesky": "BSD-3-Clause",
     "hdf5plugin": "MIT",  # its plug-ins: BSD, MIT, Apache-2.0, Zlib and that of bzip2
@@ -29,7 +29,7 @@ READ = {
     "pyusb": "BSD-3-Clause",
 }
 
-# Brought on other systems, or by other builds, than the one where the page is written.
+# Installed on other systems, or with other builds, than those with which the page is written.
 ELSEWHERE = {
     "colorama": ("BSD-3-Clause", "Windows: click"),
     "nvidia-*": ("NVIDIA's own", "CUDA builds of torch; never needed"),
@@ -49,12 +49,12 @@ _CLASSES = {
 
 
 def key(name: str) -> str:
-    """A name of a distribution as the index compares it."""
+    """The normalised name of a distribution, as the index compares names."""
     return str(canonicalize_name(name))
 
 
 def licence(package: Distribution) -> str:
-    """As SPDX expression where the metadata give one; "" where they give nothing that is short enough to be a name."""
+    """The licence as an SPDX expression if the metadata give one; "" if they give nothing short enough to be a name."""
     said = package.metadata
     if key(said["Name"]) in READ:
         return READ[key(said["Name"])]
@@ -68,16 +68,16 @@ def licence(package: Distribution) -> str:
 
 
 def wanted(extra: str | None) -> list[Requirement]:
-    """What pyproject.toml names for an extra; None: for every installation."""
+    """The requirements of an extra in pyproject.toml; None: of every installation."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = project["dependencies"] if extra is None else project["optional-dependencies"][extra]
     return [Requirement(line) for line in lines]
 
 
 def brought(requirements: Iterable[Requirement]) -> dict[str, Distribution]:
-    """The distributions that requirements bring in this environment, by name: with all that these require in turn.
+    """The distributions that requirements bring in this environment, with their own requirements, by name.
 
-    What is not installed here is left out.
+    Distributions that are not installed are left out.
     """
     got: dict[str, Distribution] = {}
     to_do, done = list(requirements), set[tuple[str, frozenset[str]]]()
@@ -104,7 +104,7 @@ def _required(package: Distribution, extras: set[str]) -> Iterator[Requirement]:
 
 
 def gpl(words: str) -> bool:
-    """Whether a licence is the GPL or the AGPL (not the LGPL), without an exception and without another to choose."""
+    """Whether a licence is GPL or AGPL (not LGPL), without an exception and without an alternative."""
     return (
         re.search(r"(?<!L)GPL|(?<!Lesser )General Public", words) is not None
         and " WITH " not in words
@@ -119,7 +119,7 @@ def rows() -> dict[str, str]:
 
 
 def row_of(name: str, named: Iterable[str]) -> str | None:
-    """The name of the row that is of a package, which may end in a star; None: there is none."""
+    """The name of the row for a package (it may end in a star); None: there is no row."""
     return next((row for row in named if fnmatch.fnmatch(name, row)), None)
 
 
@@ -129,14 +129,17 @@ def page() -> str:
     base = brought(wanted(None))
     parts = [
         "# Licences",
-        "splatline is BSD-3-Clause. Its wheel holds one file of another project: uPlot 1.6.32, MIT, with its licence\n"
-        "beside it. `python -m tests.licences` writes this page from the metadata of what is installed, with what\n"
-        "packages bring in turn. A test fails where an installed package has no row, and where one that users install\n"
-        "is under the GPL. Packages of tests and docs, which no user needs, are not listed. What each direct\n"
-        "dependency is for: [dependencies](decisions/dependencies.md).",
-        "Wheels of numpy and scipy hold libgfortran, and those of torch libgomp: GPL with the exception that lets any\n"
-        "program use them. pyusb loads the system's libusb (LGPL), a driver for DCAM cameras the vendor's library;\n"
-        "neither is shipped.",
+        "With this page you can see under which licence each package is that comes with splatline.",
+        "splatline itself is BSD-3-Clause. Its wheel holds one file of another project, uPlot 1.6.32 (MIT), together\n"
+        "with its licence. What each package that we ask for is needed for:\n"
+        "[dependencies](decisions/dependencies.md).",
+        "Three libraries have other licences. Wheels of numpy and scipy hold libgfortran, and those of torch hold\n"
+        "libgomp: both are under the GPL, with the exception that lets any program use them. pyusb loads the libusb\n"
+        "of the system (LGPL). A driver for DCAM cameras loads the vendor's library. libusb and the vendor's library\n"
+        "are not part of any wheel of ours.",
+        "`python -m tests.licences` writes this page from the metadata of the packages that are installed, including\n"
+        "the packages that these bring. A test fails if an installed package has no row, or if a package that users\n"
+        "install is under the GPL. Packages for tests and docs are not listed, because no user needs them.",
         "## Every installation",
         _table(dict.fromkeys(base, ""), base),
         "## Extras for users",
@@ -148,7 +151,7 @@ def page() -> str:
 
 
 def _section(extras: dict[str, dict[str, Distribution]], before: set[str]) -> str:
-    """What extras bring beside what there was before, and which of them."""
+    """The additional packages that extras bring, with the names of these extras."""
     packages = {name: package for each in extras.values() for name, package in each.items() if name not in before}
     by = {name: ", ".join(f"`{extra}`" for extra, each in extras.items() if name in each) for name in packages}
     return _table(by, packages)

@@ -1,4 +1,4 @@
-"""The public names and what each must be given, from the modules themselves; writes docs/public_names.md.
+"""Writes docs/public_names.md: the public names and their required parameters, from the modules.
 
 python -m tests.public_names        # in an environment with all extras
 
@@ -17,16 +17,16 @@ from recon.methods import REGISTRY
 
 PAGE = Path(__file__).parents[1] / "docs" / "public_names.md"
 
-# What scripts use: all of `__all__`.
+# For scripts: everything in `__all__`.
 FOR_SCRIPTS = ("recon", "beamline.api")
 
-# With the extra `bluesky`; of their classes ophyd-async says what can be called.
+# With the extra `bluesky`; ophyd-async defines which methods of these classes can be called.
 FOR_BLUESKY = {
     "beamline.bluesky.devices": ("Rotation", "TomoScan", "fly", "tomography"),
     "beamline.bluesky.camera": ("CameraDetector",),
 }
 
-# What other packages add and prove devices, formats and methods with.
+# For packages that add and test devices, formats and methods.
 FOR_PACKAGES = {
     "beamline.cli.options": (
         "as_scan", "json_events", "json_option", "parsed", "say", "set_option", "volume_argument", "volume_path",
@@ -122,11 +122,11 @@ _OURS = ("beamline", "recon", "drivers", "simulators")
 def lines(module: str) -> list[str]:
     """A line for each public name of a module, and one for each public member of its classes.
 
-    Behind a name stand the parameters that have no default, in their order; those behind a star by name.
+    After a name come its parameters without a default, in their order; those after a star are given by name.
     """
     loaded = import_module(module)
     named = {**FOR_BLUESKY, **FOR_PACKAGES}.get(module) or {*loaded.__all__}
-    if module == "recon":  # also the methods that it finds in the folders of its features
+    if module == "recon":  # including the methods in the folders of its features
         named = {*named, *(entry.cls for entry in REGISTRY.values())}
     told: list[str] = []
     for name in sorted(named):
@@ -138,7 +138,8 @@ def lines(module: str) -> list[str]:
 
 
 def members(cls: type) -> Iterator[str]:
-    """Fields and methods that a class has of us, not of Python or of a library; of a method its settings alone."""
+    """Our fields and methods of a class (not those of Python or a library); for a reconstruction method, its
+    settings."""
     fields = {each.name for each in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else set[str]()
     own = {name for base in cls.__mro__ if base.__module__.split(".")[0] in _OURS for name in vars(base)}
     for name in sorted(fields if fields and "takes" in own else fields | own):
@@ -149,7 +150,7 @@ def members(cls: type) -> Iterator[str]:
 
 
 def required(value: Any, *, method: bool = False) -> str:
-    """The parameters without a default, in brackets; "" of what is not called, or is called as a library says.
+    """The parameters without a default, in brackets; "" for values that are not called, or are defined by a library.
 
     Args:
         method: leave the first one out.
@@ -167,14 +168,14 @@ _SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 def _has_parameters(cls: type) -> bool:
-    """Whether scripts make values of the class, with parameters that we define."""
+    """Whether scripts create objects of the class, with parameters that we define."""
     abstract = getattr(cls, "_is_protocol", False) or inspect.isabstract(cls)
     made_by = next(base for base in cls.__mro__ if "__init__" in vars(base) or "__new__" in vars(base))
     return not abstract and made_by.__module__.split(".")[0] in _OURS
 
 
 def recorded(module: str) -> set[str]:
-    """The lines of a module that the page holds."""
+    """The lines of a module on the page."""
     match = re.search(rf"(?s)### {re.escape(module)}\n\n```text\n(.*?)\n```", PAGE.read_text(encoding="utf-8"))
     told: set[str] = set()
     for block in re.split(r"\n(?! )", match[1]) if match else ():
@@ -187,17 +188,18 @@ def page() -> str:
     """The page as Markdown."""
     parts = [
         "# Public names",
-        "What stands here stays within a major version ([releases](releases.md#what-a-version-promises)), with the\n"
-        "parameters that must be given: they stand in brackets, those behind a star are given by name. Parameters\n"
-        "with a default may be added. What does not stand here may change with any version.\n"
-        "`python -m tests.public_names` writes this page; a test compares it with the modules.",
+        "With this page you can see which Python names you may rely on. The names below, and the parameters that must\n"
+        "be given, stay the same within a major version ([releases](releases.md#what-a-version-promises)). The\n"
+        "parameters that must be given are in brackets; those after a star are given by name. A later version may add\n"
+        "parameters with a default. Any other name may change with any version.",
+        "`python -m tests.public_names` writes this page, and a test compares it with the modules.",
         "## For scripts and notebooks",
         *map(_section, FOR_SCRIPTS),
         "## For plans of bluesky",
         *map(_section, FOR_BLUESKY),
         "## For packages that add devices, formats and methods",
-        "With the entry points `splatline.method`, `correction`, `reader`, `volume_format`, `stage`, `wire`,\n"
-        "`camera`, `check` and `effect` ([contributing](contributing.md)).",
+        "A package registers what it adds under the entry points `splatline.method`, `correction`, `reader`,\n"
+        "`volume_format`, `stage`, `wire`, `camera`, `check` and `effect` ([contributing](contributing.md)).",
         *map(_section, FOR_PACKAGES),
     ]
     return "\n\n".join(parts) + "\n"

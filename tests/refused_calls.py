@@ -1,13 +1,13 @@
-"""Calls that are refused, and what they say: a text file beside a test module, test_it.refused.txt beside test_it.py.
+"""Calls that raise an error, with their messages, in a text file test_it.refused.txt next to test_it.py.
 
-It begins with imports. Then there are two lines for each call, and an empty line:
+The text file begins with imports. Then each call has two lines, followed by an empty line:
 
     parse_views('fixed:181', HALF)
     ValueError: ...
 
 Names that are not imported are those of the test module.
 
-`python -m tests.refused_calls [FILE ...]` writes the second lines anew, of all files without a name; read their
+`python -m tests.refused_calls [FILE ...]` rewrites the second lines (without a name: of all files). Read the
 differences.
 """
 
@@ -26,22 +26,22 @@ SUFFIX = ".refused.txt"
 
 
 def said(call: str, names: dict[str, Any]) -> str:
-    """The class of its error, and its words on one line."""
+    """The class of the error and its message on one line."""
     try:
         found = eval(call, names)
     except Exception as error:
         return f"{type(error).__name__}: {' '.join(str(error).split())}"
-    raise AssertionError(f"{call} is taken, and gives {found!r}")
+    raise AssertionError(f"{call} raises no error, and returns {found!r}")
 
 
 def read(path: Path) -> tuple[str, list[tuple[str, str]]]:
-    """The imports, and the calls with what they say."""
+    """The imports, and the calls with their messages."""
     imports, *pairs = path.read_text(encoding="utf-8").rstrip("\n").split("\n\n")
     return imports, [(call, words) for call, _, words in (pair.partition("\n") for pair in pairs)]
 
 
 def refused_calls(module: str, names: dict[str, Any]) -> Callable[..., None]:
-    """The test of the calls beside a test module, which gives its `__file__` and `globals()`."""
+    """The test of the calls that belong to a test module, from its `__file__` and `globals()`."""
     imports, calls = read(Path(module).with_suffix(SUFFIX))
 
     @pytest.mark.parametrize(("call", "words"), calls, ids=[call for call, _ in calls])

@@ -1,4 +1,4 @@
-"""Cases of a law that take long: the first ones are quick tests, the others slow."""
+"""Cases of a test that take long: the first ones are quick tests, the others slow."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 
 
 def others_slow(cases: Iterable[Any], quick: int = 1) -> list[Any]:
-    """For `parametrize`: the cases, a tuple for several arguments, of which those after the first `quick` are slow."""
+    """The cases for `parametrize` (a tuple for several arguments); those after the first `quick` are marked slow."""
     return [
         case if n < quick else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
         for n, case in enumerate(cases)

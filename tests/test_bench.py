@@ -1,4 +1,4 @@
-"""The scripts of tests/bench, each with the least work that runs all of it: what a later change breaks is seen here.
+"""The scripts in tests/bench run with the least work that covers all their code, so that breakage is noticed.
 
 What they measure means nothing at these sizes, so that the limits which a script asserts do not count here.
 """

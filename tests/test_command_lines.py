@@ -1,7 +1,8 @@
-"""Each command line in the pages names a command, options and arguments that there are."""
+"""Each command line in the pages uses existing commands, options and arguments."""
 
 from __future__ import annotations
 
+import inspect
 import re
 import shlex
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 import click
 import pytest
 
-from beamline.cli.main import main
+from beamline.cli.main import main, own_commands
 from recon.base.registry import ADD_ONS
 
 ROOT = Path(__file__).parents[1]
@@ -58,6 +59,16 @@ def refusal(line: str) -> str:
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_command_lines_of_a_page_are_accepted(page: Path) -> None:
     assert not {line: said for line in lines_of(page) if whole(line) and (said := refusal(line))}
+
+
+@pytest.mark.parametrize("name", own_commands())
+def test_the_examples_in_the_help_of_a_command_are_accepted(name: str) -> None:
+    command = main.get_command(click.Context(main), name)
+    assert command is not None
+    lines = [line.split("    ")[0].strip() for line in inspect.cleandoc(command.help or "").splitlines()]
+    examples = [line for line in lines if line.startswith("beamline ")]
+    assert examples
+    assert not {line: told for line in examples if (told := refusal(line))}
 
 
 def test_a_wrong_line_is_found() -> None:

@@ -1,4 +1,4 @@
-"""The pages of the docs site: in the navigation, and with links that lead somewhere."""
+"""The pages of the docs site are in the navigation, and their links work."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Features are folders and modules that can be removed: the core runs without each of them, and without all."""
+"""Features are folders and modules that can be removed: the core runs without each one, and without all."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""The product's modules import each other in one direction only, also within functions and for types alone."""
+"""The product's modules import each other in one direction only, also inside functions and for types."""
 
 import re
 from graphlib import TopologicalSorter

@@ -1,4 +1,4 @@
-"""Each package of an installation has its row in docs/licences.md, and none that users need is under the GPL."""
+"""Each installed package has a row in docs/licences.md, and no package that users need is under the GPL."""
 
 import pytest
 

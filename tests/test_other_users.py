@@ -1,4 +1,4 @@
-"""README's commands for a user who is not root, with a home that is not writable, LANG=C, and names of any letters."""
+"""README's commands for a user who is not root, with a read-only home, LANG=C, and file names in any alphabet."""
 
 from __future__ import annotations
 

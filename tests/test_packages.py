@@ -1,4 +1,4 @@
-"""Add-ons in packages/ use public names of splatline alone, and a name of a missing one says what to install."""
+"""Add-ons in packages/ use only public names of splatline; the name of a missing one says what to install."""
 
 import ast
 import tomllib

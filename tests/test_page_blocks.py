@@ -1,4 +1,4 @@
-"""Each code block of README, and of Python in any page, runs as it is printed, or is listed here with the reason."""
+"""Each code block of README, and each Python block of a page, runs as printed, or is listed here with a reason."""
 
 from __future__ import annotations
 
@@ -116,7 +116,11 @@ SCRIPTS = {
 }  # fmt: skip
 
 ELSEWHERE = {
-    ("README.md", "pip install --no-compile -c constraints.txt -e . && beamline demo"): "the gate: .ci/wheel, .ci/run",
+    (
+        "README.md",
+        "pip install --no-compile -c constraints.txt -e . && beamline demo",
+    ): "the gate: .ci/wheel; the second line is one of those of FILES",
+    ("README.md", 'pip install -c constraints.txt -e ".[dev]" && pytest -n auto'): "the gate: .ci/run",
     ("docs/tutorials.md", "pip install splatline-structure"): "the gate: .ci/wheel",
     ("docs/tutorials.md", "beamline demo"): "the gate: .ci/wheel",
     ("docs/python.md", "bluesky-0MQ-proxy 5577 5578 &"): "tests/beamline/bluesky/test_zmq.py, at ports that are free",
@@ -137,16 +141,16 @@ NOT_RUN = {
     "tests call the same",
     ("packages/splatline-tango/README.md", "from tango import DeviceProxy"): "asks a device of a running server",
     ("docs/first_day.md", "beamline config init --instrument > my.yaml   # every key, with comments"): "an instrument",
-    ("docs/first_day.md", "beamline check my.yaml --connect              # each device connects, and says who it is "
-     "and how it stands; nothing moves"): "an instrument",
+    ("docs/first_day.md", "beamline check my.yaml --connect              # connects to each device, prints its "
+     "identity and its status; nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline scan my.yaml --rehearse --set scan.angles.views=60 --set scan.period_s=0.5"):
     "minutes of frames of the whole detector",
     ("docs/first_day.md", "beamline tune my.yaml                         # counts, saturation, transmission, and the "
-     "exposure to take"): "an instrument",
-    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, bytes, free disk; "
+     "exposure to use"): "an instrument",
+    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, size, free disk; "
      "nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline recon runs/NAME/scan.h5 -m fbp --bin 4 -o quick.h5   # is the axis right, is the "
-     "sample in the field?"): "the names are the reader's",
+     "sample inside the field of view?"): "the names are the reader's",
     ("docs/tutorials.md", "beamline view runs/*_demo-battery/recon.h5"): "a viewer, until Ctrl-C",
     ("docs/tutorials.md", "beamline info SCAN.h5"): "the names are the reader's; README's block runs the same",
     ("docs/tutorials.md", "label,volume_um3,diameter_um,sphericity,z_um,y_um,x_um,cut,contacts,neighbours"): "a table",
@@ -157,7 +161,10 @@ INSTRUMENT = (
     "README.md",
     "beamline config init --instrument > my.yaml   # every key, with comments; edit ports, speeds, pixel size",
 )
-FILES = ("README.md", "beamline info SCAN.h5                         # what the file holds: frames, angles, references")
+FILES = (
+    "README.md",
+    "beamline info SCAN.h5                         # what the file contains: frames, angles, flats and darks",
+)
 """Blocks of command lines that run here."""
 
 
@@ -172,7 +179,7 @@ def test_every_block_is_run_or_listed_with_the_reason() -> None:
     assert len(known) == len(set(known)) and len(found) == len(set(found))
     assert {"new": set(found) - set(known), "gone": set(known) - set(found)} == {"new": set(), "gone": set()}
     for key, where in ELSEWHERE.items():
-        assert any((ROOT / word.strip(",:")).exists() for word in where.split()), (key, where)
+        assert any((ROOT / word.strip(",:;")).exists() for word in where.split()), (key, where)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""No import needs what Windows and macOS lack, and it is called only after a check of the platform.
+"""Nothing that Windows or macOS lack is imported, and it is called only after a platform check.
 
 All modules are imported as on each other system: Python, its libraries and paths stay those of this one. mypy reads
 what the functions call, by the stubs of the other system. What they do there is not seen here.

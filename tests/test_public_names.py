@@ -1,4 +1,4 @@
-"""The public names are those of docs/public_names.md, and need the same parameters."""
+"""The public names and their required parameters are those in docs/public_names.md."""
 
 import pytest
 

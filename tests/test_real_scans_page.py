@@ -1,4 +1,4 @@
-"""The page on real scans has the commands that made its pictures, and these pictures."""
+"""The page on real scans contains the commands that made its pictures, and these pictures."""
 
 from tests.bench.real_scans import FURTHER, ROOT, SCANS
 

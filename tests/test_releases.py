@@ -1,4 +1,4 @@
-"""Version, changelog, citation and the page of releases say the same."""
+"""Version, changelog, citation and the releases page agree."""
 
 import re
 import tomllib

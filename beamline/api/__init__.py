@@ -1,4 +1,5 @@
-"""Python for operators: connect to the instrument, scan, watch, judge and reconstruct, from a script or a notebook.
+"""Python interface for operators: connect to the instrument, scan, watch, check and reconstruct, from a script or a
+notebook.
 
 `docs/python.md` begins with three scripts. Everything here calls the functions behind the commands: files, checks,
 messages and errors are the same. Importing this package loads neither torch nor a driver; each function loads

@@ -1,4 +1,4 @@
-"""The instrument of a script: devices that stay open over many scans, and the results of scans."""
+"""The instrument in a script: devices that stay connected over many scans, and the results of these scans."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from drivers.in_beam import Ask
 
 Say = Callable[[str], None]
 
-_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets anew
+_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets again
 
 
 ScanResult = RunResult  # what scripts get
 
 
 class Instrument:
-    """Connected devices. Leaving a `with` block closes them; `connect` makes one.
+    """A connected instrument, made by `connect`. Leaving a `with` block closes its devices.
 
     Attributes:
         config: the configuration of the devices.
-        last: result of the newest scan, also of one that raised; None before the first, and if it took no frame.
+        last: result of the newest scan, also of one that raised an error; None before the first scan, and if the
+            newest took no frame.
     """
 
     def __init__(self, config: Config, connected: devices.ConnectedDevices, say: Say | None = to_stderr) -> None:
@@ -50,7 +51,7 @@ class Instrument:
         self.close()
 
     def close(self) -> None:
-        """Close all ports and the camera; a second call does nothing."""
+        """Close all ports and the camera; calling it again does nothing."""
         self._open = False
         self._devices.close()
 
@@ -68,30 +69,34 @@ class Instrument:
         """Run a scan, as `beamline scan` does: in a new folder, with every frame checked and a file that stays
         readable.
 
-        The first Ctrl-C stops the scan cleanly, the second aborts it; either ends a loop over samples too. (Python
-        catches signals only in the main thread: use `stop` in others.)
+        The first Ctrl-C stops the scan cleanly, the second aborts it; both also end a loop over samples. Python
+        delivers signals only to the main thread: use `stop` in other threads.
 
         Args:
             sample: name of the sample, in the file and in the folder's name; None: the configured one.
-            energy_kev: of the beam, written to the file. The configured monochromator goes there, if there is one.
-            set: other values of the configuration for this scan only, such as {"scan.angles.views": 90}.
-            output: folder for the folders of runs; None: `storage.folder`.
-            live: False: without a reconstruction, even where `recon.live` is on.
+            energy_kev: energy of the beam, written to the file. If a monochromator is configured, it moves to this
+                energy.
+            set: values that replace those of the configuration for this scan only, such as {"scan.angles.views":
+                90}.
+            output: folder in which the run's folder is created; None: `storage.folder`.
+            live: False: without a live reconstruction, even if `recon.live` is on.
             stop: ends the scan from another thread.
-            on_event: gets every event of the run, in its own thread.
+            on_event: gets every event of the run, in a separate thread.
 
         Raises:
-            ConfigError: a wrong value, a broken limit, or one that needs devices opened anew; nothing has moved.
+            ConfigError: a wrong value, an exceeded limit, or a value that would require opening the devices again;
+                nothing has moved.
             DeviceError: a device failed.
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
-            ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended it; ScanAborted: at once.
-            In all these cases the acquired frames are in the file: see `last`. A scan that ends because its views were
-            enough (`scan.decide`) does not raise.
+            ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: it was ended at once.
+
+        In all these cases the frames taken so far are in the file: see `last`. A scan that ends because its
+        projections were enough (`scan.decide`) does not raise an error.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
-            raise ConfigError("a scan of this instrument still runs: wait for its end. Nothing was started.")
+            raise ConfigError("a scan of this instrument is still running: wait until it ends. Nothing was started.")
         try:
             config = self._config_of(sample, energy_kev, set or {})
             return self._run(config, output, live, stop or StopRequest(), on_event)
@@ -107,9 +112,9 @@ class Instrument:
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
-                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, and would have no "
-                "effect. Give it to `connect`. A single scan can have other angles, times, optics, checks, and the "
-                "camera's roi, binning and readout. Nothing was started."
+                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, so it "
+                "would have no effect. Give it to `connect`. A single scan can change angles, times, "
+                "optics, checks, and the camera's roi, binning and readout. Nothing was started."
             )
         return config
 
@@ -153,14 +158,15 @@ def connect(
     """Open every device of a configuration. Nothing moves.
 
     Args:
-        config: its file.
+        config: path of the configuration file.
         set: values that replace those of the file, such as {"scan.angles.views": 90}.
-        ask: puts a request to the operator, where shutter or sample are moved by hand, and returns when it is done;
-            None: at the terminal.
-        say: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
+        ask: function that asks the operator to move the shutter or the sample by hand, and returns when that is
+            done. None: ask at the terminal.
+        say: function that gets a sentence on what happens, as the commands print it (`print`, a logger's `info`);
+            None: no messages.
 
     Raises:
-        ConfigError: every fault with file, line, key and legal values.
+        ConfigError: every fault with file, line, key and allowed values.
         DeviceError: a device does not answer; those opened before it are closed again.
     """
     refuse_wrong_arguments(connect, locals())
@@ -172,9 +178,10 @@ def scan(
     config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
     say: Say | None = to_stderr, **of_scan: Any,
 ) -> ScanResult:  # fmt: skip
-    """Connect, run one scan, and close the devices. Arguments and errors are those of `connect` and `Instrument.scan`.
+    """Connect, run one scan, and close the devices.
 
-    `set` is for both: it may change what devices are opened with.
+    Arguments and errors are those of `connect` and `Instrument.scan`. `set` applies to both, so it may also change
+    how the devices are opened.
     """
     with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)

@@ -1,4 +1,4 @@
-"""Reading, watching and reconstructing a scan file from Python: volumes, figures and verdicts as values."""
+"""Reads, watches, checks and reconstructs a scan file from Python; returns volumes, numbers and findings."""
 
 from __future__ import annotations
 
@@ -58,24 +58,27 @@ def reconstruct(
 ) -> ReconResult:
     """Reconstruct a finished scan of any format, as `beamline recon` does.
 
-    The first Ctrl-C during a fit or iterations ends with the volume so far (`ended_early`), the second discards it.
+    The first Ctrl-C during a fit or iterations ends them with the volume reached so far (`ended_early`), the second
+    discards it.
 
     Args:
         path: a scan file, or the folder of a run.
         method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
             `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`.
-        rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
-        views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
-        binning: pixels that are averaged, a side.
+        rows: detector rows to use, such as slice(500, 756); the volume has one slice per row.
+        views: projections to use: all, fixed:90, first:60, every:2, ... as for the option --views.
+        binning: number of pixels averaged along each side.
         selection: other options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
-        `beamline.projections.corrections`; the arguments above take precedence.
-        output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
-            A scan that does not fit into the memory needs one.
-        say: gets a sentence on what happens; None: nobody does.
+            `beamline.projections.corrections`; the arguments above take precedence.
+        output: file of the volume, as for the option -o (.h5, .tif, .npy, ...), with a report next to it; None: no
+            file is written. A scan that does not fit into the memory needs one.
+        say: function that gets a sentence on what happens; None: no messages.
 
     Raises:
-        ConfigError: an impossible method or selection. DataError: no scan, data that give no volume, or an output
-        that exists or cannot be written. Nothing is written then.
+        ConfigError: an impossible method or selection.
+        DataError: no scan, data that give no volume, or an output that exists or cannot be written.
+
+    In case of an error nothing is written.
     """
     refuse_wrong_arguments(reconstruct, locals())
     source, chosen = SourceOptions(scan_file(path), frames_per_view=None), _method(method)
@@ -120,7 +123,7 @@ def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, in
     with source.open() as opened:
         first, end, step = rows.indices(opened.shape[0])
     if step != 1:
-        raise ConfigError(f"rows {rows}: rows are taken one after the other; leave the step out. Nothing was written.")
+        raise ConfigError(f"rows {rows}: rows must be consecutive; omit the step. Nothing was written.")
     return first, end
 
 
@@ -130,16 +133,19 @@ _POLL = 0.25  # real s
 def monitor(
     path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
 ) -> ScanVerdict:
-    """The findings of the monitor's checks on every frame of a scan of any format, as `beamline monitor` prints them.
+    """The findings of the monitor's checks on every frame of a scan of any format, as `beamline monitor` prints
+    them.
 
     Args:
         path: a scan file, or the folder of a run.
-        config: file whose sections `monitor` and `references` give the limits; None: those of a new scan.
+        config: configuration file whose sections `monitor` and `references` give the limits; None: those of a new
+            scan.
         set: values that replace those of `config`.
-        follow: wait for the end of a scan that still runs.
+        follow: wait for the end of a scan that is still running.
 
     Raises:
-        ConfigError: `config` is wrong. DataError: no scan, or one that died.
+        ConfigError: `config` is wrong.
+        DataError: no scan, or one whose process was killed.
     """
     refuse_wrong_arguments(monitor, locals())
     checks, limits = CHECKS, None
@@ -152,17 +158,19 @@ def monitor(
 
 
 def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
-    """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until its end.
+    """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until it ends.
 
-    Frames are counts: `frame.counts` uint16 [row, col]. It only reads: a slow reader does not slow the scan down. But
-    in the scan's own program, reading and writing wait for each other: read a fast scan from another program.
+    Frames are counts: `frame.counts` uint16 [row, col].
+
+    A slow reader does not slow the scan down, except in the scan's own program, because there reading and writing
+    wait for each other: read a fast scan from another program.
 
     Args:
         path: a scan file, or the folder of a run (its newest part). It may not exist yet.
-        follow: False: only the present frames.
+        follow: False: only the frames that are already in the file.
 
     Raises:
-        DataError: no scan, none that begins within 120 s, or one that died.
+        DataError: no scan, no scan begins within 120 s, or its process was killed.
     """
     refuse_wrong_arguments(stream, locals())
     path = Path(path)
@@ -173,10 +181,10 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
 
 def volumes(run: str | Path) -> Iterator[Volume]:
-    """The live volume of a run after each update, and finally the finished one; ends with the run.
+    """The live volume of a run after each update, and finally the finished volume; ends with the run.
 
     Args:
-        run: its folder. A run that is over gives its last volume.
+        run: its folder. A run that has ended gives its last volume.
 
     Raises:
         DataError: no folder of a run.

@@ -1,1 +1,1 @@
-"""Scans for bluesky: its documents, and devices for its RunEngine."""
+"""Scans in bluesky: its documents, and devices for its RunEngine."""

@@ -74,7 +74,7 @@ class _Frames(DetectorAcquireLogic):
     async def prepare(self, trigger: TriggerSource, n: int, exposure: float, apart: float = 0.0) -> None:
         """Set the camera; `apart` is the time between exposures, s. Raises DeviceRefused if it does not accept that."""
         if n < 1:
-            raise ValueError(f"the camera is prepared for {n} frames; expected 1 or more")
+            raise ValueError(f"the camera was prepared for {n} frames; expected 1 or more")
         wanted = camera_settings(self._config, exposure or self._config.scan.exposure_s, trigger)
         self.settings = await asyncio.to_thread(self._devices.camera.configure, wanted)
         self.n, self._apart = n, apart
@@ -113,7 +113,7 @@ class _Frames(DetectorAcquireLogic):
             await self._task
 
     async def ensure_stopped(self) -> None:
-        """Stop, disarm, close shutter and file, with the sample back. Twice is once."""
+        """Stop, disarm, close shutter and file, with the sample back. A second call does nothing."""
         async with self._ending:
             self._stop.set()
             if self._task is not None:
@@ -123,8 +123,8 @@ class _Frames(DetectorAcquireLogic):
             self._task = None
 
     def _close(self, error: BaseException | None) -> None:
-        """Close shutter and file, and bring the sample back; the file says how many of the requested frames it lacks,
-        and why.
+        """Close shutter and file, and bring the sample back; the file states how many of the requested frames are
+        missing, and why.
         """
         writer, self._writer = self._writer, None
         if writer is not None:
@@ -135,10 +135,10 @@ class _Frames(DetectorAcquireLogic):
                 status, reason = "complete", ""
                 if error is not None or self._lacking:
                     status = "failed" if error is not None else "stopped"
-                    why = f": {error}" if error is not None else ", as the plan ended before"
+                    why = f": {error}" if error is not None else ", because the plan ended earlier"
                     reason = f"{writer.rows} of {self._lacking.stop} frames were taken{why}."
                 elif (ended_by := self.ended_by()) != "success":
-                    status, reason = "stopped", f"{writer.rows} frames were taken until the plan ended ({ended_by})."
+                    status, reason = "stopped", f"{writer.rows} frames were taken before the plan ended ({ended_by})."
                 writer.close(status, self._lacking, reason=reason)
 
     def _arm(self, kind: FrameKind) -> None:
@@ -170,8 +170,9 @@ class _Frames(DetectorAcquireLogic):
                     return
                 if frame_taken.framestamp != i:
                     raise InstrumentError(
-                        f"{camera.name}: frame {frame_taken.framestamp} came, and {i} was expected: frames are lost. "
-                        "Take them again with more time between them. What was taken before is in the file."
+                        f"Leave more time between the frames, and take them again. {camera.name}: frames "
+                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. "
+                        "Earlier frames are in the file."
                     )
                 row = writer.rows
                 frame = Frame(np.array(frame_taken.counts), kind, row, row, i, angle, frame_taken.time, exposure)

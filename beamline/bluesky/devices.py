@@ -1,4 +1,4 @@
-"""Devices for a RunEngine (ophyd-async): a whole scan that flies, and the rotation stage.
+"""Devices for a RunEngine (ophyd-async): a whole scan as one flyer, and the rotation stage.
 
 The scan is ours from trigger to file, in a thread: the RunEngine starts it, is told its rows as they are written, and
 waits for its end. So lost frames, a device that fails, and a missing beam are found by the scan, and fail `complete`.
@@ -117,7 +117,7 @@ class TomoScan(Device):
         """
         task, began = self._task, time.monotonic()
         if task is None:
-            raise RuntimeError(f"{self.name}: kickoff comes before complete")
+            raise RuntimeError(f"{self.name}: call kickoff before complete")
         while not task.done():
             await asyncio.wait([task], timeout=POLL)
             yield WatcherUpdate(
@@ -146,7 +146,7 @@ class TomoScan(Device):
 
     def _refuse_second(self) -> None:
         if self._task is not None and not self._task.done():
-            raise RuntimeError(f"{self.name}: a scan is running; unstage ends it")
+            raise RuntimeError(f"{self.name}: a scan is running; call unstage to end it")
 
     def _scan(self) -> RunResult:
         sinks: list[Sink] = [self._stream, self._begun]

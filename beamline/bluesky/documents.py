@@ -1,4 +1,5 @@
-"""Documents of bluesky (event-model) that describe a scan; its frames stay in our file, a stream datum names new rows.
+"""Bluesky documents (event-model) of a scan. Its frames stay in this program's file; a stream datum announces new
+rows.
 
 One index is one row of the file, darks and flats included. A trigger without a frame is no index.
 """
@@ -56,7 +57,9 @@ def event_model() -> Any:
     try:
         import event_model as library
     except ImportError as error:
-        raise ConfigError(f'bluesky needs ({error}): pip install "splatline[bluesky]". Nothing was started.') from error
+        raise ConfigError(
+            f'a package for bluesky is missing ({error}): pip install "splatline[bluesky]". Nothing was started.'
+        ) from error
     return library
 
 
@@ -219,20 +222,24 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
         from bluesky.callbacks.zmq import Publisher
         from zmq import ZMQError  # type: ignore[attr-defined,unused-ignore]
     except ImportError as error:
-        raise ConfigError(f'0MQ needs ({error}): pip install "splatline[bluesky]". Nothing was started.') from error
+        raise ConfigError(
+            f'a package for 0MQ is missing ({error}): pip install "splatline[bluesky]". Nothing was started.'
+        ) from error
     try:
         url = urlsplit(address)
         if url.scheme != "tcp" or not url.hostname or url.port is None:
             raise ValueError(address)
         publisher = Publisher(address)
     except (ValueError, ZMQError) as error:
-        raise ConfigError(f"{address} is no address of 0MQ; expected tcp://HOST:PORT. Nothing was started.") from error
+        raise ConfigError(
+            f"{address} is not an address for 0MQ; expected tcp://HOST:PORT. Nothing was started."
+        ) from error
     try:
         try:
             socket.create_connection((url.hostname, url.port), REACH).close()
             time.sleep(JOIN)
         except OSError as error:
-            warn(f"Nobody listens at {address} ({error}): documents are dropped until somebody does.")
+            warn(f"No program is listening at {address} ({error}): documents are dropped until one does.")
         yield publisher
     finally:  # its own close would wait for ever for a proxy that no longer reads
         publisher._context.destroy(linger=round(1000 * REACH))

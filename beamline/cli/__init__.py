@@ -1,1 +1,1 @@
-"""Commands: one file each; options, output in a terminal or as JSON, exit codes."""
+"""Commands, one file each; their options, their output in a terminal or as JSON, and exit codes."""

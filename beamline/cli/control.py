@@ -1,4 +1,4 @@
-"""Commands of configurations, runs, the stage and broken scans: `config`, `check`, `pause` ..., `home`, `recover`."""
+"""The commands `config`, `check`, `pause`, `resume`, `stop`, `abort`, `decide`, `home` and `recover`."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
 CHOICES = tuple(Choice)
-_LOOKS = 50  # a tenth of a second apart: the log of events may be written a moment after the state
-_EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
+_LOOKS = 50  # a tenth of a second apart, because the log of events may be written a moment after the state
+_EXIT_CODES = "Exit code: 0 the scan has done it, 2 no scan runs there or it does not answer, 5 disk error."
 
 
 def _command(verb: str, help_text: str) -> click.Command:
-    """The command of a `beamline.scan.control.Verb`; `help_text` begins its help."""
+    """The command `beamline VERB` for a `beamline.scan.control.Verb`; its help begins with `help_text`."""
 
     @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
     @click.argument("run", required=False, type=click.Path(path_type=Path))
@@ -43,13 +43,13 @@ def _command(verb: str, help_text: str) -> click.Command:
 
 
 def _send(run: Path | None, word: str) -> None:
-    """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
-    from beamline.config.models import StorageSection  # here: help does not need it
+    """Send a command, or the decision what to measure next, to a run (None: the only one), and print its state."""
+    from beamline.config.models import StorageSection  # imported here because help does not need it
     from beamline.scan.control import Verb, tell
 
     runs = Path(StorageSection.model_fields["folder"].default)
     if run is not None and not run.is_dir():
-        raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
+        raise ConfigError(f"the folder {run} does not exist; {_running_in(runs)}. Nothing was changed.")
     run = run or _only(runs)
     log = parts_of(run)[-1] / EVENTS
     before = log.stat().st_size if log.is_file() else 0
@@ -60,7 +60,7 @@ def _send(run: Path | None, word: str) -> None:
 
 
 def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
-    """Choices of the scan of a part, oldest first, from this byte of its log on; none without a log."""
+    """Decisions in the log of a part of a run, oldest first, from byte `since` on; empty without a log."""
     from beamline.core.event_lines import event_in
 
     with suppress(OSError), open_below(part, EVENTS) as log:
@@ -70,8 +70,8 @@ def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
 
 
 def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
-    """Raise ConfigError if the scan does not take this choice in its log from byte `before` on: it was not on offer, or
-    another one came first.
+    """Raise ConfigError if the log of the scan, from byte `before` on, does not show that it takes this choice. The
+    choice was not offered, or another one came first.
     """
     for _ in range(_LOOKS):
         newer = _decisions(part, before)
@@ -79,53 +79,77 @@ def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
             return
         time.sleep(0.1)
     instead = (
-        f"it took {newer[-1].get('choice')}: {newer[-1].get('reason')}" if newer else "it has chosen nothing since"
+        f"it took {newer[-1].get('choice')}: {newer[-1].get('reason')}" if newer else "it has made no other choice"
     )
-    raise ConfigError(f"the scan in {run} does not take {choice}, which was not on offer or came too late; {instead}.")
+    raise ConfigError(
+        f"the scan in {run} does not take {choice}, because it was not offered or came too late; {instead}."
+    )
 
 
 @click.command()
 @click.argument("words", nargs=-1, required=True, metavar=f"[RUN] {'|'.join(CHOICES)}")
 def decide(words: tuple[str, ...]) -> None:
-    """Tell the scan in the folder RUN (the running one of ./runs), while it asks, what to measure next.
+    """Tell a scan that waits for your decision what to measure next.
 
-    With `scan.decide: ask` a scan asks after each pass of views: the next pass of the plan, the angles of the last one
-    again, the offset views, views that were flagged, or no further pass.
+    \b
+    beamline decide again         measure the angles of the last pass once more
+    beamline decide RUN enough    measure no further pass (scan in the folder RUN)
 
-    Exit code: 0 the scan has obeyed, 2 no scan runs there, it does not ask, or it takes another choice, 5 disk error.
+    With `scan.decide: ask` in its configuration, a scan asks after each pass: next (the next pass of the plan), again
+    (the angles of the last pass once more), offset (the laterally offset projections), retake (flagged projections and
+    those without a frame), or enough (no further pass). Without RUN, the command goes to the only running scan in
+    ./runs.
+
+    Exit code: 0 the scan takes the choice, 2 no scan runs there, it does not ask, or it takes another choice, 5 disk
+    error.
     """
     *run, choice = words
     if len(run) > 1 or choice not in CHOICES:
-        raise click.UsageError(f"{' '.join(words)!r}: expected a folder of a run or none, then {' | '.join(CHOICES)}.")
+        raise click.UsageError(
+            f"{' '.join(words)!r}: expected {' | '.join(CHOICES)}, before it the folder of a run if needed."
+        )
     _send(Path(run[0]) if run else None, choice)
 
 
 pause = _command(
     "pause",
-    "Pause the scan in the folder RUN (the running one of ./runs). The stage stands, the shutter closes, and no view "
-    "is lost or taken twice. `beamline resume` goes on.",
+    "Pause a running scan, from another terminal.\n\n\b\nbeamline pause        the only running scan in ./runs\n"
+    "beamline pause RUN    the scan in the folder RUN\n\nThe stage stops and the shutter closes. No projection is lost "
+    "or "
+    "taken twice. `beamline resume` continues the scan.",
 )
-resume = _command("resume", "Let the paused scan in the folder RUN (the running one of ./runs) go on.")
+resume = _command(
+    "resume",
+    "Continue a paused scan, from another terminal.\n\n\b\nbeamline resume        the only running scan in ./runs\n"
+    "beamline resume RUN    the scan in the folder RUN",
+)
 stop = _command(
-    "stop", "Stop the scan in the folder RUN (the running one of ./runs) cleanly, as the first Ctrl-C does."
+    "stop",
+    "Stop a running scan cleanly, from another terminal, as the first Ctrl-C does.\n\n\b\n"
+    "beamline stop        the only running scan in ./runs\nbeamline stop RUN    the scan in the folder RUN\n\n"
+    "Frames in flight and the remaining darks and flats are taken, and the stage returns. `beamline scan --resume RUN` "
+    "continues the run later.",
 )
 abort = _command(
-    "abort", "Abort the scan in the folder RUN (the running one of ./runs) at once, as the second Ctrl-C does."
+    "abort",
+    "Abort a running scan at once, from another terminal, as the second Ctrl-C does.\n\n\b\n"
+    "beamline abort        the only running scan in ./runs\nbeamline abort RUN    the scan in the folder RUN\n\n"
+    "No further frame is taken. The scan file is readable, and `beamline scan --resume RUN` can continue the run.",
 )
 
 
 def _running_in(runs: Path) -> str:
-    """Which scans run in a folder, without a full stop."""
+    """Which scans are running in a folder, as a sentence without its full stop."""
     from beamline.scan.control import running
 
     names = [run.name for run in running(runs)]
     if not names:
         return f"no scan is running in {runs}"
-    return f"{len(names)} {'scan runs' if len(names) == 1 else 'scans run'} in {runs}: {', '.join(names)}"
+    return f"{len(names)} {'scan is' if len(names) == 1 else 'scans are'} running in {runs}: {', '.join(names)}"
 
 
 def _only(runs: Path) -> Path:
-    """The one run in a folder that goes on."""
+    """The only running scan in a folder."""
     from beamline.scan.control import running
 
     running_scans = running(runs)
@@ -136,14 +160,17 @@ def _only(runs: Path) -> Path:
 
 @click.command()
 @config_argument
-@click.option("--yes", is_flag=True, help="Skip the question whether the stage may turn.")
-@click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Longest time of the search, s.")
+@click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
+@click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Time limit of the search in seconds.")
 @set_option
 def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
-    """Search the reference position of the stage in CONFIG.
+    """Turn the stage in CONFIG to its reference mark, so that its angles are right.
 
-    THE STAGE TURNS, possibly by a full turn and beyond its soft limits. No other device is connected. Ctrl-C stops
-    the stage.
+    \b
+    beamline home my.yaml
+
+    THE STAGE TURNS, possibly by 360° and beyond its soft limits. The command asks before it does so. No other device
+    is connected. Ctrl-C stops the stage.
 
     Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
     """
@@ -153,7 +180,7 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
     config = load(file, overrides)
     stage_config = config.devices.stage
     if not yes:
-        way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference. May it turn?"
+        way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference mark. May it turn?"
         try:
             free = click.confirm(way, err=True)
         except click.Abort:  # Ctrl-C, or the end of input: there is no operator
@@ -161,7 +188,7 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
             free = False
         if not free:
             click.echo(
-                "beamline: The search was not confirmed. Nothing has moved. Use --yes to search without a question.",
+                "beamline: Nothing has moved, because the search was not confirmed. --yes skips the question.",
                 err=True,
             )
             click.get_current_context().exit(INTERRUPTED)
@@ -170,22 +197,26 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
             stage.start_home()
             angle = stage.wait(timeout)
         except BaseException:
-            # Also after a search that failed: the state of the controller is not known. The first error is reported.
+            # Stop also after a failed search, because the state of the controller is unknown. The first error counts.
             with suppress(DeviceError):
                 stage.stop()
             raise
-        click.echo(f"The stage has found its reference and is at {math.degrees(angle):.4f} deg.")
+        click.echo(f"The stage has found its reference mark and is at {math.degrees(angle):.4f} deg.")
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def recover(file: Path, as_json: bool) -> None:
-    """Turn FILE, whose writer died, into an ordinary scan file; of the folder of a run, all its files.
+    """Repair the file of a scan whose process was killed, so that any program can read it.
 
-    Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
-    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. The frames
-    are copied, which takes time and room; whatever stops it leaves FILE as it was.
+    \b
+    beamline recover RUN            repair all files in the folder of a run
+    beamline recover RUN/scan.h5    repair one file
+
+    All complete frames are kept; a frame that was being written is dropped. Any program can then open the file; it
+    has the group /exchange and the status `failed`. A file that is in order is not changed. The frames are copied,
+    which takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
     """
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan
@@ -200,7 +231,7 @@ def recover(file: Path, as_json: bool) -> None:
 
 
 def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
-    """Report each recovered file of a run, and the parts that were left out."""
+    """Report each repaired file of a run, and the parts that were left out."""
     for sentence in left_out:
         click.echo(f"Warning: {sentence}", err=True)
     for done in recovered:
@@ -211,16 +242,28 @@ def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sin
 
 @click.group()
 def config() -> None:
-    """Print a configuration template, a complete configuration, or the schema."""
+    """Print a configuration to edit, a configuration with all defaults, or the JSON schema.
+
+    \b
+    beamline config init > my.yaml                 simulated devices, to edit
+    beamline config init --instrument > my.yaml    a real instrument, to edit
+    beamline config show my.yaml                   my.yaml with all defaults
+    """
 
 
-@config.command(short_help="Print a configuration template to edit.")
-@click.option("--instrument", is_flag=True, help="A template for a real instrument instead of simulated devices.")
+@config.command(short_help="Print a configuration to edit.")
+@click.option("--instrument", is_flag=True, help="For a real instrument. Default: for simulated devices.")
 @click.argument("file", metavar="", required=False)
 def init(instrument: bool, file: str | None) -> None:
-    """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
+    """Print a complete configuration with comments, to edit.
+
+    \b
+    beamline config init > my.yaml
+    """
     if file is not None:
-        raise click.UsageError(f"config init prints a configuration and writes no file: beamline config init > {file}")
+        raise click.UsageError(
+            f"config init prints the configuration and writes no file. Use: beamline config init > {file}"
+        )
     from beamline.config.load import config_folder
 
     name = "instrument.yaml" if instrument else "simulated.yaml"
@@ -231,7 +274,11 @@ def init(instrument: bool, file: str | None) -> None:
 @config_argument
 @set_option
 def show(file: Path, overrides: tuple[str, ...]) -> None:
-    """Print CONFIG as a scan would use it: with all defaults, --set and BEAMLINE_* variables applied."""
+    """Print CONFIG as a scan would use it: with all defaults, --set and BEAMLINE_* variables applied.
+
+    \b
+    beamline config show my.yaml --set scan.period_s=0.2
+    """
     from beamline.config.load import load, resolved_yaml
 
     click.echo(resolved_yaml(load(file, overrides)), nl=False)
@@ -239,7 +286,11 @@ def show(file: Path, overrides: tuple[str, ...]) -> None:
 
 @config.command("schema", short_help="Print the JSON schema of a configuration.")
 def print_schema() -> None:
-    """Print the JSON schema of a configuration, for editors that complete and check YAML files."""
+    """Print the JSON schema of a configuration, for editors that complete and check YAML files.
+
+    \b
+    beamline config schema > schema.json
+    """
     from beamline.config.load import schema
 
     click.echo(json.dumps(schema(), indent=2, allow_nan=False))
@@ -251,19 +302,25 @@ def print_schema() -> None:
 @click.option(
     "--rehearse",
     is_flag=True,
-    help="Show the configuration with simulated devices, as `beamline scan --rehearse` would run it.",
+    help="Check the configuration with simulated devices in place of the real ones, as `beamline scan --rehearse` runs "
+    "it.",
 )
 @click.option(
     "--connect",
     is_flag=True,
-    help="Also connect each device, and print who it is and how it stands; no other program may use it meanwhile.",
+    help="Also connect to every device and print its identity and status. Close other programs that use the devices "
+    "first.",
 )
 @json_option
 def check(file: Path, overrides: tuple[str, ...], rehearse: bool, connect: bool, as_json: bool) -> None:
-    """Validate CONFIG. Nothing moves.
+    """Check CONFIG for errors, and print the plan of its scan. Nothing moves.
 
-    Prints the timeline of the scan: speed, taxi, angular step in counts, motion blur and rolling-shutter skew in
-    pixels, duration, bytes to write and free disk space.
+    \b
+    beamline check my.yaml
+    beamline check my.yaml --connect    also connect to every device
+
+    The plan has the speed of the stage, its run-up, the angular step in counts of the stage, motion blur and
+    rolling-shutter skew in pixels, the duration, the size of the data and the free disk space.
 
     Exit code: 0 valid, 2 wrong configuration or violated limit, 3 a device does not answer.
     """
@@ -286,7 +343,7 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, connect: bool,
 
 
 def _read_devices(config: Config, as_json: bool, sink: Sink) -> None:
-    """Print what each device says. Raises DeviceError at the end if one does not answer."""
+    """Print identity and status of each device. Raises DeviceError at the end if one does not answer."""
     from beamline.instrument.states import SHOWN, device_states
 
     clock, silent = SystemClock(), list[str]()
@@ -300,5 +357,5 @@ def _read_devices(config: Config, as_json: bool, sink: Sink) -> None:
                 )
                 click.echo(f"{state.name:<14}{sentence}")
     if silent:
-        advice = "Nothing has moved. Each line above says what to do"
+        advice = "Nothing has moved. The lines above say what to do for each device"
         raise DeviceError("devices", f"{' and '.join(silent)} cannot be used", advice=advice)

@@ -1,4 +1,4 @@
-"""The command `beamline`: imports the subcommand in use, maps errors to exit codes, and outlives a closed terminal."""
+"""The command `beamline`: loads the subcommand in use, turns errors into exit codes, and survives a closed terminal."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from recon.compiled import use_compiled_kernels
 
 @dataclass(frozen=True)
 class CommandEntry:
-    """A command: the module that defines it, and its one-line help.
+    """A command: the module that defines it, and its one-line summary in `beamline --help`.
 
     Attributes:
-        module: in which the command has its own name, "-" as "_".
-        files: its results are files or moves; its output is only a summary.
-        command: of another package, which is loaded.
+        module: the module with the command. Its function has the name of the command, with "_" for "-".
+        files: True if the results are files or movements, so that the printed output is only a summary.
+        command: the command itself, if it is of another package (which is loaded then).
     """
 
     module: str
@@ -56,24 +56,34 @@ class CommandEntry:
 
 
 CORE = {
-    "check": CommandEntry("beamline.cli.control", "Validate a configuration. Nothing moves.", files=False),
-    "home": CommandEntry("beamline.cli.control", "Search the stage's reference position. The stage turns."),
-    "scan": CommandEntry("beamline.cli.scan", "Run a scan, or print its plan with --dry-run."),
-    "pause": CommandEntry("beamline.cli.control", "Pause a running scan, from another terminal: no view is lost."),
-    "resume": CommandEntry("beamline.cli.control", "Let a paused scan go on."),
-    "stop": CommandEntry("beamline.cli.control", "Stop a running scan cleanly, from another terminal."),
-    "abort": CommandEntry("beamline.cli.control", "Abort a running scan at once, from another terminal."),
-    "decide": CommandEntry("beamline.cli.control", "Say what a scan that asks measures next, from another terminal."),
-    "recon": CommandEntry("beamline.cli.recon", "Reconstruct a scan, finished or still running."),
-    "recover": CommandEntry("beamline.cli.control", "Make an ordinary scan file of one whose writer died."),
+    "check": CommandEntry(
+        "beamline.cli.control", "Check a configuration and print the plan of its scan. Nothing moves.", files=False
+    ),
+    "home": CommandEntry("beamline.cli.control", "Turn the stage to its reference mark. THE STAGE TURNS."),
+    "scan": CommandEntry("beamline.cli.scan", "Run a scan and reconstruct it; --dry-run prints only the plan."),
+    "pause": CommandEntry(
+        "beamline.cli.control", "Pause a running scan (from another terminal). No projection is lost."
+    ),
+    "resume": CommandEntry("beamline.cli.control", "Continue a paused scan (from another terminal)."),
+    "stop": CommandEntry("beamline.cli.control", "Stop a running scan cleanly (from another terminal)."),
+    "abort": CommandEntry("beamline.cli.control", "Abort a running scan at once (from another terminal)."),
+    "decide": CommandEntry(
+        "beamline.cli.control", "Tell a scan that waits for your decision what to measure next (from another terminal)."
+    ),
+    "recon": CommandEntry("beamline.cli.recon", "Reconstruct a scan, finished or still running, and write a report."),
+    "recover": CommandEntry(
+        "beamline.cli.control", "Repair the file of a scan whose process was killed, so that any program can read it."
+    ),
     "monitor": CommandEntry(
-        "beamline.cli.monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False
+        "beamline.cli.monitor", "Check every frame of a scan file, as the monitor does during a scan.", files=False
     ),
     "config": CommandEntry(
-        "beamline.cli.control", "Print a configuration template, a complete configuration, or the schema.", files=False
+        "beamline.cli.control",
+        "Print a configuration to edit, a configuration with all defaults, or the JSON schema.",
+        files=False,
     ),
 }
-"""What acquires, watches and reconstructs, in the order of the help."""
+"""The commands that acquire, check and reconstruct scans, in the order of the help."""
 
 
 @cache
@@ -273,10 +283,18 @@ _MOST_THREADS = 4096  # numba starts all of them, and a system that refuses one 
 @click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(version(), prog_name="beamline")
 @click.option(
-    "--debug", is_flag=True, envvar="BEAMLINE_DEBUG", help="Print the full traceback if a defect ends the program."
+    "--debug",
+    is_flag=True,
+    envvar="BEAMLINE_DEBUG",
+    help="Print the full Python traceback if a defect ends the program.",
 )
 def main(debug: bool) -> None:
-    """X-ray micro-tomography from trigger to volume: acquire, monitor, reconstruct.
+    """Run X-ray micro-tomography scans, check every frame, and reconstruct them.
+
+    \b
+    beamline demo             scan and reconstruct a simulated battery
+    beamline recon SCAN.h5    reconstruct your own scan
+    beamline COMMAND --help   what a command does, an example, and its options
 
     Results go to stdout, messages and progress to stderr.
     """

@@ -1,4 +1,4 @@
-"""Options of reconstruction methods, and their allowed combinations."""
+"""Options of the reconstruction methods, and which of them can be combined."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.methods import METHODS, accepting, build, by_name, has_setting, takin
 def checkpoint_output(path: Path) -> Path:
     """The path of a checkpoint to write. Raises ValueError for a path without a file name."""
     if not path.name:
-        raise ValueError(f"{str(path)!r} is no file; name one, such as fit.checkpoint.h5")
+        raise ValueError(f"{str(path)!r} is not a file name; expected a name such as fit.checkpoint.h5")
     return path
 
 
@@ -41,9 +41,9 @@ def levels_of(given: str | Sequence[float]) -> tuple[float, ...]:
     try:
         levels = tuple(float(part) for part in parts)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{given!r} are no densities; expected numbers such as 0.1,0.5") from error
+        raise ValueError(f"{given!r} is not a list of densities; expected numbers such as 0.1,0.5") from error
     if len(levels) < 2 or any(not low < high for low, high in pairwise(levels)):
-        raise ValueError(f"{given!r}: expected two or more densities, each above the one before")
+        raise ValueError(f"{given!r}: expected two or more densities in ascending order")
     return levels
 
 
@@ -64,15 +64,17 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
     settings = settings_of(command, values)
     for path in settings:
         if not set(methods) & set(owners := taking(path)):
-            raise click.UsageError(f"--{options[path]} is of {', '.join(owners)}; no row is by one of these.")
+            raise click.UsageError(
+                f"--{options[path]} belongs to {', '.join(owners)}; no row uses one of these methods."
+            )
     return {method: {path: value for path, value in settings.items() if method in taking(path)} for method in methods}
 
 
 def takers(option: Declared) -> tuple[str, ...]:
-    """Names of the methods that have an option."""
+    """Names of the methods that an option belongs to."""
     if option.setting:
         return taking(option.setting)
-    from recon.auto import Auto  # here, because it loads all methods
+    from recon.auto import Auto  # imported here because it loads all methods
 
     return (*((AUTO,) if option.argument in Auto.takes else ()), *accepting(option.argument))
 
@@ -81,38 +83,38 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
     """Raise UsageError for a given option that belongs to other methods than this one.
 
     Args:
-        stated: somebody chose the method; else it is the default.
+        stated: True if the user chose the method; False if it is the default.
     """
     of_methods = {name: param for name, param in declared(command).items() if param.setting or param.argument}
     asked = {name: param for name, param in of_methods.items() if name in given}
     if method in METHODS and all(param.setting for param in asked.values()):
         own = by_name(method)
         if all(has_setting(own, param.setting) for param in asked.values()):
-            return  # without a look at the other methods, which load torch
+            return  # before the other methods are asked, because they load torch
     owners = {name: takers(param) for name, param in asked.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
         what = f"it does not go with --method {method}." if stated else _instead(name, owners)
-        raise click.UsageError(f"--{name} is of {', '.join(owners[name])}; {what}")
+        raise click.UsageError(f"--{name} belongs to {', '.join(owners[name])}; {what}")
 
 
 def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
-    """What to do about an option where no method was chosen: another option may be of other methods alone."""
+    """What to do about an option if no method was chosen. Another given option may belong only to other methods."""
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
-        return "give --method with one of these."
-    return f"--{others[-1]} is of {', '.join(owners[others[-1]])}. Give one of the two options."
+        return "add --method with one of these."
+    return f"--{others[-1]} belongs to {', '.join(owners[others[-1]])}. Give only one of the two options."
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
     """The method of this name with its settings; settings of other methods are ignored.
 
     Args:
-        name: in `recon.methods`, or of `recon.Auto`.
+        name: name of a method in `recon.methods`, or that of `recon.Auto`.
         settings: values by path.
-        any_setting: values by path, as `--set` gives them; the method must have every one of these settings.
+        any_setting: values by path from `--set`; the method must have every one of these settings.
     """
     if name == AUTO:
-        from recon.auto import Auto  # here, because it loads all methods
+        from recon.auto import Auto  # imported here because it loads all methods
 
         return Auto(tuple(method_with(each.name, settings, any_setting) for each in Auto().candidates))
     method = by_name(name)
@@ -130,7 +132,7 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")
         if not (name and equals and text):
-            raise click.BadParameter(f"{word!r} is no setting; expected NAME=VALUE, such as fit.decay=0.1")
+            raise click.BadParameter(f"{word!r} is not a setting; expected NAME=VALUE, such as fit.decay=0.1")
         try:
             settings[name] = json.loads(text)
         except ValueError:
@@ -140,27 +142,27 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
 
 def slabs_resumed(path: Path | None) -> Path | None:
     """The file of --resume if it is a partial volume; else None."""
-    from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
+    from beamline.storage.writers.partial_volume import is_partial  # imported here because help does not need it
 
     return path if path is not None and is_partial(path) else None
 
 
 SLABS_RESUMED = "resume of slabs"
-"""Stands for `--resume` of a partial volume, which has rules of its own."""
+"""Name for `--resume` with a partial volume, because other rules apply to it than to a checkpoint."""
 _OF_ONE_VOLUME = {
     "roi": "a box belongs to one volume",
-    "truth": "a truth is compared with one volume",
+    "truth": "a ground truth is compared with one volume",
     "uncertainty": "error bars belong to one volume",
-    **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes are not made in slabs"),
+    **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes cannot be reconstructed in slabs"),
 }
-"""Options that several volumes, in time or of materials, do not go with."""
+"""Options that cannot be combined with several volumes (in time, or of materials)."""
 
-_FINISHED = {"follow": "it is for a finished scan"}
-_PLANNED = {"quality": "--quality chooses it"}
-_BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
-NOT_WITH_SLABS = {"follow": "such a run holds everything in memory"}
+_FINISHED = {"follow": "it needs a finished scan"}
+_PLANNED = {"quality": "--quality sets it"}
+_BY_SECONDS = {"follow": "it needs a finished scan; use --seconds"}
+NOT_WITH_SLABS = {"follow": "a reconstruction of a running scan keeps everything in memory"}
 NOT_WITH_ERROR_BARS = dict.fromkeys(
-    ("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits"
+    ("follow", "budget", "seconds"), "error bars need the complete scan, and time for two further fits"
 )
 
 _STEPS = option(
@@ -168,57 +170,59 @@ _STEPS = option(
     setting="steps",
     excludes={"seconds": "give one of them", **_PLANNED},
     type=WholeRange(min=1),
-    help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}.",
+    help=f"Number of steps of the Gaussian fit (r2). Default: {DEFAULT_STEPS}.",
 )
 _GAUSSIANS = option(
     "--gaussians",
     setting="gaussians",
     excludes=_PLANNED,
     type=WholeRange(min=1),
-    help="Number of Gaussians at the start.",
+    help="Number of Gaussians at the start of the fit (r2). Default: chosen from the size of the detector.",
 )
 _FINISH = option(
     "--finish",
     setting="finish",
     excludes={**_PLANNED, **_FINISHED},
     type=WholeRange(min=0),
-    help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
-    "with sparse patches where these predict held-out views better.",
+    help="Number of iterations on the voxel volume after the Gaussian fit; they restore edges, cracks and pores. 0: "
+    "none. Default: 8 with total variation, then PnP-DCT steps if these predict held-out projections better.",
 )
 _ITERATIONS = option(
     "--iterations",
     setting="iterations",
     type=WholeRange(min=1),
-    help="Iterations of an iterative method. Default: depends on the method.",
+    help="Number of iterations, for the methods that iterate on voxels. Default: a fixed number for each method, for "
+    "example 20 for fista-tv.",
 )
 _TV_WEIGHT = option(
     "--tv-weight",
     setting="tv_weight",
     type=POSITIVE,
-    help="Weight of the total variation, relative to the density of the sample.",
+    help="Regularisation weight of the total variation, relative to the density of the sample: a larger weight gives a "
+    "smoother volume. Default: chosen with held-out projections.",
 )
 _PATCH_THRESHOLD = option(
     "--patch-threshold",
     setting="patch_threshold",
     type=POSITIVE,
-    help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
-    "Default: chosen by held-out views.",
+    help="Threshold of the PnP-DCT denoiser, relative to the density of the sample: smaller cosine coefficients of a "
+    "patch are set to 0. Default: chosen with held-out projections.",
 )
 _LEVELS = option(
     "--levels",
     setting="levels",
     callback=parsed(levels_of),
     metavar="A,B,...",
-    help="Densities of the sample's materials in 1/mm, ascending, for discrete. Default: two to four levels, as "
-    "held-out views prefer.",
+    help="Densities of the materials of the sample in 1/mm, in ascending order, for discrete. Default: two to four "
+    "levels, chosen with held-out projections.",
 )
 _ALLOW_NEGATIVE = option(
     "--allow-negative",
     setting="allow_negative",
     excludes=_FINISHED,
     is_flag=True,
-    help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
-    "with it.",
+    help="Do not set negative voxels to zero (nor in --finish). Use it if the air level is below zero, because setting "
+    "voxels to zero then also removes weakly absorbing material.",
 )
 _IN_TIME = together(
     option(
@@ -228,15 +232,16 @@ _IN_TIME = together(
         excludes={**_FINISHED, **_OF_ONE_VOLUME},
         type=WholeRange(min=2),
         metavar="N",
-        help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
-        "views. Each needs twelve views or more.",
+        help="For a sample that changes during the scan: reconstruct N volumes at equal time steps, from one fit of "
+        "all projections, into one .h5. Each volume needs at least 12 projections. Default: one volume.",
     ),
     option(
         "--moves/--no-moves",
         setting="moves",
-        needs=("volumes", "sets volumes in time: give --volumes N with it."),
+        needs=("volumes", "applies to a time series: add --volumes N."),
         default=None,
-        help="With --volumes: matter moves, or only its density changes. Default: chosen by held-out views.",
+        help="With --volumes: the material moves, or only its density changes. Default: chosen with held-out "
+        "projections.",
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -245,12 +250,12 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that make one volume"),
+        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that reconstruct one volume"),
     },
     type=POSITIVE,
     metavar="EACH",
-    help="Compare in equal time: each reconstruction ends when so many seconds are over. Direct methods take what they "
-    "take.",
+    help="Compare the methods in equal time: each reconstruction stops after this number of seconds. Methods without "
+    "iterations, such as fbp, take the time they need.",
 )
 """The time of every row of a table."""
 method_options = together(
@@ -261,9 +266,9 @@ method_options = together(
         setting="seconds",
         excludes=_PLANNED,
         type=POSITIVE,
-        help="Time of the whole call, instead of --steps: the fit gets what reading, correction, report and writing "
-        "leave, which it does not shorten. If that is nothing, a warning says when the call will end. With --follow: "
-        "most time after the end of the scan.",
+        help="Time limit in seconds for the whole command, instead of --steps. Reading, correction, report and writing "
+        "take the time they need; the fit gets the rest. If nothing is left for the fit, a warning says when the "
+        "command will end. With --follow: time limit after the end of the scan.",
     ),
     option(
         "--budget",
@@ -271,14 +276,17 @@ method_options = together(
         excludes={"quality": "give one of them", **_BY_SECONDS},
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
-        help="Time from line integrals to volume: auto leaves out the methods whose forecast is longer.",
+        help="Time limit of the reconstruction itself, without reading and correction: auto does not try methods that "
+        "are expected to take longer. Default: no limit.",
     ),
     option(
         "--quality",
         argument="quality",
         excludes=_BY_SECONDS,
         type=NameChoice(list(PRESETS)),
-        help="Preset of steps and Gaussians; of auto, of what is tried.",
+        help="Preset. For r2: number of steps and of Gaussians (preview: 125 steps and half the Gaussians; standard: "
+        "400 steps; best: 1500 steps). For auto: preview tries only fbp and fista-tv; best tries all methods and "
+        "accepts any improvement. Default: standard.",
     ),
     _GAUSSIANS,
     option(
@@ -286,21 +294,23 @@ method_options = together(
         setting="start",
         excludes=_FINISHED,
         type=NameChoice(get_args(Start)),
-        help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
-        "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
+        help="Volume from which the initial Gaussians are sampled. tv: slower, but without the streaks of few "
+        "projections. published: FBP with a plain ramp filter, sampled and weighted as in the paper. Default: fbp; for "
+        "r2-published: published.",
     ),
     option(
         "--loss",
         setting="fit.loss",
         type=NameChoice(get_args(Loss)),
-        help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
+        help="Loss of the Gaussian fit, in addition to SSIM: l1 (absolute differences), l2 (squared differences) or "
+        "poisson (squared differences weighted by the photon noise). Default: l1.",
     ),
     option(
         "--kernel",
         setting="fit.kernel",
         type=NameChoice([kernel.value for kernel in Kernel]),
-        help="Shape of the Gaussians: true ones, or compact ones that end, (1 - r²/8)^1.5. "
-        f"Default: {KERNEL}; gaussian by r2-published.",
+        help="Shape of the Gaussians. gaussian: true Gaussians. compact:1.5: the function (1 - r²/8)^1.5, which is "
+        f"zero beyond a finite radius. Default: {KERNEL}; for r2-published: gaussian.",
     ),
     heading(RESOURCES),
     option(
@@ -310,7 +320,7 @@ method_options = together(
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
-        help="Device that computes the fit, total variation and patches.",
+        help="Processor or graphics card that computes the Gaussian fit, total variation and PnP-DCT.",
     ),
     heading(METHOD),
     option(
@@ -318,7 +328,8 @@ method_options = together(
         setting="early_stop",
         excludes=_FINISHED,
         is_flag=True,
-        help="End the fit when held-out views stop improving; holds out every tenth unless --views does.",
+        help="Stop the fit when the residual in the held-out projections no longer falls. Every tenth projection is "
+        "held out, unless --views already leaves some out.",
     ),
     _FINISH,
     heading(OUTPUT),
@@ -329,7 +340,8 @@ method_options = together(
         of_one_call=True,
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
-        help="Write the state of the fit to this file: every minute, at the end, and at Ctrl-C.",
+        help="Save the state of the fit in this file every minute, at the end and at Ctrl-C, so that --resume can "
+        "continue it.",
     ),
     option(
         "--resume",
@@ -338,8 +350,8 @@ method_options = together(
         of_one_call=True,
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),
-        help="Continue the fit from this checkpoint, or make the slabs that this partial volume lacks: with the same "
-        "data and options.",
+        help="Continue from this file: a fit from its checkpoint, or a volume in slabs from its OUTPUT.partial.h5. "
+        "Give the same data and options as before.",
     ),
     heading(METHOD),
     _ITERATIONS,
@@ -353,8 +365,8 @@ method_options = together(
         setting="fit.rays.rectified",
         inverted=True,
         is_flag=True,
-        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It has a bias that the "
-        "corrected projection avoids.",
+        help="Project the Gaussians as 3D Gaussian splatting does, with the same length for all rays in a Gaussian. "
+        "This has a bias that the default avoids; use it only for comparison.",
     ),
     option(
         "--set",
@@ -362,8 +374,8 @@ method_options = together(
         multiple=True,
         metavar="NAME=VALUE",
         callback=settings_given,
-        help="Any setting of the method by its name in Python, such as fit.decay=0.1 or fit.policy.every=50. "
-        "May be repeated.",
+        help="Any setting of the method by its name in Python, for example fit.decay=0.1 or fit.policy.every=50. "
+        "Can be given several times.",
     ),
 )
 """The options of the fit and of the iterative methods."""

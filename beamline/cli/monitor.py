@@ -1,4 +1,4 @@
-"""`beamline monitor`: looks at the frames of a scan file with the checks that look at a running scan."""
+"""`beamline monitor`: checks every frame of a scan file, with the checks that run during a scan."""
 
 from __future__ import annotations
 
@@ -28,20 +28,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MonitorRequest:
-    """What `beamline monitor` is asked for."""
+    """The arguments of `beamline monitor`."""
 
     file: Path = set_by(scan_argument)
-    follow: bool = set_by("--follow", is_flag=True, help="Follow a scan that is still running.")
+    follow: bool = set_by("--follow", is_flag=True, help="Check a scan that is still running, until it ends.")
     config: Path | None = set_by(
         "--config",
         type=click.Path(path_type=Path),
-        help="Configuration with the limits, in its sections `monitor` and `references`. Default: the default limits.",
+        help="Configuration whose sections `monitor` and `references` set the limits. Default: the limits in "
+        "docs/monitor.md.",
     )
     overrides: tuple[str, ...] = set_by(set_option)
     sheet: Path | None = set_by(
         "--sheet",
         type=click.Path(path_type=Path, dir_okay=False),
-        help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
+        help="Write a picture of the worst frames, with the flagged regions marked, to this new PNG file.",
     )
     values: Mapping[str, Any] = others(scan_options)
     as_json: bool = set_by(json_option)
@@ -54,10 +55,15 @@ class MonitorRequest:
 @heading(DATA)
 @with_request(MonitorRequest)
 def monitor(request: MonitorRequest) -> None:
-    """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
+    """Check every frame of the scan in FILE, as the monitor does during a scan.
 
-    Prints the flags by check and level: frames, worst score, limit, where in the frame, what to do; and which checks
-    could not look at which views. FILE is not changed.
+    \b
+    beamline monitor SCAN.h5
+    beamline monitor SCAN.h5 --sheet worst.png    also draw the worst frames
+
+    FILE may have any format that `beamline recon` reads, and is not changed. For each check the command prints the
+    flagged frames, the worst score with its limit, the place in the frame and what to do. It also prints which checks
+    could not be applied to which projections.
 
     Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
     """
@@ -66,7 +72,7 @@ def monitor(request: MonitorRequest) -> None:
     from beamline.monitor.checks import CHECKS
 
     if request.overrides and request.config is None:
-        raise click.UsageError("--set changes a value of the configuration: give --config too.")
+        raise click.UsageError("--set changes a value of a configuration: add --config.")
     if request.sheet is not None:
         refuse_existing(request.sheet)
     clock = SystemClock()
@@ -87,13 +93,15 @@ def monitor(request: MonitorRequest) -> None:
     if watched.stopped:
         raise ScanStopped(f"{request.file}: stopped after {n} frames.")
     if alarmed or references:
-        faults = f", and groups of references with a fault: {len(references)}" if references else ""
-        raise AlarmError(f"{request.file}: {len(alarmed)} of {n} frames have an alarm{faults}; stdout lists them.")
+        faults = f"; groups of darks or flats with a fault: {len(references)}" if references else ""
+        raise AlarmError(
+            f"{request.file}: {len(alarmed)} of {n} frames have an alarm{faults}. They are listed on stdout."
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _Watched:
-    """A scan that the checks have looked at: the verdict, how it ended, and a stop."""
+    """Result of checking a scan: the verdict, how the scan ended, and whether the command was stopped."""
 
     verdict: ScanVerdict
     ended: Sequence[str]
@@ -101,22 +109,22 @@ class _Watched:
 
 
 def _in_lines(file: Path, watched: _Watched) -> list[str]:
-    """The verdict on a scan as the terminal shows it."""
+    """The verdict on a scan, as lines for the terminal."""
     from beamline.storage.flag_legend import counted
 
     summed = watched.verdict
     end = f"{one_line(str(file), SENTENCE)}: {summed.n_frames} frames, flagged: {counted(summed.flags)}"
     if again := summed.retaken:
-        end += f"; taken again, so that it does not count: {frames_text(again)}"
+        end += f"; not counted, because it was taken again: {frames_text(again)}"
     altered = [summed.altered] if summed.altered else []
-    left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
+    left_out = [f"Not checked: {'; '.join(summed.aside)}."] if summed.aside else []
     return [*table(summed.kinds), *summed.references, *altered, *left_out, *watched.ended, end]
 
 
 def _watched(
     request: MonitorRequest, checks: Sequence[Check], limits: ReferenceLimits | None, sink: Sink, clock: Clock
 ) -> _Watched:
-    """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
+    """Check every frame, report its flags, and write the picture of the worst frames if the user asked for it."""
     from beamline.projections.replay import replay, verdict
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
@@ -151,7 +159,7 @@ def _watched(
 
 
 def _facts(file: Path, summed: ScanVerdict) -> dict[str, Any]:
-    """What the event `done` says of a scan."""
+    """The contents of the event `done`."""
     return {
         "file": file, "n_frames": summed.n_frames, "alarmed_frames": len(summed.alarmed),
         "retaken": len(summed.retaken), "flags": summed.flags, "references": summed.references,

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share: how values are parsed and compared, and what --json prints."""
+"""Arguments and options that several commands share: parsing, rules between options, and the output of --json."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from recon.methods import METHODS
 
 
 def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any) -> Any:
-    """The number, where it is within the bounds; else it is refused in the words of a declared value."""
+    """The number if it is within the bounds; otherwise raise the usage error that a setting in Python would raise."""
     low, high = "gt" if bounds.min_open else "ge", "lt" if bounds.max_open else "le"
     limits: dict[str, Any] = {low: bounds.min, high: bounds.max}
     if fault := Setting(**limits).fault(number):
@@ -35,8 +35,23 @@ def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any)
     return number
 
 
+def _bounds_text(bounds: click.FloatRange | click.IntRange) -> str:
+    """The bounds for the help of an option: `at least 1`, `above 0`, `0 to 65535`; empty without bounds."""
+    low, high = bounds.min, bounds.max
+    if low is not None and high is not None:
+        return f"{low} to {high}"
+    if low is not None:
+        return f"{'above' if bounds.min_open else 'at least'} {low}"
+    return "" if high is None else f"{'below' if bounds.max_open else 'at most'} {high}"
+
+
 class FiniteRange(click.FloatRange):
     """A range of finite numbers; click's own range accepts NaN and infinities."""
+
+    name = "number"
+
+    def _describe_range(self) -> str:
+        return _bounds_text(self)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return _within(self, click.FLOAT.convert(value, param, ctx), param, ctx)
@@ -44,6 +59,11 @@ class FiniteRange(click.FloatRange):
 
 class WholeRange(click.IntRange):
     """A range of whole numbers."""
+
+    name = "n"
+
+    def _describe_range(self) -> str:
+        return _bounds_text(self)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return _within(self, click.INT.convert(value, param, ctx), param, ctx)
@@ -70,7 +90,7 @@ class MethodChoice(NameChoice):
 
 
 def unknown_method(name: str, legal: Iterable[str]) -> str:
-    """Why a method cannot be chosen here, without a full stop."""
+    """Why a method cannot be chosen here, as a sentence without its full stop."""
     if (entry := METHODS.get(name)) is not None and entry.several in _ELSEWHERE:
         return f"{name!r} {_ELSEWHERE[entry.several]}"
     return unknown("method", name, legal)
@@ -79,7 +99,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 _ELSEWHERE = {
     "times": "makes several volumes, in time: use beamline recon --volumes N",
 }
-"""Of methods that make several volumes: what takes them."""
+"""For methods that make several volumes: the command that runs them."""
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
@@ -89,16 +109,16 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class Declared(click.Option):
-    """A click option that says whose it is and what it goes with.
+    """A click option that states which methods it belongs to, and with which options it can be combined.
 
     Args:
-        setting: it is of the methods with this setting, by its path in Python, such as `fit.loss`.
-        argument: it is of the methods that take this beside their settings, see `Method.takes`.
-        inverted: it is a flag that switches the setting off.
-        excludes: long names of options that do not go with it, and why.
-        needs: another option, without which this one means nothing, and the end of the sentence that says so.
-        of_one_call: it is of one scan or call, and not written into a recipe.
-        former: its long name in the last version, which is still understood, and shown nowhere.
+        setting: path of a setting in Python, such as `fit.loss`; the option belongs to the methods with this setting.
+        argument: an argument of methods (see `Method.takes`); the option belongs to these methods.
+        inverted: True for a flag that switches the setting off.
+        excludes: long names of options that cannot be combined with it, each with the reason.
+        needs: another option that this one requires, and the end of the error message without it.
+        of_one_call: True if the option belongs to one scan or one call; it is then not written into a recipe.
+        former: long name in the last version, which is still accepted but not shown in the help.
     """
 
     def __init__(
@@ -124,7 +144,7 @@ class Declared(click.Option):
 
 
 def option(*names: str, **facts: Any) -> Decorator:
-    """`click.option` for a `Declared` one."""
+    """`click.option` that makes a `Declared` option."""
     return click.option(*names, cls=Declared, **facts)
 
 
@@ -134,7 +154,7 @@ def name_of(option: click.Option) -> str:
 
 
 def declared(command: click.Command) -> dict[str, Declared]:
-    """The options of a command that declare rules, by their long names."""
+    """The `Declared` options of a command, by their long names."""
     return {name_of(param): param for param in command.params if isinstance(param, Declared)}
 
 
@@ -144,8 +164,8 @@ def refuse_contradictions(
     """Raise UsageError for two options that exclude each other, or one without another that it requires.
 
     Args:
-        given: long names of the options that the user gave, and of what else options may exclude.
-        shown: how messages name the latter.
+        given: long names of the options that the user gave, and names of other things that options may exclude.
+        shown: how error messages call these other things.
     """
     for name, param in declared(command).items():
         if name not in given:
@@ -163,20 +183,31 @@ set_option = click.option(
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
+    help="Replace a value of the configuration, for example scan.period_s=0.2. Can be given several times.",
 )
 json_option = option(
     "--json", "as_json", is_flag=True, of_one_call=True,
-    help="Print one JSON event per line to stdout.",
+    help="Print JSON to stdout, one event per line, instead of text.",
 )  # fmt: skip
-seed_option = option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
-dataset_option = option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
+seed_option = option(
+    "--seed",
+    type=SEED,
+    default=0,
+    show_default=True,
+    help="Seed of all random numbers. The same seed gives the same result.",
+)
+dataset_option = option(
+    "--dataset",
+    help="Name of the array, if an HDF5 or .npz file holds several. Default: the only array with three axes.",
+)
 
 
 def new_folder_option(default: str) -> Decorator:
-    """Option -o of a command that writes several files; `default` describes the folder without it."""
+    """Option -o of a command that writes several files; `default` describes the folder used without the option."""
     where = click.Path(path_type=Path, file_okay=False)
-    return option("-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in this folder.")
+    return option(
+        "-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in the current folder."
+    )
 
 
 def together(*options: Decorator) -> Decorator:
@@ -194,8 +225,9 @@ def set_by(*options: Decorator | str, **facts: Any) -> Any:
     """A field of a command's request, and the option that sets it.
 
     Args:
-        options: names of the option, or an option or argument whose parameter is named as the field; after headings.
-        facts: as of `option`, beside names.
+        options: names of the option, or a ready-made option or argument whose parameter has the name of the field.
+            Headings may come before it.
+        facts: keyword arguments of `option`.
     """
     return field(metadata={"options": options, "facts": facts})
 
@@ -209,7 +241,7 @@ def with_request(request: type) -> Decorator:
     """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
 
     Args:
-        request: a frozen dataclass whose fields are made by `set_by`, and one of them perhaps by `others`.
+        request: a frozen dataclass whose fields are made by `set_by`; one field may be made by `others`.
     """
     fields_of = {each.name: each.metadata for each in fields(request)}
 
@@ -248,7 +280,7 @@ def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parame
 
 def as_scan(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
     """A callback that replaces the folder of a run by its scan file with all parts."""
-    from beamline.storage.interrupted import scan_file  # here: help needs none of it
+    from beamline.storage.interrupted import scan_file  # imported here because help does not need it
 
     return scan_file(value)
 
@@ -260,14 +292,14 @@ def _as_volume(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
 
 
 scan_argument = click.argument("file", metavar="FILE|RUN", type=click.Path(path_type=Path), callback=as_scan)
-"""A scan: its file, or the folder of a run, which stands for its scan with all parts."""
+"""A scan: its file, or the folder of a run, which means the scan file of the run with all parts."""
 volume_argument = click.argument("volume", metavar="VOLUME|RUN", type=click.Path(path_type=Path), callback=_as_volume)
-"""A volume: its file, or the folder of a run, which stands for its recon.h5."""
+"""A volume: its file, or the folder of a run, which means the file recon.h5 in it."""
 
 
 def volume_path(text: str) -> Path:
     """Check that the suffix of a path names a format of volumes. Raises ValueError otherwise."""
-    from beamline.storage.volumes.files import format_of  # here: help needs none of it
+    from beamline.storage.volumes.files import format_of  # imported here because help does not need it
 
     format_of(Path(text))
     return Path(text)
@@ -288,9 +320,9 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
 
 @contextmanager
 def json_events(as_json: bool) -> Iterator[Sink]:
-    """The sink for JSON on stdout, idle unless `as_json`. An error in the block becomes the event `failed`.
+    """The sink that prints JSON to stdout; without `as_json` it does nothing. An error becomes the event `failed`.
 
-    What anything else prints in the block, such as a plug-in, goes to stderr: stdout holds JSON alone.
+    Anything else that is printed in the block, for example by a plug-in, goes to stderr: stdout has only JSON.
     """
     if not as_json:
         yield fan_out()

@@ -1,4 +1,4 @@
-"""Commands with many options: shown in groups, kept as recipes, and repeated by a command line."""
+"""Commands with many options: help in groups, recipes (files with options), and the command line of a call."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as th
 
 
 class Repeatable(click.Command):
-    """A command that records its options as they were typed."""
+    """A command that records its options as the user typed them."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = list(args)
@@ -33,9 +33,9 @@ class Repeatable(click.Command):
 
 
 def given(ctx: click.Context) -> dict[click.Option, Any]:
-    """The options that the user gave, on the command line or in a recipe, as they were typed there.
+    """The options that the user gave on the command line or in a recipe, with the values as typed.
 
-    A flag that a recipe switches off (`uncertainty: false`) is as if it had not been given.
+    A flag that a recipe switches off (`uncertainty: false`) counts as not given.
     """
     typed = {}
     for param in ctx.command.params:
@@ -97,13 +97,13 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: options by their long names (YAML), or a volume with its recipe. Options on the command "
-        "line override it.",
+        help="Recipe: a YAML file with options by their long names, as --write-config writes it, or a volume, whose "
+        "options are then used again. Options on the command line override it.",
     )(command)
 
 
 _ALLOWED_IN_RECIPES = ("angles", "angle-rows", "darks", "flats", "scanner-file")
-"""Options on the data of one scan that a user may write into a recipe, where they hold for all scans."""
+"""Options about the data of one scan that are allowed in a recipe, in which they apply to all scans."""
 
 
 def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
@@ -124,22 +124,20 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
         if name not in options and name not in former:
             raise click.BadParameter(f"{value}: {unknown('option of a recipe', name, options)}")
         if not isinstance(text, str) or not text:
-            raise click.BadParameter(
-                f"{value}: {name} is not a single value; expected one value, as on the command line"
-            )
+            raise click.BadParameter(f"{value}: {name} must have a single value, as on the command line")
         option = options[name] if name in options else former[name]
         defaults[str(option.name)] = text.split() if option.multiple else text
     ctx.default_map = defaults
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    """The content of a recipe, all values as text: YAML's own rules would turn 61:04 into 3664."""
+    """The content of a recipe, with all values as text, because YAML would turn 61:04 into 3664."""
     try:
         text = _text(path)
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or error
         raise click.BadParameter(f"{path} cannot be read ({why})") from error
-    from beamline.config.tree import yaml_faults  # here, because it loads pydantic
+    from beamline.config.tree import yaml_faults  # imported here because it loads pydantic
 
     with yaml_faults(text, str(path)):
         content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
@@ -157,7 +155,7 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} contains no recipe; expected a volume that `beamline recon` wrote")
+            raise click.BadParameter(f"{path} contains no recipe; expected a volume written by `beamline recon`")
         return str(record.parameters["recipe"])
 
 
@@ -174,7 +172,7 @@ _ALL = "splatline_help_all"
 
 
 def heading(group: str) -> Decorator:
-    """A decorator that puts the options below it into a group, down to the next heading.
+    """A decorator that puts the options below it into a group of the help, down to the next heading.
 
     Args:
         group: one of GROUPS.

@@ -1,4 +1,4 @@
-"""`beamline recon`: reconstructs a scan file; writes a volume and its report."""
+"""`beamline recon`: reconstructs a scan, and writes the volume and a report."""
 
 from __future__ import annotations
 
@@ -44,18 +44,27 @@ if TYPE_CHECKING:
 )
 @recon_options
 def recon(**values: Any) -> None:
-    """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of images, .npy, Zarr, .txrm.
+    """Reconstruct the scan in FILE, and write a volume and a report.
 
-    HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
+    \b
+    beamline recon SCAN.h5                          the method is chosen for you
+    beamline recon SCAN.h5 -m fbp --rows 500:510    a first look at ten slices
+    beamline recon SCAN.h5 -m fista-tv --bin 2      binned 2 x 2, quicker
 
-    Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
-    and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
-    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. Finished
-    slabs of a large volume are kept, even after a kill, in OUTPUT.partial.h5; --resume goes on from there.
+    FILE is HDF5, multi-page TIFF, a folder or .zip of images, .npy, Zarr or .txrm. Known HDF5 layouts are NXtomo,
+    Diamond NeXus and Data Exchange; for any other layout name the datasets with --data-path, --angles-path,
+    --flats-path and --darks-path.
 
-    --volumes N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
+    The volume [z, y, x] is in 1/mm (1/px if the pixel size is unknown). By default it is an NXtomoproc file, which
+    also holds all settings. No file is overwritten, and a failure leaves no partial file.
+
+    The first Ctrl-C stops and keeps the volume reached so far (exit code 4), if at least one step or iteration is done;
+    the second one discards it. Finished slabs of a large volume stay in OUTPUT.partial.h5, even if the process is
+    killed; --resume continues from this file.
+
+    If the sample changes during the scan, --volumes N reconstructs N volumes in time, which `beamline view` plays.
     """
-    there = not values["follow"] and values["write_config"] is None  # a recipe needs no scan
+    there = not values["follow"] and values["write_config"] is None  # a recipe can be written without a scan
     options = options_of(click.get_current_context(), there=there)
     if values["write_config"] is not None:
         if values["output"] is not None:
@@ -70,15 +79,15 @@ def recon(**values: Any) -> None:
 
 
 def options_of(context: click.Context, default: str = "", *, there: bool = False) -> ReconOptions:
-    """The options of the reconstruction that a context of `recon` asks for.
+    """The options of a reconstruction, from the parameters of a click context of `recon`.
 
     Args:
-        default: the method where none is named; empty: the usual one for such options.
-        there: the scan must be there, which is looked at before the libraries that compute are loaded.
+        default: the method if the user names none; empty: the usual method for the given options.
+        there: True if the scan must exist. This is checked before the libraries for the computation are loaded.
 
     Raises:
-        UsageError: options do not go together, a file is named twice, or the method cannot do what is asked.
-        DataError: the scan is not there.
+        UsageError: options exclude each other, a file is named twice, or the method cannot do what is asked.
+        DataError: the scan does not exist.
     """
     values, file = dict(context.params), context.params["file"]
     method = _checked_method(context, default)
@@ -86,7 +95,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     if there and not file.exists():
         with json_events(values["as_json"]):
             raise DataError(f"{file} does not exist.")
-    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
+    from beamline.reconstruct.checkpoints import CheckpointOptions  # imported here because help does not need it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
 
     page = report_beside(path) if values["report"] else None
@@ -98,7 +107,9 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
     built = method_with(method, settings, values["any_setting"])
     if values["region"] is not None and values["max_residual"] is not None and built.makes_boxes:
-        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
+        raise click.UsageError(
+            "--max-residual needs the whole volume, but fbp with --roi computes only the box. Leave out one of the two."
+        )
     same = {each.name: values[each.name] for each in fields(ReconOptions) if each.name in values}
     return ReconOptions(**same | {
         "source": source, "target": OutputPaths(path, page), "selection": selection, "method": built,
@@ -109,13 +120,13 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
 
 
 def _checked_method(context: click.Context, default: str = "") -> str:
-    """The method's name, after all options were found to go together and with it.
+    """The name of the method, after checking that all options can be combined with each other and with the method.
 
     Args:
-        default: the method where none is named; empty: the usual one for such options.
+        default: the method if the user names none; empty: the usual method for the given options.
 
     Raises:
-        UsageError: they do not.
+        UsageError: they cannot be combined.
     """
     asked, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
@@ -141,8 +152,8 @@ def _in_time() -> str:
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError, of the command that asks, for a recipe whose options contradict each other, or cannot be used
-    with a volume, for any scan."""
+    """Raise UsageError for a recipe with options that exclude each other or that do not belong to its method, whatever
+    the scan. The error is one of the command that calls this function."""
     try:
         with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
             values = dict(context.params)
@@ -158,23 +169,24 @@ def run_reconstruction(
     """Write the volume and its report, with progress on the terminal.
 
     Args:
-        values: of the command's parameters; those that it lacks are not given.
-        more: lines that follow the result.
+        values: parameters of the command; a parameter that is missing counts as not given.
+        more: gives further lines to print after the result.
 
     Raises:
-        ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
-        as it should be.
+        ScanStopped: the reconstruction was stopped early; the volume was written.
+        DataError: the volume was written, but not the last checkpoint.
+        QualityError: the volume was written, but its residual is above the limit.
     """
-    from beamline.reconstruct.pipeline import reconstruct_file  # here: help needs none of it
+    from beamline.reconstruct.pipeline import reconstruct_file  # imported here because help does not need it
 
     limit = values.get("max_residual")
     stop = StopOnSignal(ready=options.follow is not None)
 
     def made(event: Event) -> None:
-        """Note when a volume exists: from the method's own first step or iteration on (those of trials and slices have
-        a unit).
+        """Note when a first volume exists, so that Ctrl-C can keep it.
 
-        Of several volumes there are some from the first trial on.
+        It exists from the first step or iteration of the method itself (events of test reconstructions and of slices
+        have a unit). If several volumes are reconstructed, it exists from the first test reconstruction on.
         """
         of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
         if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.volumes > 1)):
@@ -187,10 +199,10 @@ def run_reconstruction(
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
     if lost := record.ending.lost_checkpoint:
-        raise DataError(f"The last checkpoint could not be written: {lost} The volume is in {output}.")
+        raise DataError(f"The last checkpoint could not be written: {lost} The volume was written: {output}.")
     if record.ended_early:
-        raise ScanStopped(f"The reconstruction was stopped early; {output} has the volume reached so far.")
-    if limit is not None:  # only on request: no limit suits every sample
+        raise ScanStopped(f"The reconstruction was stopped early. The volume reached so far is in {output}.")
+    if limit is not None:  # there is no default, because no limit suits every sample
         require(record.metrics, limit)
 
 
@@ -198,10 +210,10 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
     """Raise QualityError if the data residual of a finished volume exceeds the limit."""
     name = "residual_held_out" if "residual_held_out" in metrics else "residual"
     if not metrics[name] <= max_residual:
-        views = "held out" if name == "residual_held_out" else "used"
+        kind = "held-out projections" if name == "residual_held_out" else "projections used"
         raise QualityError(
-            f"The data residual of views {views} is {metrics[name]:.4g}, more than --max-residual {max_residual:g}. "
-            "The volume and its report were written. Check them, the rotation axis and the flags of the scan."
+            f"Check the report, the rotation axis and the flags of the scan: the residual of the {kind} is "
+            f"{metrics[name]:.4g}, more than --max-residual {max_residual:g}. The volume and its report were written."
         )
 
 

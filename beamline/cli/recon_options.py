@@ -1,4 +1,4 @@
-"""What `beamline recon` can be asked for."""
+"""The options of `beamline recon`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from beamline.core.text import memory_size
 from beamline.storage.volumes import suffixes_text
 from recon.base.choices import AUTO
 from recon.base.registry import in_folders
-from recon.methods import names
+from recon.methods import CANDIDATES, names
 
 if TYPE_CHECKING:
     from beamline.reconstruct.region import AroundSample, Region
@@ -36,19 +36,21 @@ if TYPE_CHECKING:
 def cluster_of(text: str) -> str:
     """`local:N` or `tcp://HOST:PORT`. Raises ValueError for any other text."""
     if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+", text):
-        raise ValueError(f"{text!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT")
+        raise ValueError(f"{text!r} is neither local:N (N workers on this computer) nor tcp://HOST:PORT")
     return text
 
 
 _OF_FEATURES = in_folders("recon.features", "METHODS").items()
-_FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not entry.several)
+_FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not (entry.several or name in CANDIDATES))
 
 
 def region_of(text: str) -> Region | AroundSample:
-    """Parse a box of voxels, `z0:z1,y0:y1,x0:x1`, or `auto` for the one around the sample. Raises ValueError for any
-    other text.
+    """Parse a box of voxels, `z0:z1,y0:y1,x0:x1`, or `auto` for the box around the sample.
+
+    Raises:
+        ValueError: any other text.
     """
-    from beamline.reconstruct.region import AroundSample, Region  # here: help needs none of it
+    from beamline.reconstruct.region import AroundSample, Region  # imported here because help does not need it
 
     return AroundSample() if text == "auto" else Region.parse(text)
 
@@ -58,21 +60,22 @@ report_option = option(
     of_one_call=True,
     default=True,
     show_default=True,
-    help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
+    help="Write a report about the volume: an HTML page next to the output, which a browser can print on A4 or as PDF.",
 )
 unfinished_option = option(
     "--unfinished",
     of_one_call=True,
     is_flag=True,
-    help="Accept an incomplete scan, one that failed or is still running, and use its frames.",
+    help="Use the frames of a scan that is incomplete, because it failed or is still running. Without this option the "
+    "command stops with an error.",
 )
 memory_option = option(
     "--memory",
     excludes=NOT_WITH_SLABS,
     metavar="SIZE",
     callback=parsed(memory_size),
-    help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
-    "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
+    help="Memory that may be used, for example 8G or 500M. A parallel-beam scan that needs more is kept on the disk of "
+    "the output and reconstructed slab by slab. Default: 70 % of the free memory, within the limit of a container.",
 )
 
 recon_options = together(
@@ -84,9 +87,11 @@ recon_options = together(
         "-m",
         "--method",
         type=MethodChoice((AUTO, *names())),
-        help="auto chooses fbp, fista-tv, discrete, pnp-dct or r2 by held-out views. r2 fits Gaussians to the views, "
-        "fbp is filtered back-projection, the others iterate on voxels; "
-        f"{_FOR_COMPARISON} are there for comparison. Default: auto; r2 with --follow and with options of the fit.",
+        metavar="NAME",
+        help="Reconstruction method. auto tries fbp, fista-tv, discrete, pnp-dct and r2 on some rows and takes the "
+        "simplest one that predicts held-out projections as well as the best. fbp: filtered back-projection. r2: fit "
+        f"of Gaussians. fista-tv, discrete, pnp-dct: iterations on voxels. All names: {', '.join((AUTO, *names()))} "
+        f"({_FOR_COMPARISON} are meant for comparison). Default: auto; r2 with --follow and with options of the fit.",
     ),
     selection_options,
     method_options,
@@ -96,14 +101,16 @@ recon_options = together(
         type=NameChoice(["ram-lak", "shepp-logan", "hann"]),
         default="hann",
         show_default=True,
-        help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
+        help="Filter of fbp, also of the fbp volume that other methods are compared with. hann suits few or noisy "
+        "projections best.",
     ),
     heading(OUTPUT),
     option(
         "--max-residual",
         type=NOT_NEGATIVE,
         metavar="X",
-        help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
+        help="Largest acceptable residual, as a share of the measured projections: above it the command ends with exit "
+        "code 6. The held-out projections count, if there are any. Default: no limit.",
     ),
     heading(METHOD),
     seed_option,
@@ -112,14 +119,14 @@ recon_options = together(
         "--uncertainty",
         excludes=NOT_WITH_ERROR_BARS,
         is_flag=True,
-        help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv "
-        "and fbp, into an .h5.",
+        help="Also write the standard deviation of each voxel, estimated by fitting two halves of the projections "
+        "again. For auto, r2, fista-tv, discrete, pnp-dct and fbp; needs .h5 output.",
     ),
     option(
         "--truth",
         of_one_call=True,
         metavar="FILE[:A:B]",
-        help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use.",
+        help="Ground truth, to compare the volume with (PSNR, SSIM): .npz, .npy or HDF5. A:B: use only these slices.",
     ),
     option(
         "-o",
@@ -127,7 +134,8 @@ recon_options = together(
         of_one_call=True,
         metavar="PATH",
         callback=parsed(volume_path),
-        help=f"Output: {suffixes_text()}. Default: FILE's stem + _METHOD.h5, in this folder.",
+        help=f"File for the volume; its suffix sets the format: {suffixes_text()}. Default: the name of FILE with "
+        "_METHOD.h5, in the current folder.",
     ),
     report_option,
     heading(DATA),
@@ -136,18 +144,22 @@ recon_options = together(
         excludes={SLABS_RESUMED: "these slabs belong to a finished scan"},
         of_one_call=True,
         is_flag=True,
-        help="Follow a running scan: reconstruct while it grows. A method that needs all views waits for its end.",
+        help="Reconstruct a scan while it is running. Methods that need all projections wait for the end of the scan.",
     ),
     option(
         "--previous-part",
         "earlier",
         former="--earlier",
-        needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts."),
+        needs=(
+            "follow",
+            "is for a run that is still being continued: add --follow, or give the joined.h5 of its parts as FILE.",
+        ),
         of_one_call=True,
         type=click.Path(path_type=Path),
         multiple=True,
         metavar="FILE",
-        help="With --follow: an earlier part of a resumed run, whose views come first. May be repeated.",
+        help="With --follow: file of an earlier part of a resumed run; its projections come first. Can be given "
+        "several times.",
     ),
     unfinished_option,
     heading(RESOURCES),
@@ -158,34 +170,35 @@ recon_options = together(
         of_one_call=True,
         metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
-        help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
-        "or those of a scheduler. It needs splatline-cluster.",
+        help="Reconstruct slabs in parallel with dask.distributed, if the volume is made in slabs: with N workers on "
+        "this computer, or with those of a scheduler. Needs splatline-cluster. Default: one slab after the other.",
     ),
     heading(OUTPUT),
     option(
         "--roi",
         "region",
-        excludes={"follow": "it is for a finished scan", "truth": "a truth is compared with the whole volume"},
+        excludes={"follow": "it needs a finished scan", "truth": "a ground truth is compared with the whole volume"},
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
-        help="Box of voxels to write, of the volume that the same options give without this one. It is made of the "
-        "rows that show it; fbp makes these voxels alone. auto: the box around the sample, as coarse views show it.",
+        help="Write only this box of voxels; the indices are those of the full volume. Only detector rows that see the "
+        "box are used. fbp computes only these voxels; other methods compute full slices and crop them. auto: the box "
+        "around the sample, found in binned projections. Default: all voxels.",
     ),
     option(
         "--write-config",
         of_one_call=True,
         type=click.Path(path_type=Path),
-        help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
-        "done.",
+        help="Save the options of this command as a recipe in this file (-: print it). Without -o, nothing is "
+        "reconstructed.",
     ),
     heading(RESOURCES),
     option(
         "--dry-run",
         "dry",
-        excludes={"follow": "a scan that runs takes its own time", "budget": "it states the time of every method"},
+        excludes={"follow": "the time of a running scan is not known", "budget": "it prints the time of every method"},
         of_one_call=True,
         is_flag=True,
-        help="Print the memory, time and disk space that it will take, and end. Nothing is run.",
+        help="Print the memory, time and disk space that the reconstruction needs, and stop. Nothing is computed.",
     ),
     option(
         "--beside-scan",
@@ -193,9 +206,9 @@ recon_options = together(
         of_one_call=True,
         is_flag=True,
         hidden=True,
-        help="End when stdin does, with the process that started this one.",
+        help="Stop when stdin closes, that is, with the process that started this one.",
     ),
     heading(OUTPUT),
     json_option,
 )
-"""All options of `beamline recon`, and its argument."""
+"""All options and the argument of `beamline recon`."""

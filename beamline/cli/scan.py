@@ -42,49 +42,54 @@ class ScanRequest:
         click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
     )
     dry: bool = set_by(
-        "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
+        "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space, and stop. No device is used."
     )
     overrides: tuple[str, ...] = set_by(set_option)
     rehearse: bool = set_by(
         "--rehearse",
         is_flag=True,
-        help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices.",
+        help="Rehearse the scan: run a CONFIG for a real instrument with simulated devices in place of the real ones.",
     )
-    page: bool = set_by("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
-    no_live: bool = set_by("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
+    page: bool = set_by(
+        "--page",
+        is_flag=True,
+        help="Also show the run in the browser, where it can be paused and stopped, as `beamline watch --control` "
+        "does.",
+    )
+    no_live: bool = set_by("--no-live", is_flag=True, help="Do not reconstruct, neither during the scan nor after it.")
     documents: str | None = set_by(
         "--documents",
         metavar="FILE|tcp://HOST:PORT",
         type=click.Path(dir_okay=False),
-        help="Add the documents of bluesky to FILE, one a line, or send them to a proxy of 0MQ. "
+        help="Write bluesky documents: append them to FILE, one a line, or send them to a 0MQ proxy. "
         'Needs: pip install "splatline[bluesky]".',
     )
     stop_on_failure: bool = set_by(
-        "--stop-on-failure", is_flag=True, help="With several scans: stop after the first one that fails."
+        "--stop-on-failure", is_flag=True, help="With several scans: if one fails, do not start the following scans."
     )
     wait: bool = set_by(
         "--wait",
         is_flag=True,
-        help="With several scans: wait for Enter before each but the first, so that the sample can be changed.",
+        help="With several scans: wait for Enter before each scan except the first, so that you can change the sample.",
     )
     as_json: bool = set_by(json_option)
     output: Path | None = set_by(
         "-o",
         "--output",
         type=click.Path(path_type=Path, file_okay=False),
-        help="Folder for the folders of runs. Default: storage.folder of CONFIG.",
+        help="Folder in which the folder of the run is created. Default: storage.folder of CONFIG.",
     )
     run: Path | None = set_by(
         "--resume",
         metavar="RUN",
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
-            "output": "the run has its folder",
+            "output": "the run already has its folder",
             "rehearse": "a rehearsal starts a new run; RUN has its devices",
-            "documents": "they describe complete scans",
+            "documents": "documents describe complete scans",
         },
-        help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own "
-        "configuration.",
+        help="Continue the run in this folder: take the missing projections, or the missing flats and darks at the "
+        "end, with the configuration stored in the folder.",
     )
 
     @property
@@ -101,18 +106,25 @@ class ScanRequest:
 @click.command(cls=Repeatable)
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
-    """Run the scan in CONFIG, or continue one that ended early (--resume RUN).
+    """Run the scan that CONFIG describes, check every frame, and reconstruct it while the sample rotates.
 
-    Several CONFIGs, or a TABLE with a line for each scan (docs/commands.md), are taken one after the other. One that
-    fails does not stop the others; Ctrl-C does.
+    \b
+    beamline config init > my.yaml     write a configuration to edit
+    beamline scan my.yaml --dry-run    print the plan; nothing moves
+    beamline scan my.yaml              run the scan
+    beamline scan --resume RUN         continue a run that ended early
 
-    With `scan.energies` it is a series: a scan of each energy, in one folder, which --resume takes too.
+    Each run gets a new folder, named with UTC time and sample. The first Ctrl-C, SIGTERM, or closing the terminal
+    stops the scan cleanly; the second Ctrl-C aborts it. The scan file is readable in both cases.
 
-    Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, SIGTERM or a terminal that is
-    closed stops the scan cleanly; the second Ctrl-C aborts it. The file is readable in either case.
+    Several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), run one after the other. If one scan
+    fails, the next one starts anyway; Ctrl-C ends all of them.
 
-    Exit codes: see `beamline --help`. 6 means that darks or flats cannot be used. 7 means that the scan is complete,
-    but frames have an alarm of the monitor, or darks or flats a fault.
+    If CONFIG has `scan.energies`, a scan is taken at each energy, all in one folder. --resume can continue such a
+    series, too.
+
+    Exit codes are listed in `beamline --help`. 6: darks or flats cannot be used. 7: the scan is complete, but frames
+    have an alarm of the monitor, or darks or flats have a fault.
     """
     _refuse_contradictions(request)
     if _are_several_scans(request.files):
@@ -123,7 +135,7 @@ def scan(request: ScanRequest) -> None:
 
 
 def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:
-    """Take a scan, or one at each energy; or complete a run, which may only need joining."""
+    """Run a scan, or one at each energy; or continue a run, whose parts may only need to be joined."""
     from beamline.config.load import load
     from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
@@ -152,10 +164,10 @@ def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> N
 def _one_scan(
     config: Config, series: ResumableRun | None, request: ScanRequest, json_sink: Sink, held: ExitStack
 ) -> None:
-    """Take the scan, or print its plan.
+    """Run the scan, or print its plan.
 
     Raises:
-        AlarmError: it is complete, and frames, darks or flats have a fault.
+        AlarmError: the scan is complete, but frames, darks or flats have a fault.
     """
     for sentence in series.left_out if series else ():
         click.echo(f"Warning: {sentence}", err=True)
@@ -169,22 +181,22 @@ def _one_scan(
     if not request.as_json:
         click.echo("\n".join([_results(result), *rehearsed]))
     if faults := faults_of(result):
-        raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+        raise AlarmError(f"The scan is complete, but {' '.join(faults)} Details are in {result.path.parent}.")
 
 
 def _ask_about(config: Config, *, asked: bool) -> None:
-    """Warn of values that no instrument has, and ask whoever sits at the terminal whether they are meant.
+    """Warn about unusual values of the configuration, and ask the user at the terminal whether they are intended.
 
     Raises:
-        ConfigError: they are not. Nothing has moved.
+        ConfigError: they are not intended. Nothing has moved.
     """
     from beamline.scan.preflight import doubts
 
     sentences = doubts(config)
     for sentence in sentences:
         click.echo(f"Warning: {sentence}", err=True)
-    if sentences and asked and sys.stdin.isatty() and not click.confirm("Scan all the same?", err=True):
-        raise ConfigError("The configuration was not confirmed. Nothing has moved.")
+    if sentences and asked and sys.stdin.isatty() and not click.confirm("Start the scan anyway?", err=True):
+        raise ConfigError("The scan was not started, because the values were not confirmed. Nothing has moved.")
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
@@ -194,13 +206,13 @@ def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> 
 
     planned = hms_text(dry_run(config, request.output).timeline.duration)
     return [
-        f"{'rehearsed':<10}in {hms_text(result.seconds)}. At the instrument the plan takes {planned}, without "
-        "moves of shutter and sample"
+        f"{'rehearsed':<10}in {hms_text(result.seconds)}. At the instrument the scan takes {planned}, plus the time "
+        "for moving shutter and sample"
     ]
 
 
 def _refuse_contradictions(request: ScanRequest) -> None:
-    """Raises UsageError for options that do not go together."""
+    """Raises UsageError for options that exclude each other."""
     context = click.get_current_context()
     refuse_contradictions(context.command, names_given(context))
     if request.file is None and request.run is None:
@@ -214,9 +226,9 @@ def _refuse_contradictions(request: ScanRequest) -> None:
         ("--wait", request.wait, True),
     ):
         if given and of_several is not several:
-            raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
+            raise click.UsageError(f"{name} works only with {'several scans' if of_several else 'a single scan'}.")
     if request.run is not None and request.overrides and request.file is None:
-        raise click.UsageError("--resume continues RUN with its own configuration: leave out --set.")
+        raise click.UsageError("--resume continues RUN with the configuration stored in it: leave out --set.")
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
@@ -225,16 +237,16 @@ def _are_several_scans(files: Sequence[Path]) -> bool:
 
 
 def _queue() -> Any:
-    """The module of the feature whose `take_all` takes several scans. UsageError: this installation has none."""
+    """The module whose `take_all` runs several scans. Raises UsageError if this installation has none."""
     modules = in_folders("beamline.features", "QUEUES")
     if "scan" not in modules:
-        raise click.UsageError("This installation runs one scan at a time: give one CONFIG. Nothing was started.")
+        raise click.UsageError("This installation cannot run several scans: give one CONFIG. Nothing was started.")
     return import_module(modules["scan"])
 
 
 @contextmanager
 def _shown(request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> Iterator[tuple[list[Sink], Ask]]:
-    """The sinks of a scan (terminal and page, then `others`), and the function that asks the operator."""
+    """The event sinks of a scan (terminal, page, then `others`), and the function that asks the operator."""
     from beamline.instrument.connect import ask_operator
 
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
@@ -250,7 +262,7 @@ def run_one(
     held: ExitStack,
     stop: StopRequest | None = None,
 ) -> RunResult:
-    """Run the scan, or the missing energies of `series`, with the terminal, the page and the documents beside it."""
+    """Run the scan, or the rest of the run `series`, with output to the terminal, the page and bluesky documents."""
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
@@ -265,7 +277,7 @@ def run_one(
 
 
 def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
-    """The configuration of a series of energies: the given one, or that in its folder `run`; None: it is one scan."""
+    """The configuration of a series of energies, given or stored in its folder `run`; None if it is a single scan."""
     from beamline.config.load import load
     from beamline.core.files import CONFIG
     from beamline.scan.energies import is_series
@@ -280,12 +292,14 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
     if config is None or config.scan.energies is None:
         return None
     if documents is not None:
-        raise click.UsageError("--documents describes a single scan: leave it out with scan.energies.")
+        raise click.UsageError(
+            "--documents works only with a single scan: leave it out, because the configuration has scan.energies."
+        )
     return config
 
 
 def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
-    """Scan at each energy, or continue the series, with the terminal and the page beside it."""
+    """Scan at each energy, or continue the series, with output to the terminal and the page."""
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
 
@@ -303,7 +317,7 @@ def _show_energies(done: SeriesRun, request: ScanRequest, json_sink: Sink) -> No
         click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
     if faults := [fault for result in done.results for fault in faults_of(result)]:
-        raise AlarmError(f"The scans are complete, but {' '.join(faults)} Look at {done.folder}.")
+        raise AlarmError(f"The scans are complete, but {' '.join(faults)} Details are in {done.folder}.")
 
 
 def faults_of(result: RunResult) -> list[str]:
@@ -313,13 +327,15 @@ def faults_of(result: RunResult) -> list[str]:
     words = []
     if result.alarmed_frames:
         verb = "has" if result.alarmed_frames == 1 else "have"
-        again = f", beside {count(result.retaken, 'view')} that were taken again" if result.retaken else ""
+        again = f" (not counting {count(result.retaken, 'projection')} taken again)" if result.retaken else ""
         words.append(
             f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{again}: "
             f"{counted(result.flags)}."
         )
     if result.alarmed_views and (treated := _treated(result.path)):
-        words.append(f"A reconstruction (--flags use): {treated} Repeat the scan where too many views are lost.")
+        words.append(
+            f"With --flags use, a reconstruction does this: {treated} Repeat the scan if too many projections are lost."
+        )
     return [*words, *result.reference_faults]
 
 
@@ -353,7 +369,7 @@ def _results(result: RunResult) -> str:
         "scan": result.path,
         "frames": str(result.n_frames),
         "flagged": result.flags and f"{counted(result.flags)}; see {folder}",
-        "retaken": result.retaken and f"{result.retaken} flagged views; `beamline recon` uses the new ones",
+        "retaken": result.retaken and f"{count(result.retaken, 'flagged projection')}; recon uses the new ones",
         "volume": None if recon is None else recon.get("output", folder / RECON),
         "report": None if recon is None else recon.get("report"),
     }

@@ -1,4 +1,4 @@
-"""Options of a scan, its part and its corrections; the same for every command that opens one or reconstructs."""
+"""Options about the scan file, the part of the scan and its corrections, shared by all commands that open a scan."""
 
 from __future__ import annotations
 
@@ -34,58 +34,70 @@ scan_options = together(
         "--quantity",
         type=NameChoice(["counts", "transmission", "line-integrals"]),
         callback=underscored,
-        help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
+        help="What the pixel values are, if the file does not say so: raw counts, transmission (0 to 1), or line "
+        "integrals (-log of the transmission).",
     ),
     option(
-        "--horizontal-axis", is_flag=True, help="The rotation axis lies along the rows: turn frames by a quarter turn."
+        "--horizontal-axis",
+        is_flag=True,
+        help="The rotation axis is parallel to the detector rows: rotate all frames by 90°.",
     ),
     option(
         "--angles",
         of_one_call=True,
         type=_PATH,
-        help="File of angles in degrees: a text with one a line, a table with a column named so, .npy, or a list in an "
-        "HDF5 file by its unit; FILE::NAME for one of several.",
+        help="File with the angles in degrees: a text file with one angle a line, a table with a column for them, "
+        ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). Default: "
+        "the angles in the scan file.",
     ),
-    option("--angle-rows", of_one_call=True, metavar="A:B", help="Lines of --angles that belong to the projections."),
+    option(
+        "--angle-rows",
+        of_one_call=True,
+        metavar="A:B",
+        help="Lines of --angles that belong to the projections, from A up to, not including, B. Default: all.",
+    ),
     option(
         "--darks",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of images, .npy, Zarr or HDF5 file (FILE::DATASET) with darks, instead of those in the "
-        "file; or a number, the counts of every pixel.",
+        help="File with darks: TIFF, folder of images, .npy, Zarr or HDF5 (FILE::DATASET); or a number, the counts of "
+        "every pixel in a dark. Default: the darks in the scan file.",
     ),
     option(
         "--flats",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of images, .npy, Zarr or HDF5 file (FILE::DATASET) with flats, instead of those in the "
-        "file.",
+        help="File with flats: TIFF, folder of images, .npy, Zarr or HDF5 (FILE::DATASET). Default: the flats in the "
+        "scan file.",
     ),
     option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file or Zarr of any layout, or of several detectors: its projections, as /raw/images, with "
-        "their dimensions where these are not frame,row,col: /raw/images:frame,col,row.",
+        help="Name of the dataset with the projections, for an HDF5 or Zarr file of unknown layout or with several "
+        "detectors, for example /raw/images. If the dimensions are not frame,row,col, add them: "
+        "/raw/images:frame,col,row.",
     ),
     option(
         "--order",
         metavar="DIMENSIONS",
-        help="Dimensions of the projections, of images one after the other, too, where these are not frame,row,col: "
-        "row,view,col for a stack of sinograms, view,col or col,view for one.",
+        help="Order of the dimensions of the projections, also of a series of images, if it is not frame,row,col: "
+        "row,view,col for a stack of sinograms, view,col or col,view for a single sinogram.",
     ),
-    option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
-    option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
+    option("--darks-path", metavar="DATASET", help="With --data-path: name of the dataset with the darks."),
+    option("--flats-path", metavar="DATASET", help="With --data-path: name of the dataset with the flats."),
     option(
         "--angles-path",
         metavar="DATASET",
-        help="For any HDF5 file: its angles, one for each projection or frame, in the unit that the dataset states.",
+        help="Name of the dataset with the angles in an HDF5 file, one for each projection or for each frame, in the "
+        "unit that the dataset states.",
     ),
     option(
         "--frames",
         metavar="KINDS",
-        help="Kinds of frames, overriding names and keys of the file: darks=0:5,flats=5:10+95:100. Others are views. "
-        "none=30:38+61:62 leaves frames out; alone, it keeps the kinds of the others. "
-        "0::2 or 1::2: every second view, with its darks and flats, where two exposures or thresholds alternate.",
+        help="State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
+        "projections. Overrides the file. none=30:38+61:62 leaves frames out; given alone, the file decides about the "
+        "others. 0::2 or 1::2: use every second projection with its darks and flats, if two exposures or thresholds "
+        "alternate.",
     ),
     option(
         "--append",
@@ -95,7 +107,7 @@ scan_options = together(
         multiple=True,
         type=_PATH,
         metavar="FILE",
-        help="A further file of the same scan, whose frames follow. May be repeated.",
+        help="Another file of the same scan; its frames follow those of FILE. Can be given several times.",
     ),
     option(
         "--scanner-file",
@@ -104,45 +116,51 @@ scan_options = together(
         of_one_call=True,
         type=_PATH,
         metavar="FILE",
-        help="File of the scanner's vendor beside the images (.xtekct, .log, .pca, .xml): distances, pixels, angles.",
+        help="File that the software of the scanner wrote next to the images (.xtekct, .log, .pca, .xml). Distances, "
+        "pixel size and angles are read from it.",
     ),
     option(
         "--angles-unit",
         type=NameChoice(["deg", "rad"]),
-        help="Unit of --angles-path or --angles, overriding the one in the file.",
+        help="Unit of --angles-path or --angles: degrees or radians. Default: the unit that the file states.",
     ),
 )
-"""The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""
+"""The options that set the fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, ..."""
 
 light_options = together(
     option(
         "--photons-per-count",
-        excludes={"spectra": "of several energies the dose is counted in frames"},
+        excludes={"spectra": "for scans at several energies the dose is counted in frames"},
         type=POSITIVE,
-        help="Number of X-ray photons at the sample per count.",
+        help="Number of X-ray photons at the sample for one count of the camera.",
     ),
     click.option(
         "--dose-in",
         metavar="MATERIAL",
-        help="With --photons-per-count: report the absorbed dose in this material or formula.",
+        help="With --photons-per-count: also report the absorbed dose, for a sample of this material, for example "
+        "water or SiO2.",
     ),
 )
-"""What `light_asked` takes."""
+"""The options whose values `light_asked` takes."""
 
 
 def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:
-    """The light options; None without --photons-per-count. UsageError for a dose without photons."""
+    """Photons per count and material for the dose; None without --photons-per-count.
+
+    Raises:
+        UsageError: --dose-in without --photons-per-count.
+    """
     if photons_per_count is None:
         if dose_in is not None:
             raise click.UsageError("--dose-in needs --photons-per-count.")
         return None
-    from beamline.projections.scan_statistics import LightAsked  # here: it loads matplotlib and numba
+    from beamline.projections.scan_statistics import LightAsked  # imported here because it loads matplotlib and numba
 
     return LightAsked(photons_per_count, dose_in)
 
 
 def span(value: str) -> tuple[int, int]:
-    """Parse FIRST:END, two whole numbers. ValueError for anything else."""
+    """Parse FIRST:END, two whole numbers. Raises ValueError for any other text."""
     match = re.fullmatch(r"(\d+):(\d+)", value)
     if match is None or int(match[1]) >= int(match[2]):
         raise ValueError(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
@@ -150,22 +168,22 @@ def span(value: str) -> tuple[int, int]:
 
 
 def column(value: str) -> float | None:
-    """Parse a column of the detector; "auto" gives None. ValueError for anything else."""
+    """Parse a column of the detector; "auto" gives None. Raises ValueError for any other text."""
     if value == "auto":
         return None
     if value.startswith("try:"):
-        raise ValueError(f"slices by several axes are drawn by beamline sweep FILE axis={value.removeprefix('try:')}")
+        raise ValueError(f"to draw slices with several axes, use beamline sweep FILE axis={value.removeprefix('try:')}")
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{value!r} is neither a column number (0: centre of the first) nor auto")
+        raise ValueError(f"{value!r} is neither a column number (0: centre of the first column) nor auto")
     return number
 
 
 def distances(value: str) -> tuple[float, float]:
-    """Parse SOD:SDD in mm. ValueError for anything else."""
+    """Parse SOD:SDD in mm. Raises ValueError for any other text."""
     try:
         sod, sdd = (float(part) for part in value.split(":"))
     except ValueError:
@@ -176,13 +194,13 @@ def distances(value: str) -> tuple[float, float]:
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of `Selection`, from --views on, with those of every step, and what `scan_options` adds."""
+    """Adds the options of `Selection` (--views and others), of every correction, and those of `scan_options`."""
     of_steps = (_of_step(option) for step in registered() for option in options_of(step).values())
     return together(*_BEFORE, scan_options, *_AFTER, *of_steps)(command)
 
 
 def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
-    """Source and selection that the parameter values of a command describe."""
+    """Source options and selection, from the parameter values of a command."""
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
 
@@ -204,7 +222,7 @@ def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOpti
 
 
 def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """The steps for the options in `values`."""
+    """The correction steps that the options in `values` ask for."""
     try:
         return steps_of(values)
     except ValueError as error:
@@ -212,7 +230,7 @@ def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 
 
 def _of_step(asked: Option) -> Callable[..., Any]:
-    """An option of a step as an option of the command line."""
+    """The command-line option for an option of a correction step."""
     return option(
         asked.name,
         type=NameChoice(asked.choices) if asked.choices else click.Path(path_type=Path) if asked.path else str,
@@ -231,19 +249,22 @@ _BEFORE = (
         default="all",
         show_default=True,
         metavar="SPEC",
-        help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N | every:K",
+        help="Projections to use. fixed:N: N evenly spread ones. sector:A-B[:N]: those from A to B degrees (N of "
+        "them). random:N[:SEED]: N random ones. first:N: the first N. every:K: every K-th.",
     ),
     option(
         "--rows",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector rows to use; the volume has one slice per row. Default: all.",
+        help="Detector rows to use, from FIRST up to, not including, END, counted from 0. The volume has one slice per "
+        "row. Default: all.",
     ),
     option(
         "--cols",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector columns to use, as if there were no others: --axis and messages count from FIRST. Default: all.",
+        help="Detector columns to use, as if the detector had no others: --axis and messages count columns from FIRST. "
+        "Default: all.",
     ),
     option(
         "--bin",
@@ -251,7 +272,7 @@ _BEFORE = (
         type=WholeRange(min=1),
         default=1,
         show_default=True,
-        help="Average blocks of N x N pixels.",
+        help="Average blocks of N x N pixels: less noise, memory and time, voxels N times as large.",
     ),
     option(
         "--axis",
@@ -259,15 +280,16 @@ _BEFORE = (
         metavar="PX|auto",
         default="auto",
         show_default=True,
-        help="Rotation axis: column of the unbinned detector (0: centre of the first column used), or auto to find it. "
-        "beamline sweep FILE axis=80:90:0.5 draws a slice by each of these axes.",
+        help="Rotation axis (centre of rotation): column of the unbinned detector (0: centre of the first column "
+        "used), or auto to find it. To compare slices with several axes: beamline sweep FILE axis=80:90:0.5",
     ),
     option(
         "--sample-width",
         type=FiniteRange(min=0, min_open=True),
         metavar="MM",
-        help="Width of a sample that is wider than the field, which is reconstructed as wide as it is (in px where the "
-        "pixel size is unknown). Default: as the scan file says, or measured by views held out.",
+        help="Width of the sample in mm (in px if the pixel size is unknown), if it is wider than the field of view. "
+        "The whole sample is then reconstructed. Default: the value in the scan file; without one, the width is "
+        "estimated with held-out projections.",
     ),
 )
 _AFTER = (
@@ -276,26 +298,27 @@ _AFTER = (
         "--frames-per-view",
         type=WholeRange(min=1),
         metavar="N",
-        help="Average N successive projections to one view, such as those that a step scan takes at one angle; 1: "
-        "average none. Default: as the plan in the scan file says.",
+        help="Average N successive projections, for example those that a step scan takes at one angle. 1: no "
+        "averaging. Default: the number in the scan file.",
     ),
     option(
         "--pixel-size-um",
         type=POSITIVE,
-        help="Pixel size at the sample (cone beam: on the detector). Default: as in the file.",
+        help="Pixel size in µm, at the sample (cone beam: on the detector). Default: the value in the scan file.",
     ),
     option(
         "--cone",
         callback=parsed(distances),
         metavar="SOD:SDD",
-        help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
+        help="Cone beam: distances in mm from the source to the rotation axis (SOD) and to the detector (SDD). "
+        "Default: the values in the scan file.",
     ),
     option(
         "--central-row",
         type=FiniteRange(),
         metavar="PX",
-        help="Cone beam: row of the unbinned detector that the central ray meets, the one at a right angle to the "
-        "rotation axis (0: centre of the first row; also beyond the detector). Default: the middle row.",
+        help="Cone beam: detector row at which the ray perpendicular to the rotation axis meets the detector "
+        "(unbinned, 0: centre of the first row). It may lie outside the detector. Default: the middle row.",
     ),
     heading(CORRECTIONS),
 )

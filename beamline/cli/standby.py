@@ -1,4 +1,4 @@
-"""A process that has loaded what a live reconstruction needs before the scan that it is for begins.
+"""Standby process: loads what a live reconstruction needs before its scan starts, then waits for the command.
 
 `python -m beamline.cli.standby` then waits for a line of JSON on its stdin, a file for its stderr and the words of a
 command, and is that command from there on. It ends with its stdin.

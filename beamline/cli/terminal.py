@@ -1,4 +1,4 @@
-"""Output for people: events as a progress bar or plain lines on stderr, the result of a reconstruction as text."""
+"""Output for people: events as a progress bar or plain lines on stderr; the result of a reconstruction as text."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from beamline.core.process import ChildProcess
 from beamline.core.recon_events import FitReached, VolumeDone
 from beamline.core.sinks import Narration, Warnings, lines
 from beamline.core.stop import terminated_like_interrupted
-from beamline.core.text import SENTENCE, one_line, printable
+from beamline.core.text import SENTENCE, count, one_line, printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock, SystemClock
 from drivers.in_beam import Ask
@@ -49,15 +49,21 @@ if TYPE_CHECKING:
 
 SAY_EVERY = 0.2  # s between events on the progress of many frames
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
+_ITERATIONS = {
+    "sweeps of trials": "iterations of test reconstructions (to choose the settings)",
+    "sweeps on voxels": "iterations of the voxel refinement",
+    "sweeps of error bars": "iterations for the error bars",
+}  # beginning of the unit of a progress event: what the progress line calls it
 _COUNTED = dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames"))
-# stage: the name of its bar and what it counts; other stages are named after what they count
+# stage: name of its progress bar, and what is counted. Other stages are named after what is counted.
 
 
 class Terminal:
     """A sink that prints events. Leaving it as a context manager removes the progress bar.
 
     Args:
-        stream: to print to (stderr: results belong to stdout). A terminal gets a bar, anything else plain lines.
+        stream: where to print (stderr, because stdout is for results). A terminal gets a progress bar, any other
+            stream gets plain lines.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -76,7 +82,7 @@ class Terminal:
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._printed: dict[str, tuple[float, int]] = {}  # real s and frame or step of the last line
+        self._printed: dict[str, tuple[float, int]] = {}  # real time (s), and frame or step, of the last line
         self._last_text, self._narrated = "", Narration()
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
@@ -120,14 +126,19 @@ class Terminal:
                 what = in_folders("beamline.features", "COUNTED").get(stage, "trials")
                 self._show(what, n, of, trials(event, what))
             case KernelsCompiled(_, n, seconds):
-                self._show("kernels", n, 0, f"{n} compiled in {seconds:.0f} s; once on a machine, 1 to 2 minutes")
+                self._show(
+                    "kernels",
+                    n,
+                    0,
+                    f"{n} compiled in {seconds:.0f} s (only the first time on a computer; takes 1 to 2 minutes)",
+                )
             case FitReached(_, step, steps):
                 self._show("volume", step, steps, fit(event))
             case Failed() | VolumeDone() | RunDone() | Done():
                 pass  # the command prints these itself
             case _:
                 text = "\n".join(lines(event))
-                if text and text != self._last_text:  # a snapshot of the same views replaces the one before
+                if text and text != self._last_text:  # a snapshot of the same projections is not printed again
                     self._last_text = text
                     self._console.print(text)
 
@@ -151,18 +162,18 @@ class Terminal:
 
 @contextmanager
 def events_shown(as_json: bool) -> Iterator[Sink]:
-    """The sink of a command's events: JSON on stdout, or else the terminal. SIGTERM and SIGHUP interrupt the block."""
+    """The sink for the events of a command: JSON on stdout, or the terminal. SIGTERM and SIGHUP end the block."""
     with terminated_like_interrupted(), json_events(as_json) as json_sink, Terminal(sys.stderr) as terminal:
         yield json_sink if as_json else terminal
 
 
 class Answer:
-    """The output of a command: events while it works, then its result as facts for programs or lines for people.
+    """The output of a command: events during the work, then the result, as facts for programs or lines for people.
 
     Attributes:
-        sink: of events.
-        clock: of their times.
-        lines: for people, once it is done.
+        sink: takes the events.
+        clock: gives the times of the events.
+        lines: the result as lines for people, once the work is done.
     """
 
     def __init__(self, sink: Sink) -> None:
@@ -181,14 +192,14 @@ class Answer:
         return counting(stage, self.sink, self.clock)
 
     def done(self, facts: object, *lines: str) -> None:
-        """Send the event `done` with its facts; for people the lines are printed when the work has ended."""
+        """Send the event `done` with the facts. The lines are printed for people when the work has ended."""
         self.sink(Done(facts, time=self.clock.now()))
         self.lines = lines
 
 
 @contextmanager
 def answering(as_json: bool) -> Iterator[Answer]:
-    """A context with the output of a command; at its end the lines are printed, unless stdout is for JSON."""
+    """A context with the output of a command. Its end prints the lines, unless stdout is for JSON."""
     with events_shown(as_json) as sink:
         answer = Answer(sink)
         yield answer
@@ -203,9 +214,10 @@ def rates(frame: FrameStored) -> str:
 
 
 def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
-    """n/N, rate and remaining time, if known; else that the work has begun."""
+    """n/N, rate and remaining time if they are known; otherwise `started`."""
     if not (done.of and done.per_s) or done.eta_s is None:
-        return "begun"
+        return "started"
+    what = "projections" if what == "views" else what
     return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {timedelta(seconds=round(done.eta_s))} left"
 
 
@@ -218,15 +230,17 @@ def trials(done: TrialReached, what: str = "trials") -> str:
 
 
 def fit(at: FitReached) -> str:
-    """n/N, rate, views, Gaussians (none for iterations), residuals and remaining time."""
-    word = at.unit or ("steps" if at.n_gaussians else "iterations")
-    parts = [f"{at.step}/{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
+    """n of N, rate, projections, Gaussians (not for iterations), residuals and remaining time."""
+    known = next((name for name in _ITERATIONS if at.unit.startswith(name)), None)
+    word = _ITERATIONS[known] if known else at.unit or ("steps" if at.n_gaussians else "iterations")
+    about = "about " if "as a rule" in at.unit or "usually" in at.unit else ""
+    parts = [f"{at.step} of {about}{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
     parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
-    parts += [f"{at.n_views} views"]
+    parts += [count(at.n_views, "projection")]
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
-    errors = {"residual": at.residual, "held out": at.held_out}
+    errors = {"residual": at.residual, "residual of held-out projections": at.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    left = "left for this step" if at.unit else "left"  # other parts of the work may follow
+    left = "left for this step" if at.unit else "left"  # because other parts of the work may follow
     parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} {left}"]
     return ", ".join(parts)
 
@@ -248,7 +262,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 
 
 def results(record: ReconRecord) -> str:
-    """The result of a reconstruction: files, grid, then a table of metrics by method."""
+    """The result of a reconstruction: files and grid, then a table of metrics by method."""
     shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
     several = "" if record.series is None else f"{record.series.n} of "
     span = f", {seconds[0]:.4g} to {seconds[-1]:.4g} s" if len(seconds) else ""
@@ -258,7 +272,7 @@ def results(record: ReconRecord) -> str:
         "output": record.output,
         "report": record.report and f"{record.report}{drawn}",
         "volumes" if several else "volume": f"{several}{shape} in {record.unit or 'volume fractions'}{span}",
-        "axis_col": f"{record.axis_col:.2f}",
+        "axis": f"column {record.axis_col:.2f}",
         "cone": "magnification" in numbers
         and "magnification {magnification:.4g}, voxels of {voxel_mm:.4g} mm, fan of {fan_deg:.3g} degrees".format(
             **numbers
@@ -270,22 +284,22 @@ def results(record: ReconRecord) -> str:
 
 
 def _metrics_of(record: ReconRecord) -> list[str]:
-    """Lines of a table of metrics by method."""
+    """The lines of a table of metrics, with one column per method."""
     columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
     if record.compared is not None:
         columns[BASELINE] = {**record.compared}
-    lines = [f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
+    lines = [f"{'':<38}" + "".join(f"{name:>14}" for name in columns)]
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
             label = metric.label
             if name == "seconds" and record.ending.resumed_from:
                 label += ", since resumed"
-            lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
+            lines.append(f"{label:<38}" + "".join(f"{cell:>14}" for cell in cells))
     return lines
 
 
-LOOK, ACT = "watch", "control"  # Purpose of an address: the first word of its line
+LOOK, ACT = "watch", "control"  # Purpose of an address: first word of its line
 ENDS_WITHIN = 3.0  # s
 
 
@@ -293,7 +307,7 @@ class PageBeside:
     """A sink that serves the page of a run from a separate process, within the context.
 
     Args:
-        say: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
+        say: prints the addresses, one a line. They contain the access tokens, so they must not be logged.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -319,10 +333,10 @@ class PageBeside:
             self._held.callback(child.let_go)  # first: open pages are told that they end
             return child.tell
         except OSError as error:
-            self._say(f"There is no page ({error}). The scan is not affected.")
+            self._say(f"The page cannot be shown ({error}). The scan is not affected.")
             return lambda text: None
 
     def _pass_on(self, line: str) -> None:
         what, _, address = line.strip().partition(" ")
         if what in (LOOK, ACT):
-            self._say(f"Page, to {what}: {address.strip()}")
+            self._say(f"Page to {what} the scan: {address.strip()}")

@@ -1,1 +1,3 @@
-"""Configuration: YAML, environment and overrides become one frozen model, or errors with file and line."""
+"""Configuration: combines YAML file, environment and overrides into one frozen model, or reports errors with file
+and line.
+"""

@@ -1,4 +1,4 @@
-"""Configuration of what stands in the beam: its monitor, shutters, the monochromator, and devices with named places."""
+"""Configuration of devices in the beam: beam monitor, shutters, monochromator, and devices with named positions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ Name = Annotated[str, Setting(min_length=1, max_length=80)]
 
 
 class MotorSection(Section):
-    """A separate motor, of any kind of stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
+    """A separate motor, of any kind of stage. For a linear axis, every key with deg in its name means the axis's own
+    unit (such as mm).
+    """
 
     speed_deg_s: float | None = setting(None, "null: the stage's max_speed_deg_s.", gt=0)
     stage: Annotated[StageConfig, Field(discriminator="kind")]
@@ -51,12 +53,12 @@ class StageMover(MotorSection):
     """A motor that moves the sample out of the beam for flats, between two positions."""
 
     kind: Literal["stage"]
-    in_deg: float = setting(doc="Where the sample is in the beam.")
-    out_deg: float = setting(doc="Where flats are taken.")
+    in_deg: float = setting(doc="Position of the sample in the beam.")
+    out_deg: float = setting(doc="Position of the sample while flats are taken.")
     mm_per_deg: float | None = setting(
         None,
-        "mm towards higher columns of the frame that a unit of the axis moves the sample; null: "
-        "unknown, or not across.",
+        "mm by which the sample moves towards higher columns of the frame, per unit of the axis; null: "
+        "unknown, or not across the beam.",
         ge=-1e3,
         le=1e3,
     )
@@ -65,7 +67,7 @@ class StageMover(MotorSection):
     def _places_can_be_reached(self) -> Self:
         self.refuse_unreachable({"in_deg": self.in_deg, "out_deg": self.out_deg})
         if self.in_deg == self.out_deg:
-            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
+            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}, so flats would show the sample")
         return self
 
     def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
@@ -74,7 +76,7 @@ class StageMover(MotorSection):
         Raises:
             DeviceError: its stage does not answer, or does not fit.
         """
-        places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not come")
+        places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not move")
         rad_per_mm = math.radians(1 / self.mm_per_deg) if self.mm_per_deg else math.nan
         return StageSampleMover(self._connected("sample mover", places, clock, url), rad_per_mm)
 
@@ -85,7 +87,7 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter that has only names: simulated without an effect on the light, or changed by the operator."""
+    """A filter that has only names: simulated without an effect on the intensity, or changed by the operator."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Setting(min_length=1)]
@@ -111,7 +113,7 @@ class MotorFilter(MotorSection):
 
     def connect(self, clock: Clock, url: str | None = None) -> PlacedStage:
         """Connect the motor; see `StageMover.connect`."""
-        return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
+        return self._connected("filter", self._places(self.places, "the filter did not move to"), clock, url)
 
 
 class FoundFilter(Section):
@@ -129,7 +131,7 @@ class FoundFilter(Section):
 def refuse_equal(places: Mapping[str, float | str]) -> None:
     """Raise ValueError if two positions have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("two positions have the same value; give each a different one")
+        raise ValueError("two positions have the same value; give each a different value")
 
 
 class BeamMonitorSection(Section):
@@ -139,18 +141,18 @@ class BeamMonitorSection(Section):
     """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
 
     unit: str
-    scale: float = setting(1.0, "What the number is multiplied by to be in `unit`.", gt=0)
+    scale: float = setting(1.0, "Factor that converts the reading to `unit`.", gt=0)
     timeout_s: float = setting(2.0, gt=0, le=1e6)
     period_s: float = setting(
-        1.0, "Between readings while a scan runs (real time); they are kept in the scan's file.", gt=0, le=1e6
+        1.0, "Time between readings during a scan (real time); they are stored in the scan's file.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
-        None, "In `unit`: a scan pauses while there is less; null: it never does.", gt=0
+        None, "In `unit`: the scan pauses below this value; null: it never pauses.", gt=0
     )
     resume_above: float | None = setting(
-        None, "In `unit`: from here on there is beam again; null: a tenth above pause_below.", gt=0
+        None, "In `unit`: the beam counts as back from this value on; null: a tenth above pause_below.", gt=0
     )
-    settle_s: float = setting(5.0, "For which there must be beam again before the scan goes on.", ge=0)
+    settle_s: float = setting(5.0, "How long the beam must be back before the scan continues.", ge=0)
 
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
@@ -185,9 +187,9 @@ class StageOutputShutter(Section):
     """A shutter on a digital output of the stage's controller, if the controller has outputs that can be set."""
 
     kind: Literal["stage_output"]
-    output: int = setting(doc="Number of the output; not the one that the trigger pulses come from.", gt=0)
-    open_high: bool = setting(True, "A high output opens.")
-    settle_s: float = setting(0.1, "How long the blade travels.", ge=0)
+    output: int = setting(doc="Number of the output; it must differ from the output of the trigger pulses.", gt=0)
+    open_high: bool = setting(True, "true: a high output opens the shutter.")
+    settle_s: float = setting(0.1, "Time that the blade needs to open or close.", ge=0)
 
 
 class FoundShutter(Section):
@@ -209,13 +211,13 @@ class NoMonochromator(Section):
 
 
 class _Monochromator(Section):
-    range_kev: tuple[Kev, Kev] | None = setting(None, "Lowest and highest energy that a scan may ask for; null: any.")
+    range_kev: tuple[Kev, Kev] | None = setting(None, "Lowest and highest energy that a scan may set; null: any.")
 
     @model_validator(mode="after")
     def _range_rises(self) -> Self:
         if self.range_kev is not None and self.range_kev[0] > self.range_kev[1]:
             low, high = self.range_kev
-            raise ValueError(f"range_kev is {low:g} ... {high:g}; give the lower energy first")
+            raise ValueError(f"range_kev is {low:g} ... {high:g}; expected the lower energy first")
         return self
 
 
@@ -239,7 +241,7 @@ class FoundMonochromator(_Monochromator):
 
     @property
     def stops(self) -> bool:
-        """Whether the monochromator can be stopped."""
+        """True if the monochromator can be stopped."""
         raise NotImplementedError
 
     def connect(self, clock: Clock) -> ConnectedMonochromator:

@@ -1,4 +1,6 @@
-"""Configuration of the devices: stage, camera, shutter, beam monitor and what moves in the beam, real or simulated."""
+"""Configuration of the devices: stage, camera, shutter, beam monitor and devices that move in the beam, real or
+simulated.
+"""
 
 from __future__ import annotations
 
@@ -71,16 +73,18 @@ class _Orca(Section):
     kind: str
     model: Literal["C15550-20UP", "C15550-22UP"] = setting(
         "C15550-20UP",
-        "ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and simulations go by it.",
+        "ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast. Plans and simulations "
+        "use its timing.",
     )
     roi: Roi | None = setting(None, "null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1
     readout: Literal["standard", "ultra_quiet", "photon_number"] = setting(
-        "standard", "photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."
+        "standard", "photon_number: the camera counts photoelectrons, at the speed of ultra_quiet."
     )
     trigger_polarity: Literal["positive", "negative"] = setting(
         "positive",
-        "The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here.",
+        "Edge of the trigger pulse that starts an exposure. A camera that was just switched on uses "
+        "negative; the driver sets the value given here.",
     )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
@@ -95,18 +99,16 @@ class SimulatedOrca(_Orca):
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
     library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
-    index: int = setting(0, "Which camera, where DCAM finds several.", ge=0)
-    link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 carries 17.7 full frames a second, CoaXPress 120.")
-    cool_s: float = setting(
-        0.0, "Wait at most so long for the sensor to be cold before a scan; 0: do not wait.", ge=0, le=1e6
-    )
+    index: int = setting(0, "Which camera to use if DCAM finds several.", ge=0)
+    link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 transfers 17.7 full frames per second, CoaXPress 120.")
+    cool_s: float = setting(0.0, "Longest wait before a scan until the sensor is cold; 0: do not wait.", ge=0, le=1e6)
     usb_product: int | None = setting(
         None,
-        "USB product id, for `check --connect`; null: any of the vendor's (which makes other things too).",
+        "USB product id, for `check --connect`; null: any product of the vendor (who also makes other devices).",
         ge=0,
         le=0xFFFF,
     )
-    usb_serial: str | None = setting(None, "USB serial number, for `check --connect`, where there are several cameras.")
+    usb_serial: str | None = setting(None, "USB serial number, for `check --connect`, if there are several cameras.")
 
     @property
     def options(self) -> DcamOptions:
@@ -200,8 +202,8 @@ class DeviceSection(Section):
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
             raise ValueError(
                 f"stage.active_high {str(high).lower()} contradicts camera.trigger_polarity "
-                f"{camera.trigger_polarity}: the simulated cable has no inverter, and every exposure would begin at "
-                f"its pulse's end; set trigger_polarity {'positive' if high else 'negative'}"
+                f"{camera.trigger_polarity}: the simulated cable has no inverter, so every exposure would "
+                f"start at the end of its pulse. Set trigger_polarity {'positive' if high else 'negative'}"
             )
         return self
 
@@ -228,8 +230,8 @@ class DeviceSection(Section):
                 continue
             if (port := device.stage.port) in taken:
                 raise ValueError(
-                    f"{name}.stage.port {port} is used by {taken[port]}, too, and a port can be opened once; the "
-                    f"{name.replace('_', ' ')} needs a separate controller or record"
+                    f"{name}.stage.port {port} is also used by {taken[port]}, and a port can be opened "
+                    f"only once; the {name.replace('_', ' ')} needs a separate controller or record"
                 )
             taken[port] = f"devices.{name}"
         return self

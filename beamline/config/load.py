@@ -1,4 +1,6 @@
-"""Configuration: a YAML file, BEAMLINE_* variables and --set overrides make one frozen Config, or a clear refusal."""
+"""Loads a configuration: combines a YAML file, BEAMLINE_* variables and --set overrides into one frozen Config, or
+reports what is wrong.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
-NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none: its plan is taken as it is."
+NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so it follows its plan."
 """For the operator of such a run, where it would decide otherwise."""
 
 
@@ -58,17 +60,17 @@ def load(
 ) -> Config:
     """Read and validate a configuration file.
 
-    Later wins: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value` overrides. File names in
-    the file are relative to it; those in variables and overrides, to the working directory.
+    Later sources replace earlier ones: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value`
+    overrides. File names in the file are relative to it; those in variables and overrides, to the working directory.
 
     Args:
-        environment: os.environ unless given.
-        rehearse: with the simulated counterpart of each device of a real instrument; see `rehearsal`.
-        no_live: given for a run without a reconstruction, whatever the file says; takes a sentence on what it then
-            does not do.
+        environment: default: os.environ.
+        rehearse: use the simulated counterpart of each device of a real instrument; see `rehearsal`.
+        no_live: given for a run without a live reconstruction, whatever the file states; takes a sentence on what the
+            run then does not do.
 
     Raises:
-        ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
+        ConfigError: every fault with file, line, key, what was found and what is allowed. Nothing has been started.
     """
     path = Path(path)
     tree = _read_file(path, "beamline config init")
@@ -84,7 +86,7 @@ def load(
 
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
-    """Read and validate a configuration of another package, as `load` does one of a scan; no variable overrides it.
+    """Read and validate a configuration of another package, as `load` reads that of a scan; no variable overrides it.
 
     Args:
         printed_by: the command that prints an example.
@@ -106,15 +108,15 @@ def _read_file(path: Path, printed_by: str) -> Tree:
     except OSError as error:
         if (kind := kind_of_data(path)) is not None:
             raise ConfigError(
-                f"{path} is {kind}, not a configuration: `beamline info {path}` says what it holds. Nothing was "
-                "started."
+                f"{path} is {kind}, not a configuration: `beamline info {path}` shows what it contains. "
+                "Nothing was started."
             ) from None
         raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
     return read(text, str(path))
 
 
 def takes_text(keys: Sequence[str], of: Mapping[str, Any] | None = None) -> bool:
-    """Whether a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
+    """True if a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
     another one."""
     legal = declared_at(schema() if of is None else of, tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
@@ -130,7 +132,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 def at_energies(config: Config) -> tuple[Config, ...]:
     """The configuration of a scan at each of `scan.energies`; a configuration without them itself.
 
-    The n-th of N scans begins n / N of a step later, or has another seed, so that all views together see more angles.
+    The n-th of N scans begins n / N of a step later, or has another seed, so that all projections together see more
+    angles.
     """
     scan, energies = config.scan, config.scan.energies
     if energies is None:
@@ -195,7 +198,7 @@ def plan_of(config: Config) -> ScanPlan:
     """The scan that a configuration asks for.
 
     Raises:
-        ConfigError: an angle file that cannot be read, or passes that do not divide the views.
+        ConfigError: an angle file that cannot be read, or passes that do not divide the projections.
     """
     scan = config.scan
     try:
@@ -227,7 +230,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     """The simulated scene as plain values, read from its file if the configuration names one.
 
     Raises:
-        ConfigError: the file is not there, or is no group of keys.
+        ConfigError: the file does not exist, or is not a group of keys.
     """
     scene = config.simulation.scene if config.simulation else {}
     if isinstance(scene, dict):
@@ -309,11 +312,14 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
         at = ("simulation", "scene")
-        yield at, f"simulation.scene: there is no file {scene}; expected one beside this file, or {scenes}"
+        yield (
+            at,
+            f"simulation.scene: there is no file {scene}; expected one next to the configuration file, or {scenes}",
+        )
 
 
 def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Key path and value of each number of plain values; several ones of a key have its path."""
+    """Key path and value of each number in plain values; several numbers of one key share its path."""
     if isinstance(values, dict | list | tuple):
         for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
             yield from quantities(each, at if name is None else (*at, str(name)))
@@ -325,21 +331,22 @@ _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigg
 
 
 def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
+    """Faults of camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
     camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
     if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
         return
     for key, fit in _ONE_FRAME_A_PULSE.items():
         if (value := getattr(camera, key)) not in fit:
             expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
-            what = f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; {expected}"
+            what = f"devices.camera.{key} {value} does not give one frame per pulse, which a fly scan needs; {expected}"
             yield ("devices", "camera", key), what
     width = stage.settings.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),
-            f"devices.camera.trigger_active level exposes while the pulse lasts; set devices.stage.pulse_width_s "
-            f"({width}) to scan.exposure_s ({scan.exposure_s:g}), or trigger_active: edge",
+            "devices.camera.trigger_active level means that the exposure lasts as long as the pulse. Set "
+            f"devices.stage.pulse_width_s ({width}) to scan.exposure_s ({scan.exposure_s:g}), or "
+            "trigger_active: edge",
         )
 
 
@@ -350,13 +357,14 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
 
 
 def offset_places(config: Config) -> tuple[float, ...]:
-    """The sample's places in mm for offset views: by 0.9 of the field, until a twentieth of it shows air beyond the
-    sample on either side. ValueError: why it cannot be."""
+    """Positions of the sample in mm for offset projections: in steps of 0.9 of the field of view, until a twentieth of
+    it shows air beyond the sample on either side. Raises ValueError with the reason if this is impossible.
+    """
     mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
     if not config.scan.offset_views:
         return ()
     if diameter is None:
-        raise ValueError("how far the sample is stepped follows from its diameter; set sample.diameter_mm")
+        raise ValueError("set sample.diameter_mm, which determines how far the sample is stepped")
     per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
     if not per_unit:
         raise ValueError("devices.sample_mover cannot step the sample; set its kind to stage, and its mm_per_deg")
@@ -367,11 +375,14 @@ def offset_places(config: Config) -> tuple[float, ...]:
     n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
     if n < 1:
         raise ValueError(
-            f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set scan.offset_views to 0"
+            f"the field of view of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set "
+            "scan.offset_views to 0"
         )
     places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
     if isinstance(mover, StageMover):
-        mover.refuse_unreachable({f"the place for {mm:.4g} mm aside,": mover.in_deg + mm / per_unit for mm in places})
+        mover.refuse_unreachable(
+            {f"the position for an offset of {mm:.4g} mm,": mover.in_deg + mm / per_unit for mm in places}
+        )
     return places
 
 

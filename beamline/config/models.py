@@ -1,4 +1,4 @@
-"""Configuration models: every key a configuration file may hold, its unit, its legal values and its default."""
+"""Configuration models: every key of a configuration file, with its unit, allowed values and default."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ else:
 
 class SampleSection(Section):
     name: str = setting(
-        doc="letters, digits and _ . + - (it ends the run folder's name)",
+        doc="letters, digits and _ . + - (the name of the run's folder ends with it)",
         pattern=r"^\w([\w.+-]*[\w+-])?$",
         max_length=80,
     )
     description: str = ""
     diameter_mm: float | None = setting(
-        None, "Of the circle about the rotation axis that holds all of the sample; null: not known.", gt=0, le=1e3
+        None,
+        "Diameter of the circle about the rotation axis that contains the whole sample; null: not known.",
+        gt=0,
+        le=1e3,
     )
 
 
@@ -50,7 +53,7 @@ class _Span(Section):
 
 
 class FixedAngles(_Span):
-    """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
+    """Equal steps from start_deg over span_deg; without the end itself (180 projections over 180 deg: 0 ... 179)."""
 
     scheme: Literal["fixed"]
 
@@ -79,7 +82,7 @@ class InterlacedAngles(_Span):
 
 
 class GoldenAngles(_Span):
-    """Golden-ratio steps modulo span_deg: well spread after any number of views; step scans only."""
+    """Golden-ratio steps modulo span_deg: well spread after any number of projections; step scans only."""
 
     scheme: Literal["golden"]
 
@@ -110,13 +113,15 @@ class Fields(Section):
 
 
 class TargetSection(Section):
-    """What ends a scan that decides, whichever comes first; null: that does not end it."""
+    """When a scan that makes decisions ends; the first target that is reached counts; null: no such target."""
 
     quality_db: float | None = setting(
-        None, "dB of PSNR by which the volume may stay below that of the whole plan.", gt=0, le=100
+        None, "dB of PSNR that the volume may be worse than the volume of the whole plan.", gt=0, le=100
     )
-    seconds: Seconds | None = setting(None, "From the first frame to the last flats and darks, at most.")
-    dose: float | None = setting(None, "Share of the plan's exposures with light on the sample, at most.", gt=0, le=1)
+    seconds: Seconds | None = setting(None, "Time limit from the first frame to the last flats and darks.")
+    dose: float | None = setting(
+        None, "Limit for the share of the plan's exposures with beam on the sample.", gt=0, le=1
+    )
 
 
 class ScanSection(Section):
@@ -124,54 +129,59 @@ class ScanSection(Section):
     angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds = setting(
-        doc="Time between views: sets the speed of a fly scan, the least time per frame of a step scan."
+        doc="Time between projections: sets the speed of a fly scan, and the shortest time per frame of a step scan."
     )
     frames_per_view: int = setting(
         1,
-        "Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has them all.",
+        "Frames at each angle of a step scan. `beamline recon` averages them to one projection; the file "
+        "contains all of them.",
         ge=1,
         le=1000,
     )
-    settle_s: float = setting(0.1, "Wait after each move of a step scan.", ge=0, le=1e6)
+    settle_s: float = setting(0.1, "Settling time after each move of a step scan.", ge=0, le=1e6)
     warm_up_s: float = setting(
         0.0,
-        "Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm.",
+        "How long the scintillator is exposed before frames with beam, each time the shutter opens. It "
+        "is brighter when it is warm.",
         ge=0,
         le=1e6,
     )
     filter: str | None = setting(
-        None, "Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."
+        None,
+        "Name of one of the places of devices.filter, to which it moves before the first frame; null: it "
+        "stays where it is.",
     )
     energy: Kev | None = setting(
-        None, "keV to which devices.monochromator goes before the first frame; null: as it stands."
+        None, "keV to which devices.monochromator moves before the first frame; null: it stays where it is."
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle.",
+        "keV of an energy series: one scan at each, one after the other. Each begins a fraction of a "
+        "step later in angle.",
         min_length=2,
         max_length=1000,
     )
     offset_views: int = setting(
         0,
-        "Angles at which a sample wider than the field is stepped across the beam after the views, "
-        "until all was shown.",
+        "For a sample wider than the field of view: number of angles at which the sample is stepped "
+        "across the beam after the projections, until all of it was measured.",
         ge=0,
         le=100,
     )
     on_watchdog_loss: Literal["warn", "pause"] = setting(
-        "warn", "The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."
+        "warn", "What a scan does without a watchdog, or if the watchdog ended and could not be replaced."
     )
     decide: Literal["off", "ask", "do"] = setting(
         "off",
-        "What follows each pass of views: the plan (off), what the operator answers (ask), or the best "
-        "gain a second until the target is met (do).",
+        "What the scan does after each pass of projections. off: continue the plan. ask: what the "
+        "operator decides. do: what improves the volume most per second, until the target is met.",
     )
     target: TargetSection = TargetSection(quality_db=1.0)
     wait_s: float = setting(
-        30.0, "Longest wait for a prediction after a pass, and again for the operator's answer.", ge=0, le=3600
+        30.0, "Longest wait for a prediction after a pass, and then for the operator's decision.", ge=0, le=3600
     )
     pass_views: int = setting(
-        0, "Views of a pass of a step scan; a fly scan has the passes of interlaced angles.", ge=0, le=1_000_000
+        0, "Projections per pass of a step scan; a fly scan has the passes of interlaced angles.", ge=0, le=1_000_000
     )
     darks: Fields = Fields()
     flats: Fields = Fields()
@@ -186,12 +196,12 @@ class ScanSection(Section):
 class OpticsSection(Section):
     pixel_size_um: float = setting(doc="Size of an unbinned pixel at the sample.", gt=0, le=1e6)
     energy_kev: float | None = setting(None, gt=0, le=1e6)
-    distance_mm: float | None = setting(None, "Sample to detector.", ge=0, le=1e7)
+    distance_mm: float | None = setting(None, "Distance from sample to detector.", ge=0, le=1e7)
     axis_col: Column | None = setting(
         None, "Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."
     )
     light_path: LightPath | None = setting(
-        None, "From X-ray photons to photoelectrons, for `beamline tune`; null: not known."
+        None, "Efficiency from X-ray photons to photoelectrons, for `beamline tune`; null: not known."
     )
 
 
@@ -200,22 +210,23 @@ class StorageSection(Section):
     preview_bin: int = setting(4, gt=0, le=10_000)
     flush_every: int = setting(
         16,
-        "Frames that are flushed together, at most, while others wait to be written; else each is flushed at once.",
+        "Largest number of frames that are flushed together while others wait to be written; otherwise "
+        "each frame is flushed at once.",
         gt=0,
         le=1_000_000,
     )
 
 
 class ReconSection(Section):
-    live: bool = setting(
-        True, "A volume while the scan runs; by a method that needs the whole scan, when it is complete."
-    )
+    live: bool = setting(True, "Make a volume during the scan; with a method that needs the whole scan, after it.")
     method: MethodName = setting(
-        DEFAULT, "r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."
+        DEFAULT,
+        "r2 makes a volume that grows during the scan; the others need the whole scan. auto: as in `beamline recon`.",
     )
     seconds: Seconds = setting(
         1800.0,
-        "Most time after the last view: the volume is made as of a finished scan, and takes longer on a busy machine.",
+        "Time limit after the last projection. null: the volume is made as for a finished scan, and "
+        "takes longer on a busy computer.",
     )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
@@ -258,12 +269,13 @@ class Config(Section):
             few_simulated = 2 * sum(simulated.values()) <= len(simulated)
             odd = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
-                f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} real. Make all "
-                "simulated or none. `beamline scan CONFIG --rehearse` runs a real configuration with simulated devices"
+                f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} "
+                "real. Make all of them simulated or none. `beamline scan CONFIG --rehearse` runs a "
+                "configuration for real devices with simulated ones"
             )
         if any(simulated.values()) and self.simulation is None:
             raise ValueError(
-                "devices.camera: simulated devices need a simulation section; `simulation: {}` takes its defaults"
+                "devices.camera: simulated devices need a simulation section; `simulation: {}` uses its defaults"
             )
         return self
 
@@ -271,7 +283,7 @@ class Config(Section):
     def _filter_is_there(self) -> Self:
         named, there = self.scan.filter, list(self.devices.filter.places)
         if named is not None and named not in there:
-            legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has none"
+            legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has no places"
             raise ValueError(f"scan.filter {named!r} is not one of the filter's places; {legal}")
         return self
 
@@ -280,13 +292,13 @@ class Config(Section):
         n = self.scan.frames_per_view
         if n > 1 and self.scan.mode is Mode.FLY:
             raise ValueError(
-                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle; set scan.mode to step, or "
-                "plan more views, which collect as much light"
+                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle. Set scan.mode to "
+                "step, or plan more projections, which collect as many photons"
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(
-                f"scan.frames_per_view {n}: a frame with an alarm is left out of its view's mean, so none is taken "
-                "again; set monitor.retake to false"
+                f"scan.frames_per_view {n}: set monitor.retake to false, because a frame with an alarm is "
+                "left out of the mean of its projection, so nothing is taken again"
             )
         return self
 
@@ -307,13 +319,15 @@ class Config(Section):
         needs = {
             "one scan at a time; set scan.energies to null": scan.energies is None,
             "a live volume; set recon.live to true": recon.live,
-            "a volume that grows with the views; set recon.method to r2": streams(recon.method),
-            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views of a step scan, such "
-            "as 60": 0 < scan.pass_views < getattr(angles, "views", math.inf) if scan.mode is Mode.STEP else interlaced,
+            "a volume that grows during the scan; set recon.method to r2": streams(recon.method),
+            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views for a "
+            "step scan, such as 60": 0 < scan.pass_views < getattr(angles, "views", math.inf)
+            if scan.mode is Mode.STEP
+            else interlaced,
         }
         if scan.decide != "off" and not all(needs.values()):
             lacking = next(need for need, met in needs.items() if not met)
-            raise ValueError(f"scan.decide {scan.decide} needs {lacking}; off takes the plan as it is")
+            raise ValueError(f"scan.decide {scan.decide} needs {lacking}; with off the scan follows its plan")
         return self
 
     @model_validator(mode="after")
@@ -322,7 +336,7 @@ class Config(Section):
         energies = self.scan.energies or ([] if self.scan.energy is None else [self.scan.energy])
         if energies and isinstance(device, NoMonochromator):
             raise ValueError(
-                f"{name} needs a monochromator, and devices.monochromator.kind is none; name one, or set {name} to null"
+                f"{name} needs a monochromator, but devices.monochromator.kind is none; set it, or set {name} to null"
             )
         low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:

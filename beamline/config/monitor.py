@@ -28,18 +28,18 @@ class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
     act_after: int = setting(
-        10, "Frames in a row with an alarm before the check's policy pauses or stops the scan.", ge=1
+        10, "Consecutive frames with an alarm before the check's policy pauses or stops the scan.", ge=1
     )
     retake: Annotated[bool | tuple[str, ...], Setting(problem=_no_checks)] = setting(
         False,
-        "Views with an alarm or without a frame are taken again, once, after the last view. Names of "
-        "checks: those with a warning of these checks, too.",
+        "true: projections with an alarm or without a frame are taken again, once, after the last "
+        "projection. Names of checks: projections with a warning of these checks are also taken again.",
     )
-    retake_share: float = setting(0.25, "Share of the views that are taken again at most.", gt=0, le=1)
+    retake_share: float = setting(0.25, "Largest share of the projections that is taken again.", gt=0, le=1)
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
-        """The checks whose warnings make the scan repeat a view."""
+        """The checks whose warnings make the scan repeat a projection."""
         return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 
@@ -57,7 +57,7 @@ def _limits_of(check: Check) -> Any:
 def _policies() -> Any:
     """The section with the policy of each check, and its default, as `section_of` takes a key."""
     keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
-    section = section_of("Policies", Section, keys, "What alarms of each check do to a scan.")
+    section = section_of("Policies", Section, keys, "What an alarm of each check does to a scan.")
     return section, section()
 
 
@@ -83,7 +83,9 @@ class ReferencesBase(Section):
     """The keys that are not limits."""
 
     on_fault: Literal["stop", "log"] = setting(
-        "stop", "Darks or flats with a fault stop the scan before its first projection, or the fault is logged."
+        "stop",
+        "What happens before the first projection if darks or flats have a fault: the scan stops, or the "
+        "fault is logged.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Rehearsal: the configuration of a real instrument with the simulated counterpart of each of its devices."""
+"""Rehearsal: turns the configuration of a real instrument into one with simulated devices."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from drivers.orca_quest import SENSOR_SHAPE
 
 _MARK = "_rehearsal"
 _ELECTRONS = 5000  # of a sensor pixel in an exposure without a sample: 70 % of its range
-_LONGEST = 60  # characters of a sample's name before the mark, which ends the run folder's name
+_LONGEST = 60  # characters of a sample's name before the mark at the end of the run folder's name
 
 
 def rehearsal(config: Config) -> dict[str, Any]:
-    """The plain values of the same scan with simulated devices; a simulated configuration is unchanged.
+    """The plain values of the same scan with simulated devices; a configuration for simulated devices is unchanged.
 
-    All that plan, stage and camera settings say stays. The rotation axis is that of the scene, so it is searched.
-    Unless its section `simulation` says otherwise, the scene is a battery that fits the field, and the clock is
+    All settings of plan, stage and camera stay. The rotation axis is that of the scene, so it is searched for. Unless
+    its section `simulation` states otherwise, the scene is a battery that fits into the field of view, and the clock is
     virtual, so that it waits for each simulated frame.
     """
     data = config.model_dump(mode="json")
@@ -82,7 +82,7 @@ def _stage(stage: StageSection) -> dict[str, Any]:
 
 
 def _stand_in(stage: StageSection, kind: str) -> dict[str, Any]:
-    """A stage of another kind that turns as this one does, and gives pulses as close, from the same output."""
+    """A stage of another kind that turns like this one, with pulses as close together, from the same output."""
     settings, limits = stage.settings, stage.settings.limits()
     same = {"counts_per_turn", "max_speed_deg_s", "low_deg", "high_deg", "active_high", "timeout_s", "transcript"}
     return stage.model_dump(mode="json", include=same) | {
@@ -116,7 +116,7 @@ def _monochromator(real: DeviceSection) -> dict[str, Any]:
 
 
 def _beam_monitor(real: DeviceSection) -> dict[str, Any]:
-    """The simulated one shows a steady intensity, which says nothing of the limits of the real one."""
+    """A simulated monitor that shows a steady intensity, which has no relation to the limits of the real one."""
     monitor = real.beam_monitor
     if monitor.counterpart is None:
         return _plain(NoBeamMonitor())

@@ -18,7 +18,7 @@ from recon.base.setting import Setting, settings_of
 def port_problem(port: str) -> str:
     """What is wrong with a port; "" if it may be one. Names of ports, not URLs, have a colon only within a path."""
     wrong = re.match(r"[a-z]\w*:(?!//)|socket://(?!.+:\d+)", port, re.IGNORECASE)
-    return f"{port} is no port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
+    return f"{port} is not a port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
 
 SEVERAL_LINES = ("description", "pattern", "query", "line_end")  # keys whose text may have control characters
@@ -26,9 +26,9 @@ Port = Annotated[str, Setting(min_length=1, problem=port_problem)]
 
 
 class Section(BaseModel):
-    """A frozen group of keys, which rejects unknown keys, and `yes` for a number.
+    """A frozen group of keys. It rejects unknown keys, and `yes` for a number.
 
-    What a validator of a group says begins with the key that is to be looked at, whose line the message then has.
+    The message of a validator of a group begins with the key that has the fault; the message then names its line.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -36,15 +36,16 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_yaml_traps(cls, data: Any) -> Any:
-        """Refuse what YAML reads otherwise than it was meant."""
+        """Raise an error for values that YAML reads differently from what the author probably meant."""
         for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
             truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)
             if isinstance(value, bool) and bool not in truths:
                 raise ValueError(f"{name} is {str(value).lower()} (YAML reads yes, no, on and off as true and false)")
             if isinstance(value, str) and name not in SEVERAL_LINES and (found := min(value, default=" ")) < " ":
                 raise ValueError(
-                    f"{name} is {value!r}, with the control character {found!r}: within double quotes a backslash "
-                    "begins one; write the text without quotes, or within single ones"
+                    f"{name} is {value!r}, with the control character {found!r}. In double quotes a "
+                    "backslash starts such a character; write the text without quotes, or in single "
+                    "quotes"
                 )
         return data
 
@@ -68,7 +69,7 @@ def _inside(made: Setting, kind: Any, value: Any) -> Any:
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
-    """Whether it is a class of one of these kinds, and not a union."""
+    """True if it is a class of one of these kinds, and not a union."""
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 

@@ -1,4 +1,4 @@
-"""Configuration of the rotation stage: one section per kind, with the keys that its settings declare.
+"""Configuration of the rotation stage: one section per kind of stage, with the keys that its settings declare.
 
 Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
 folder says.
@@ -52,8 +52,8 @@ class StageSection(Section):
 
     kind: str
     port: Port = setting(
-        doc="Where its controller is; sim:// and the kind is its simulated counterpart, where it has one; that takes "
-        "all else from here."
+        doc="Address of the controller. sim:// and the kind is its simulated counterpart, if there is one; "
+        "it uses all other settings given here."
     )
 
     @model_validator(mode="after")
@@ -63,8 +63,9 @@ class StageSection(Section):
             raise ValueError(f"low_deg {low} must lie below high_deg {high}")
         if self.simulated and (other := STAGES[self.kind].Settings.stand_in):
             raise ValueError(
-                f"a {self.kind} stage has no simulated controller, so {self.port} is none of its ports; simulate a "
-                f"stage with kind: {other}, port: sim://{other}, or set its real port and rehearse with --rehearse"
+                f"a {self.kind} stage has no simulated controller, so {self.port} is not a valid port. "
+                f"Simulate a stage with kind: {other}, port: sim://{other}, or set the real port and "
+                "rehearse with --rehearse"
             )
         if self.simulated and self.port.lower() != f"sim://{self.kind}":
             raise ValueError(f"port {self.port} is not the simulated counterpart of {self.kind}, sim://{self.kind}")

@@ -1,4 +1,5 @@
-"""Configuration text: YAML, --set and BEAMLINE_* variables as one tree, with the origin of each value, and its faults.
+"""Configuration text: merges YAML, --set and BEAMLINE_* variables into one tree, remembers where each value came
+from, and reports faults.
 
 Faults are pydantic's findings with file and line, the key, its value and the legal values.
 """
@@ -26,8 +27,8 @@ YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeErr
 _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
 """Of a YAML text: characters, values (as often as aliases repeat them), groups within groups, digits of a number."""
 _TOO_MUCH = (
-    f"this is more than settings hold: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} groups within each "
-    f"other and numbers of {_DIGITS} digits. Nothing was started."
+    f"this is more than settings may have: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
+    f"nested groups and numbers of {_DIGITS} digits. Nothing was started."
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
 _BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
@@ -71,7 +72,7 @@ def read(text: str, name: str) -> Tree:
     """Parse YAML with safe types only.
 
     Raises:
-        ConfigError: bad syntax, a key said twice, or a top level that is no group of keys; with file and line.
+        ConfigError: bad syntax, a key given twice, or a top level that is not a group of keys; with file and line.
     """
     data, origins = _parsed(text, name)
     if data is None:
@@ -107,7 +108,9 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 
 @contextmanager
 def yaml_faults(text: str, name: str) -> Iterator[None]:
-    """A context that reads YAML: ConfigError for its faults, and before for what would take longer than a second."""
+    """A context for reading YAML: raises ConfigError for its faults, and in advance for text that would take longer
+    than a second.
+    """
     depth = 0
     if len(text) > _LONGEST or _BRACKETS.search(text):
         raise ConfigError(f"{name}: {_TOO_MUCH}")
@@ -126,12 +129,12 @@ def yaml_faults(text: str, name: str) -> Iterator[None]:
 
 
 def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
-    """The line of a fault of YAML, 0: not known, and what is wrong with it, for who does not know YAML."""
+    """The line of a fault of YAML (0: not known), and what is wrong with it, for somebody who does not know YAML."""
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
         at = error.position
-        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} is not allowed in text; take it out"
+        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} is not allowed in text; remove it"
     if mark is None:
         return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]
@@ -151,22 +154,22 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
         (is_quote and "end of stream" in problem, f"the {opened} of this line is never closed"),
         (is_open, f"the {opened} of this line is never closed"),
         ("'\\t'" in problem and not this[: mark.column].strip(), "this line begins with a tab; indent it with spaces"),
-        (quoted, "text goes on behind a closing quote; a quote that belongs to a text is written twice"),
-        ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it into quotes"),
-        ("escape" in problem, "in double quotes, a backslash begins a special character; use single quotes"),
+        (quoted, "text continues after a closing quote; write a quote that belongs to the text twice"),
+        ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it in quotes"),
+        ("escape" in problem, "in double quotes, a backslash starts a special character; use single quotes"),
         (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
         (this[mark.column :][:1] in ("!", "=") or "tag" in problem, _TAGGED),
-        ("unhashable" in problem, "a key of this line is a list or a group; keys are text"),
-        ("another document" in problem, "a second document begins here; settings are a single one"),
+        ("unhashable" in problem, "a key of this line is a list or a group; keys must be text"),
+        ("another document" in problem, "a second document begins here; settings must be one document"),
         (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
         (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
-        (of_key and ": " in this[: mark.column], "a colon is missing, or a value that has a colon needs quotes"),
+        (of_key and ": " in this[: mark.column], "a colon is missing, or a value that contains a colon needs quotes"),
         (
             of_key and deeper and ": " in above,
             "this line is indented deeper than the one above, which already has a value",
         ),
         (of_key, "a colon is missing after a key of this line or the one above"),
-        ("<block end>" in problem, "the indentation of this line is that of no group above it"),
+        ("<block end>" in problem, "the indentation of this line does not match any group above it"),
     )
     at = context if (is_open or is_quote) and context else mark
     return at.line + 1, next((sentence for holds, sentence in faults if holds), problem)
@@ -199,11 +202,11 @@ def override(
 ) -> Tree:
     """The tree overridden by BEAMLINE_SECTION__KEY variables and then by `section.key=value`.
 
-    Values are YAML; those of text keys are the text as it stands, where it is not quoted as YAML. A variable without a
-    double underscore is ignored.
+    Values are YAML; values of text keys are used literally unless they are quoted as YAML. A variable without a double
+    underscore is ignored.
 
     Args:
-        is_text: whether the key of this path takes text.
+        is_text: True if the key of this path takes text.
 
     Raises:
         ConfigError: an override without `=`, or with a value that is not YAML.
@@ -231,17 +234,18 @@ def override(
     return Tree(data, origins)
 
 
-_OWN_VIEWS = "Every reconstruction of 25 views or more compares its own views"
+_OWN_VIEWS = "Every reconstruction of 25 projections or more compares its projections with the volume"
 REMOVED = {
     "monitor.model": _OWN_VIEWS,
     "monitor.policy.model": _OWN_VIEWS,
-    "monitor.dark.light": "references.light_in_darks is the fraction of the flats from which darks have light",
-    "recon.stop_when": "scan.decide: do with scan.target: {quality_db: 0.5} ends a scan when all views to come would "
-    "add 0.5 dB at most",
-    "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
+    "monitor.dark.light": "references.light_in_darks is the share of the flats' intensity from which on darks count "
+    "as exposed to the beam",
+    "recon.stop_when": "scan.decide: do with scan.target: {quality_db: 0.5} ends a scan when all projections still to "
+    "come would add at most 0.5 dB",
+    "scan.return_views": "The check `opposite` shows motion of the sample, from projections 180° apart",
 }
 """Keys of 1.0.0 that were removed, each with what does the same."""
-_ADVICE = "A real configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
+_ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:

@@ -1,1 +1,1 @@
-"""The base of all folders: errors, events, stop requests, child processes, memory, text, atomic files."""
+"""Basics for all other folders: errors, events, stop requests, child processes, memory, text, safe writing of files."""

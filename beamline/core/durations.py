@@ -1,4 +1,4 @@
-"""Durations: the time that is left, the rows of a table in turn, and the phases of a long work."""
+"""Durations: remaining time, progress through the rows of a table, and the phases of long work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors with exit codes: each class says which part failed and whether data are safe. A defect leaves a traceback."""
+"""Errors with exit codes. The class says which part failed and whether data are safe; a defect leaves a traceback."""
 
 from __future__ import annotations
 
@@ -119,8 +119,8 @@ def user_message(error: BaseException) -> str:
     if out_of_memory(error):
         what = " ".join(str(error).split()) or "no details"
         return (
-            f"Out of memory ({what}). No half result was kept, and what was there is untouched. Take fewer --rows or "
-            "--views, a coarser --bin, or a smaller --memory, which works in slabs."
+            f"Out of memory ({what}). Use fewer --rows or --views, a larger --bin, or a smaller --memory (the "
+            "volume is then made in slabs). No incomplete result was kept, and existing files were not changed."
         )
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "

@@ -1,4 +1,4 @@
-"""Lines of events from another process, or of a log: the event, or its values alone."""
+"""Lines of events from another process or from a log: parsing them into events or plain values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def event_of(values: Mapping[str, Any]) -> Event:
         with suppress(TypeError):  # other fields, or the values are not those of the dataclass that is spread
             taken = {name: made(**rest) for name, made in spread.items()} or rest
             return each(**{name: value for name, value in given.items() if name in own}, **taken)
-    raise ValueError(f"no kind of event has the values {dict(values)}")
+    raise ValueError(f"no event has the values {dict(values)}")
 
 
 def event_in(line: str | bytes) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Events: everything that happens in a run, one class a kind. Terminal, events.jsonl and log are sinks of them.
+"""Events: everything that happens in a run, one class per kind. Sinks (terminal, events.jsonl, log) receive them.
 
 Here are the kinds of a scan and of any command; `recon_events` has those of reconstructions.
 """
@@ -34,13 +34,15 @@ def spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **o
 @dataclass_transform(frozen_default=True, field_specifiers=(field, spread))
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened; each kind is a frozen dataclass. Fields with their default value are not written.
+    """Something that happened during a run. Each kind of event is a frozen dataclass.
+
+    A field that has its default value is not written to JSON.
 
     Attributes:
-        event: its kind, as a JSON line names it.
-        time: s since the Unix epoch; the announcer of a run sets it.
-        source: "recon": an event of the live reconstruction of a scan.
-        scan: in a batch, the file that it is about.
+        event: the kind of the event, as it is written to JSON.
+        time: time in s since the Unix epoch; the announcer of a run sets it.
+        source: "recon" if the event comes from the live reconstruction of a scan.
+        scan: in a batch, the scan file that the event belongs to.
     """
 
     event: ClassVar[str]
@@ -76,8 +78,8 @@ Sink = Callable[[Event], None]  # Takes events
 
 
 def json_of(values: object) -> str:
-    """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
-    from pydantic_core import to_jsonable_python  # here, because most commands write no line
+    """One line of JSON. NaN and infinities become null, arrays become lists, dataclasses objects, and paths strings."""
+    from pydantic_core import to_jsonable_python  # imported here because most commands write no JSON
 
     from recon.base.json_values import plain
 
@@ -85,7 +87,7 @@ def json_of(values: object) -> str:
 
 
 class RunStarted(Event, event="run_started"):
-    """A scan begins; nothing has moved. duration: planned, s; remarks: of the plan, for people."""
+    """A scan starts; nothing has moved yet. duration: planned, in s; remarks: remarks of the plan, for people."""
 
     folder: Path
     path: Path
@@ -97,11 +99,11 @@ class RunStarted(Event, event="run_started"):
 
 
 class StateEntered(Event, event="state"):
-    """A scan enters a state, or reports something in it; in a reconstruction `state` is a topic.
+    """A scan enters a state, or reports something. In a reconstruction, `state` is the topic of the message.
 
     Attributes:
-        message: for people; may be empty.
-        more: values beside it, by name: the picture of `ready`, the prediction of `gain`.
+        message: a sentence for people; may be empty.
+        more: further values by name, for example the picture of the state `ready`.
     """
 
     state: str
@@ -110,7 +112,7 @@ class StateEntered(Event, event="state"):
 
 
 class BlockStarted(Event, event="block_started"):
-    """Darks, flats or projections begin. first_row: of the file; exposure, period: s."""
+    """A block of darks, flats or projections starts. first_row: its first row in the file; exposure, period: in s."""
 
     kind: str
     mode: str
@@ -121,7 +123,7 @@ class BlockStarted(Event, event="block_started"):
 
 
 class BlockDone(Event, event="block_done"):
-    """A block is over. missing: planned triggers without a frame; lost, ignored, extra: see scan.ledger."""
+    """A block has ended. missing: planned triggers without a frame; lost, ignored, extra: see scan.ledger."""
 
     kind: str
     mode: str
@@ -135,7 +137,7 @@ class BlockDone(Event, event="block_done"):
 
 
 class FrameStored(Event, event="frame"):
-    """A frame is in the file; at most ten events a second. mean: of its counts; simulations leave it out."""
+    """A frame was stored in the file; at most ten events per second. mean: mean counts (not given by simulations)."""
 
     n: int
     of: int
@@ -147,7 +149,7 @@ class FrameStored(Event, event="frame"):
 
 
 class BeamRead(Event, event="beam"):
-    """A reading of the beam monitor. read_at: s since the Unix epoch."""
+    """A reading of the beam monitor. read_at: time in s since the Unix epoch."""
 
     value: float
     unit: str
@@ -155,7 +157,7 @@ class BeamRead(Event, event="beam"):
 
 
 class FrameFlagged(Event, event="flag"):
-    """A check of the monitor begins to flag, or flags at another level."""
+    """A check of the monitor starts to flag frames, or changes the level of its flags."""
 
     flag: Flag = spread(Flag.event_values, Flag)
 
@@ -169,23 +171,24 @@ class RuleBroken(Event, event="flag"):
 
 
 class Warned(Event, event="warning"):
-    """Something needs attention, and the work continues."""
+    """Something needs attention, but the work continues."""
 
     message: str
     state: str | None = None
 
 
 class PassEnded(Event, event="pass_ended"):
-    """A pass of views is over. What is next is being chosen, or the operator is asked.
+    """A pass of projections is done. The program chooses what to measure next, or asks the operator.
 
     Attributes:
-        number: of this event, from 1: after a pass, offset views or retakes; n_views: so far.
-        options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
-            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known).
-        recommended: the choice that the program takes or would take.
-        wait: real s for which the operator is asked; 0: nobody is.
-        remark: a sentence on why no gain is known; "" where they are.
-        passes: that are over; offset views and retakes are none.
+        number: number of this event, from 1; such an event follows a pass, offset projections or retakes.
+        n_views: number of projections so far.
+        options: what can be measured next, as values of `beamline.plan.choose.PassOption`: choice, frames, seconds,
+            dose (fraction of that of the plan), bytes, and gain, low, high in dB (None: not known).
+        recommended: the choice that the program makes or would make.
+        wait: real time in s for which the operator is asked; 0 if nobody is asked.
+        remark: a sentence that says why no gain is known; empty if gains are known.
+        passes: number of passes that are done, without offset projections and retakes.
     """
 
     number: int
@@ -198,17 +201,20 @@ class PassEnded(Event, event="pass_ended"):
 
 
 class NextChosen(Event, event="next_chosen"):
-    """What is measured after a pass.
+    """The decision what is measured after a pass.
 
     Attributes:
-        number: of the decision, from 1; n_views: so far; passes: as of `PassEnded`.
-        choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
+        number: number of the decision, from 1.
+        n_views: number of projections so far.
+        passes: as in `PassEnded`.
+        choice: a `beamline.plan.passes.Choice`.
+        by: who decided: program, operator, or plan (nobody did, so the scan follows its plan).
         reason: a sentence.
-        options: as of `PassEnded`.
-        predicted, gained: dB by an earlier choice, as predicted then and as measured now, with the ends of its range:
-            the newest choice that a law has judged since the event before; None: not known.
+        options: as in `PassEnded`.
+        predicted, gained: improvement in dB by an earlier choice, as predicted then and as measured now; gained_low and
+            gained_high are the ends of its range. None: not known.
         judged: number of the decision for that earlier choice.
-        dropped: frames of views by which the scan is shorter after this choice.
+        dropped: number of frames that are not taken because of this choice.
     """
 
     number: int
@@ -227,7 +233,7 @@ class NextChosen(Event, event="next_chosen"):
 
 
 class Counted(Event, event="progress"):
-    """n of `of` frames, slices, views or axes are done; `stage` names the work."""
+    """n of `of` frames, slices, projections or axes are done; `stage` names the work."""
 
     stage: str
     n: int
@@ -237,7 +243,7 @@ class Counted(Event, event="progress"):
 
 
 class PhaseReached(Event, event="progress"):
-    """A phase of the work begins (n is 0), or n of `of` items are done, which `counted` names. None: unknown."""
+    """A phase of the work starts (n is 0), or n of `of` items are done; `counted` names the items. None: not known."""
 
     stage: str
     counted: str
@@ -249,7 +255,7 @@ class PhaseReached(Event, event="progress"):
 
 
 class TrialReached(Event, event="progress"):
-    """n of `of` trials, scans or runs are done, and `label` begins."""
+    """n of `of` trials, scans or runs are done, and the one named `label` starts."""
 
     stage: str
     n: int
@@ -260,7 +266,7 @@ class TrialReached(Event, event="progress"):
 
 
 class KernelsCompiled(Event, event="progress"):
-    """Kernels were compiled: their number, and the seconds that it took."""
+    """Kernels were compiled: their number, and the time in seconds."""
 
     stage: str
     n: int
@@ -274,33 +280,33 @@ class ScanDone(Event, event="scan_done"):
 
 
 class Listed(Event):
-    """An event that is printed as it is. values: by name, a mapping or a dataclass."""
+    """An event whose values are printed unchanged. values: a mapping or a dataclass."""
 
     values: Any = spread()
 
 
 class StepsListed(Listed, event="explain"):
-    """Steps of a frame of a scene in order, and the effects that it does not name."""
+    """The steps that make a frame of a scene, in order, and the effects that the scene does not use."""
 
 
 class DeviceRead(Listed, event="device"):
-    """What a device says of itself to `beamline check --connect`: `name`, `fault` ("" if it answers) and its values."""
+    """Status of a device for `beamline check --connect`: `name`, `fault` ("" if it answers) and its values."""
 
 
 class RunDone(Event, event="done"):
-    """A run has ended successfully. result: a `RunResult`; read from the line of another process, its values by
-    name."""
+    """A run has ended successfully. result: a `RunResult`, or its values by name if the event was read from the output
+    of another process."""
 
     folder: Path
     result: Any = spread(RunResult.run_values)
 
 
 class Done(Listed, event="done"):
-    """A command has ended successfully. values: what it found or wrote."""
+    """A command has ended successfully. values: its results."""
 
 
 class Failed(Event, event="failed"):
-    """A command has failed. folder: of the run."""
+    """A command has failed. folder: folder of the run."""
 
     message: str
     exit_code: int | None = None

@@ -1,4 +1,4 @@
-"""Files: only regular ones are read; a file is written whole or not at all, and replaces none unless asked."""
+"""Files: only regular files are read; a file is written completely or not at all, and replaces none unless asked."""
 
 from __future__ import annotations
 
@@ -85,19 +85,19 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
         return
     if not stat.S_ISREG(status.st_mode):
         what = "It is a folder" if stat.S_ISDIR(status.st_mode) else "It is a device or a pipe"
-        raise OSError(errno.EINVAL, f"{what}, and a regular file is expected", str(path))
+        raise OSError(errno.EINVAL, f"{what}, but a regular file is expected", str(path))
     if status.st_size > largest:
-        raise OSError(errno.EFBIG, f"It has {status.st_size} bytes, and at most {largest:.0f} are read", str(path))
+        raise OSError(errno.EFBIG, f"It is too large ({status.st_size} bytes, at most {largest:.0f})", str(path))
 
 
 _DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF file", b"PK\3\4": "a .zip or .npz file"}
 
 
 _SUBSTITUTES = {
-    b"version https://git-lfs": "a pointer of Git LFS in its place: `git lfs pull` fetches the file",
+    b"version https://git-lfs": "only a pointer of Git LFS: run `git lfs pull` to get the file",
     b"\x1f\x8b": "packed by gzip: `gunzip` unpacks it",
-    b"<!doctype html": "a web page, such as that of a login, in its place: download the file again",
-    b"<html": "a web page, such as that of a login, in its place: download the file again",
+    b"<!doctype html": "a web page instead of the data, for example a login page: download the file again",
+    b"<html": "a web page instead of the data, for example a login page: download the file again",
 }
 
 
@@ -138,7 +138,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     for part in parts:
         place /= part
         if part == ".." or PurePosixPath(part).is_absolute() or is_link(place):
-            raise OSError(errno.ELOOP, "It is a link, and only what lies in the folder itself is read", str(place))
+            raise OSError(errno.ELOOP, "It is a link, but only files in the folder itself are read", str(place))
     place.stat()
     require_regular(place, largest)
     return place
@@ -193,7 +193,7 @@ def broken_link(path: Path) -> str:
     """A sentence if `path`, or a folder on the way to it, is a link whose target does not exist; "" if not."""
     for place in (path, *path.parents):
         if place.is_symlink() and not place.exists():
-            return f"{place} is a link to {place.readlink()}, which is not there: is its disk mounted?"
+            return f"{place} is a link to {place.readlink()}, which does not exist: is its disk mounted?"
     return ""
 
 
@@ -214,14 +214,18 @@ def refuse_existing(path: Path) -> None:
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
     if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
         raise DataError(
-            f"{path}: the name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} are possible, as "
-            "names of temporary files, and of what is written beside it, are longer. Name another output. Nothing was "
-            "written."
+            f"{path}: the name is too long: {len(os.fsencode(path.name))} bytes, at most {most} are allowed, because "
+            "the program also writes files with longer names next to it (temporary files, the report). Use a shorter "
+            "name. Nothing was written."
         )
     if link := broken_link(path):
-        raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
+        raise DataError(
+            f"{link} Mount the disk, or name another output, because links are never replaced. Nothing was written."
+        )
     if path.exists():
-        raise DataError(f"{path} exists and results are never overwritten. Name another output, or move it away.")
+        raise DataError(
+            f"{path} exists, and results are never overwritten. Name another output, or move this one away."
+        )
     if not path.parent.is_dir():
         raise DataError(
             f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create it first."
@@ -234,8 +238,8 @@ def refuse_not_utf8(path: Path | str) -> None:
         str(Path(path).absolute()).encode()
     except UnicodeEncodeError as error:
         raise DataError(
-            f"The path {path} is no text: it has bytes that are not UTF-8, and no result could name it. "
-            "Rename the file or folder. Nothing was read."
+            f"The path {path} contains bytes that are not UTF-8, so no result could state its name. Rename the file or "
+            "folder. Nothing was read."
         ) from error
 
 
@@ -245,7 +249,9 @@ def replaceable(path: Path) -> Path:
     DataError where the target is not there.
     """
     if link := broken_link(path):
-        raise DataError(f"{link} Links are never replaced. Mount it, or remove the link. Nothing was written.")
+        raise DataError(
+            f"{link} Mount the disk, or remove the link, because links are never replaced. Nothing was written."
+        )
     return path.resolve() if path.is_symlink() else path
 
 
@@ -293,7 +299,7 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         try:
             partial.replace(path)
         except OSError as error:  # Windows replaces no file that another program holds open
-            raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
+            raise DataError(f"{path} could not be replaced ({error}); the existing file was not changed.") from error
     except OSError as error:
         left = "what was there is untouched" if replace else "nothing is left of it"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
@@ -327,7 +333,7 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
         partial.write_bytes(data)
         bring_to_disk(partial)
         if partial.read_bytes() != data:
-            raise OSError(errno.EIO, "what is read back is not what was written")
+            raise OSError(errno.EIO, "the data that were read back differ from those written")
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequence[str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""What is installed: the version, the configurations and scenes of the package, and modules by the names of ours."""
+"""What is installed: the version, the configurations and scenes of the package, and advice for broken installations."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def package_problem(home: str) -> str:
         if origin is None:
             return f"splatline is incomplete: Python finds no package {name!r}. {_AGAIN}."
         if origin != ours and os.path.realpath(origin) != os.path.realpath(ours):
-            return f"Python finds {name!r} at {origin}, not splatline's at {ours}: {_way_out(origin)}."
+            return f"Python finds {name!r} at {origin} instead of that of splatline at {ours}: {_way_out(origin)}."
         with open(origin, "rb") as file:  # noqa: PTH123
             if _MARK not in file.readline():
                 return f"{origin} is not splatline's: {_way_out(origin)}."
@@ -75,7 +75,10 @@ def installation_problem(error: BaseException) -> str:
     if origin is None:
         advice = f"{sys.executable} does not find it. Install it: pip install {package}"
     elif name in sys.stdlib_module_names or not _installed(origin):
-        advice = f"Python finds it at {origin}. If that is another one, {_way_out(origin)}; if not, install it again"
+        advice = (
+            f"Python finds it at {origin}. If this is a different package, {_way_out(origin)}; otherwise install "
+            "it again"
+        )
     else:
         advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
     said = " ".join(f"{type(cause).__name__}: {cause}".split())

@@ -1,4 +1,4 @@
-"""This machine: its description, its memory, and the time, memory and disk space that a piece of work needs."""
+"""This computer: its description, its memory, and the time, memory and disk space that a task needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Child processes: each starts in its own process group, is read line by line, and ended in time."""
+"""Child processes: started in their own process group, read line by line, and ended within a time limit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from beamline.core.stop import StopScope
 _POLL = 0.2  # real s between two questions whether the process should stop
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
-ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
+ORPHANED = "this process ends, because the process that started it has died; no result was written"
 _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
@@ -51,8 +51,8 @@ def python() -> str:
     if program := os.environ.get(PYTHON) or next(ours, None):
         return program
     raise NoPythonError(
-        f"Python runs inside another program here (sys.executable is {sys.executable!r}), and no program that runs it "
-        f"alone was found in {sys.prefix}. Set {PYTHON} to one that has splatline, such as C:/Python313/python.exe"
+        f"Set {PYTHON} to a Python that has splatline, such as C:/Python313/python.exe: Python runs inside another "
+        f"program here (sys.executable is {sys.executable!r}), and no stand-alone Python was found in {sys.prefix}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Quantities: that of a volume's voxels, with its unit; and plausible ranges of those of an instrument.
+"""Quantities: what the voxels of a volume are, with units; and the plausible ranges of values of an instrument.
 
 Every type accepts a value in a mistaken unit, such as eV for keV.
 """
@@ -110,10 +110,10 @@ def doubt(name: str, value: float | None) -> str:
     if value is None or known is None or known.holds(value):
         return ""
     meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.plausible_as(value).items()]
+    factor = max(abs(value) / known.high, known.low / abs(value))
     return (
-        f"{name}: {value:.6g} {known.unit} is {max(abs(value) / known.high, known.low / abs(value)):.2g} times beyond "
-        f"the {known.low:g} to {known.high:g} {known.unit} of instruments of this kind"
-        f"{': did you mean ' + ' or '.join(meant) + '?' if meant else '.'}"
+        f"{name} = {value:.6g} {known.unit} is outside the usual range of {known.low:g} to {known.high:g} "
+        f"{known.unit}, by a factor of {factor:.2g}.{' Did you mean ' + ' or '.join(meant) + '?' if meant else ''}"
     )
 
 
@@ -128,8 +128,8 @@ def doubt_span(span_deg: float) -> str:
     for turn in (math.pi / 2, math.pi, 2 * math.pi, 4 * math.pi):
         if abs(abs(span_deg) / turn - 1) < _SAME:
             return (
-                f"scan.angles: a span of {span_deg:g} degrees is {math.degrees(turn):.0f} degrees in radians: did you "
-                f"mean {math.copysign(math.degrees(turn), span_deg):.0f}?"
+                f"scan.angles: the span of {span_deg:g} degrees would be {math.degrees(turn):.0f} degrees if it was in "
+                f"radians. Did you mean {math.copysign(math.degrees(turn), span_deg):.0f}?"
             )
     return ""
 

@@ -1,4 +1,4 @@
-"""Events of a reconstruction, of one that follows a scan, and of trials of reconstructions."""
+"""Events of a reconstruction, of a reconstruction that follows a scan, and of trials."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from beamline.core.events import Event, Listed, spread
 
 
 class SnapshotWritten(Event, event="snapshot"):
-    """The volume so far is in a file.
+    """The live volume was written to a file.
 
     Attributes:
-        unlearnt: relative residual of new views before the fit has learnt them.
-        method: whose volume it is, the one that predicts views held out better.
-        errors: of each method in these views, in the measure of the volume.
+        unlearnt: relative residual of new projections before the fit has used them.
+        method: the method of this volume, which predicts held-out projections better than the other one.
+        errors: error of each method in the held-out projections, on the scale of the volume.
     """
 
     path: Path
@@ -28,7 +28,7 @@ class SnapshotWritten(Event, event="snapshot"):
 
 
 class SlicesDrawn(Event, event="slices"):
-    """A picture has FBP slices of the views so far. degrees: angle of the half turn that the views cover."""
+    """A picture with FBP slices of the projections so far. degrees: how much of the 180° the projections cover."""
 
     picture: Path
     n_views: int
@@ -36,14 +36,14 @@ class SlicesDrawn(Event, event="slices"):
 
 
 class LawMeasured(Event, event="error_law"):
-    """The law of the error (`recon.base.error_law`) as the live reconstruction measured it at the end of a pass.
+    """The error model (`recon.base.error_law`) that the live reconstruction measured at the end of a pass.
 
     Attributes:
-        number: of the pass, from 1.
-        n_views: those that the live reconstruction used.
-        exponent, exponent_error, noise, offset: as of `ErrorLaw`.
-        gained: dB that the volume gained by this pass, as views held out measure it; None: not known.
-        reason: why these views have no law; then the numbers of the law are NaN.
+        number: number of the pass, from 1.
+        n_views: number of projections that the live reconstruction used.
+        exponent, exponent_error, noise, offset: as in `ErrorLaw`.
+        gained: improvement of the volume by this pass in dB, measured with held-out projections; None: not known.
+        reason: why no error model could be measured; the numbers of the model are then NaN.
     """
 
     number: int
@@ -57,11 +57,11 @@ class LawMeasured(Event, event="error_law"):
 
 
 class FitReached(Event, event="progress"):
-    """Progress of a fit or of iterations: the fields of `recon.base.method.Progress`, a rate and the time left.
+    """Progress of a fit or of iterations: the fields of `recon.base.method.Progress`, a rate and the remaining time.
 
-    waiting: views of a growing scan that are in the file, and that no step has learnt yet.
+    waiting: number of projections in the file of a growing scan that no step has used yet.
 
-    Numbers of another process are None where they are not finite.
+    Numbers from another process are None if they are not finite.
     """
 
     stage: str
@@ -80,9 +80,9 @@ class FitReached(Event, event="progress"):
 
 
 class ReconStarted(Event, event="recon_started"):
-    """Line integrals are ready, and the method begins. again: a live fit restarts because its axis has moved.
+    """Line integrals are ready, and the method starts. again: a live fit restarts because its axis has changed.
 
-    more: of a finished scan, values by name; `axis_confident` is None where the axis was given.
+    more: further values of a finished scan, by name; `axis_confident` is None if the user gave the axis.
     """
 
     file: Path | str
@@ -94,20 +94,20 @@ class ReconStarted(Event, event="recon_started"):
 
 
 class ReconDone(Listed, event="recon_done"):
-    """The live reconstruction wrote its volume; the values are those of its event `done`, see `VolumeDone`."""
+    """The live reconstruction has written its volume. The values are those of its event `done`, see `VolumeDone`."""
 
 
 class VolumeDone(Event, event="done"):
     """A reconstruction of this process has ended successfully; the event of another process is read as `Done`.
 
-    record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
+    record: the record of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """
 
     record: Any = spread(lambda record: record.event_values())
 
 
 class TrialsStarted(Event, event="trials_started"):
-    """The trials of a table, `tradeoff` or `study`, begin. by: the metric that they are compared by."""
+    """The trials of a table (`tradeoff` or `study`) start. by: the metric by which they are compared."""
 
     file: Path | str
     table: str

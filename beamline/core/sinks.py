@@ -1,4 +1,4 @@
-"""Sinks of events: JSON lines, sentences for people, several sinks as one, warnings, a thread that passes events on."""
+"""Sinks, which take events: JSON lines, sentences for people, several sinks as one, warnings, a thread of its own."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def sentence(event: Event) -> str | None:
         case Warned(message):
             return f"Warning: {message}"
         case BlockStarted(kind, mode, n, exposure=exposure):
-            return f"{n} {kind} frames ({mode}, {exposure:g} s each)"
+            return f"Taking {n} {kind} frames ({mode}, exposure {exposure:g} s)"
         case BlockDone():
             return _missing(event)
         case FrameFlagged(flag):
@@ -61,7 +61,7 @@ def sentence(event: Event) -> str | None:
             return _decision(event)
         case ScanDone(scan):
             alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
-            again = f", {scan.retaken} views taken again" if scan.retaken else ""
+            again = f", {count(scan.retaken, 'projection')} taken again" if scan.retaken else ""
             head = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
             return f"{head}, {scan.seconds:.1f} s: {scan.path}"
         case Failed(message):
@@ -75,39 +75,41 @@ def _of_reconstruction(event: Event) -> str | None:
     """The sentence of an event of `recon_events`."""
     match event:
         case ReconStarted():
-            again = " again, from the start" if event.again else ""
-            return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
+            again = "starts again from the beginning" if event.again else "starts"
+            views = count(event.n_views, "projection")
+            return f"{event.method} {again}: {views}, rotation axis at column {event.axis_col:.2f}"
         case TrialsStarted(file, trials=trials, by=by):
-            return f"{trials} trials of {file}, quality by {by}"
+            return f"{count(trials, 'trial')} of {file}; quality is measured by {by}"
         case TrialDone():
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
-            return f"Volume from {n_views} views so far: {path}"
+            return f"Volume from the first {count(n_views, 'projection')}: {path}"
         case ReconDone(values):
             return f"Volume: {values.get('output', '')}"
     return None
 
 
 def lines(event: Event) -> list[str]:
-    """The event as lines for people: a table where a pass has ended, else its sentence; [] where it has none."""
+    """The event as lines for people: a table if a pass has ended, otherwise its sentence; [] if it has none."""
     if isinstance(event, PassEnded):
         return [*_table_of_options(event)]
     text = sentence(event)
     return [] if text is None else [one_line(text, SENTENCE)]
 
 
-_OVER = 32  # frames after the last one of a finding that takes several: more come every 8 views at most
-_HELD = 60.0  # s after the first of them the frames so far are told
+_OVER = 32  # frames after which a finding has ended; an ongoing one is reported at least every 8 projections
+_HELD = 60.0  # s after its first event, an ongoing finding is reported with its frames so far
 
 
 class Narration:
     """Events for people; repeated findings on further frames are joined into one.
 
-    It comes when the finding has ended, `_HELD` s after its first event, or before the end of a block or a command.
+    The joined event comes when the finding has ended, `_HELD` s after its first event, or before a block or a command
+    ends.
     """
 
     def __init__(self) -> None:
-        self._open: dict[str, FrameFlagged] = {}  # by check: a finding with all frames so far
+        self._open: dict[str, FrameFlagged] = {}  # by check: an ongoing finding with all its frames so far
 
     def __call__(self, event: Event) -> Iterator[Event]:
         """The events to report now."""
@@ -154,9 +156,9 @@ def _trial(trial: TrialDone) -> str:
 
 
 def _table_of_options(ended: PassEnded) -> Iterator[str]:
-    """Lines of at most 80 characters: what can be measured next, side by side, and how the operator answers."""
-    number = ended.passes or ended.number  # of earlier versions
-    yield f"Pass {number} is over, {count(ended.n_views, 'view')} so far. What can be measured next:"
+    """Lines of at most 80 characters: a table of what can be measured next, and how the operator answers."""
+    number = ended.passes or ended.number  # `number` in files of earlier versions
+    yield f"Pass {number} is done, {count(ended.n_views, 'projection')} so far. What can be measured next:"
     yield f"  {'choice':<7}{'gain, dB':<22}{'dB/min':>8}{'s':>9}{'dose':>9}{'data':>10}"
     for option in ended.options:
         mark, choice = "> " if option["choice"] == ended.recommended else "  ", one_line(str(option["choice"]))
@@ -166,11 +168,11 @@ def _table_of_options(ended: PassEnded) -> Iterator[str]:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
         answer = f"beamline decide CHOICE, Enter for {one_line(ended.recommended)}"
-        yield f"Within {ended.wait:.0f} s: {answer}; else the plan goes on."
+        yield f"Within {ended.wait:.0f} s: {answer}; otherwise as planned."
 
 
 def _gain(option: Mapping[str, Any]) -> tuple[str, str]:
-    """The gain of an option with its range, and dB a minute."""
+    """The expected improvement by an option, with its range, and in dB per minute."""
     gain, low, high, seconds = (option[name] for name in ("gain", "low", "high", "seconds"))
     if gain is None:
         return "not known", "-"
@@ -178,7 +180,7 @@ def _gain(option: Mapping[str, Any]) -> tuple[str, str]:
     return f"{gain:+.2f}{ends}", f"{60 * gain / seconds:+.2f}" if seconds else "-"
 
 
-_BY = {"program": "chosen by the program: ", "plan": "as planned: "}  # the operator's reason says who chose
+_BY = {"program": "chosen by the program: ", "plan": "as planned: "}  # if the operator chose, the reason says so
 
 
 def _decision(chosen: NextChosen) -> str:
@@ -187,7 +189,7 @@ def _decision(chosen: NextChosen) -> str:
         return decision
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
     ends = "" if None in (low := chosen.gained_low, high := chosen.gained_high) else f" ({low:.2f} to {high:.2f})"
-    return f"{decision.rstrip('.')}. An earlier choice: {predicted}measured {chosen.gained:+.2f} dB{ends}"
+    return f"{decision.rstrip('.')}. Result of an earlier choice: {predicted}measured {chosen.gained:+.2f} dB{ends}"
 
 
 def _missing(block: BlockDone) -> str | None:
@@ -196,11 +198,11 @@ def _missing(block: BlockDone) -> str | None:
     return f"Of {block.n} {block.kind} frames: {', '.join(parts)}" if parts else None
 
 
-Warn = Callable[[str], None]  # Takes a sentence about something that is wrong though work goes on
+Warn = Callable[[str], None]  # Takes a sentence about something that is wrong, although the work continues
 
 
 class Note(str):
-    """A sentence about what was done, where nothing is wrong: it becomes an event `state`, not a warning."""
+    """A sentence about what was done, if nothing is wrong. It becomes an event `state`, not a warning."""
 
 
 def event_of_sentence(text: str, now: float) -> Event:
@@ -209,7 +211,7 @@ def event_of_sentence(text: str, now: float) -> Event:
 
 
 class JsonLines:
-    """A sink that writes one JSON line per event and flushes it, so that a crash loses no earlier event."""
+    """A sink that writes one JSON line per event and flushes it, so that a crash does not lose earlier events."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -239,18 +241,18 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
             return
         try:
             sink(event)
-        except BaseException as error:  # of somebody's code; SystemExit would end the announcer in silence
+        except BaseException as error:  # from any code; SystemExit would end the announcer without a message
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
             works = False
             why = f"{type(error).__name__}: {error}"
-            others(Warned(f"An output of events failed and gets no further events: {why}", time=event.time))
+            others(Warned(f"An output failed and is not used any more: {why}", time=event.time))
 
     return send
 
 
 class Warnings:
-    """Sends each warning or note as an event, once, and collects it in `messages` for the report."""
+    """Sends each warning or note once, as an event, and collects it in `messages` for the report."""
 
     def __init__(self, sink: Sink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
@@ -262,7 +264,7 @@ class Warnings:
             self._sink(event_of_sentence(text, self._clock.now()))
 
     def withdraw(self, beginning: str) -> None:
-        """Take back, of the report, what begins so: it does not hold any more."""
+        """Remove messages with this beginning from the report, because they are no longer true."""
         self.messages = [text for text in self.messages if not text.startswith(beginning)]
 
 
@@ -272,9 +274,8 @@ _PATIENCE = 10.0  # s
 class Announcer:
     """Passes events to sinks in a separate thread. Leaving the context waits until all events have been passed on.
 
-    It waits for `_PATIENCE` s at most: a terminal or pipe that nobody reads takes no event, and must not keep the
-    program from ending. A sink that raises (a closed pipe, a full disk) gets no further events; the others get a
-    warning.
+    It waits at most `_PATIENCE` s, so that the program can end even if nobody reads the terminal or pipe. A sink that
+    raises (closed pipe, full disk) gets no further events; the other sinks get a warning.
     """
 
     def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:

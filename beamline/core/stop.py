@@ -1,4 +1,4 @@
-"""Requests to end work early: a scan's StopRequest, the stop scope of a reconstruction, and signals that ask for one.
+"""Requests to end work early: StopRequest of a scan, stop scope of a reconstruction, and the signals that ask for it.
 
 The first signal asks for a stop with the data so far, the second ends at once. Python lets only the main thread catch
 signals. Other threads catch nothing; there the request to stop must come from its owner.
@@ -32,7 +32,8 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
     """A context in which the first Ctrl-C requests a stop, the second an abort.
 
     SIGTERM, a closed terminal (SIGHUP), a closed console of Windows (SIGBREAK) and the signals of batch systems request
-    a stop. Ctrl-Z suspends nothing: the shutter would stay open, and the watchdog would take the scan for dead.
+    a stop. Ctrl-Z does not suspend the process, because the shutter would stay open, and the watchdog would conclude
+    that the scan has died.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -46,10 +47,12 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
         if not stop.aborting:
-            to_stderr(f"Stopping cleanly, as the process received {signal.Signals(number).name}. Ctrl-C aborts.")
+            to_stderr(f"Stopping cleanly, because the process received {signal.Signals(number).name}. Ctrl-C aborts.")
 
     def keep_on(number: int, frame: FrameType | None) -> None:
-        to_stderr("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
+        to_stderr(
+            "Use `beamline pause` to pause the scan: it cannot be suspended, because the shutter would stay open."
+        )
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
     return _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_ENDING, terminate)})
@@ -59,12 +62,14 @@ class StopOnSignal:
     """A stop scope: the first Ctrl-C, SIGTERM or SIGHUP requests a stop with a partial result, the second interrupts.
 
     Args:
-        reply: printed on the first signal.
-        ready: there is, or soon will be, such a result. Before that the first signal interrupts.
+        reply: sentence that is printed after the first signal.
+        ready: True if there is a partial result, or will be soon. Otherwise the first signal interrupts the work.
     """
 
     def __init__(
-        self, reply: str = "Stopping as soon as there is a volume. Ctrl-C again discards it.", ready: bool = True
+        self,
+        reply: str = "Stopping as soon as there is a volume. Press Ctrl-C again to stop without a volume.",
+        ready: bool = True,
     ) -> None:
         self._requested, self._reply, self.ready = False, reply, ready
 
@@ -89,14 +94,17 @@ def terminated_like_interrupted() -> AbstractContextManager[None]:
 
 @contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
-    """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones.
+    """A context in which signals have these handlers, if it runs in the main thread. Its end restores the old handlers.
 
-    A signal that is ignored stays so: SIGHUP under `nohup`, SIGINT where a script started this in the background.
+    Signals that are ignored stay ignored: SIGHUP under `nohup`, SIGINT if a script started this in the background.
     """
     with ExitStack() as restore:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():
-                if signal.getsignal(number) not in (None, signal.SIG_IGN):  # None: not Python's, cannot be restored
+                if signal.getsignal(number) not in (
+                    None,
+                    signal.SIG_IGN,
+                ):  # None: the handler is not from Python and cannot be restored
                     restore.callback(signal.signal, number, signal.signal(number, handler))
         yield
 
@@ -134,7 +142,7 @@ class Cause(Enum):
 
 
 class PauseRequest:
-    """A request to pause a scan, from any thread: until it is resumed, or until its causes are over."""
+    """A request to pause a scan, from any thread, until the operator resumes it or its causes have ended."""
 
     def __init__(self) -> None:
         self._by_operator = ""
@@ -153,11 +161,12 @@ class PauseRequest:
 
     def pause(self, reason: str = "the operator asked for it") -> None:
         self._by_operator = (
-            f"{reason.rstrip('.')}. Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
+            f"{reason.rstrip('.')}. Press Enter or use `beamline resume` to continue; Ctrl-C or "
+            "`beamline stop` ends the scan"
         )
 
     def resume(self) -> None:
-        """End the operator's pause; a pause for missing beam or a slow disk goes on."""
+        """End the pause by the operator. A pause because of missing beam or a slow disk continues."""
         self._by_operator = ""
 
     def no_beam(self, reason: str, since: float) -> None:
@@ -181,19 +190,19 @@ class PauseRequest:
 
 
 class StopRequest:
-    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once); it cannot be undone.
+    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). It cannot be undone.
 
-    Any thread and signal handlers can set it. Each flag is set by one assignment, without a lock, because a handler may
-    interrupt another one here.
+    Any thread or signal handler can set it. Each flag is set by a single assignment without a lock, because one signal
+    handler may interrupt another.
 
     Args:
-        now: a clock in real s.
+        now: a clock that gives real time in s.
 
-    Attributes, only for reading:
-        stopping: a stop or an abort was requested.
-        aborting: an abort was.
-        reason: of the first stop, or of the last abort.
-        by_person: somebody asked, or the system, and not only the scan itself.
+    Attributes (read only):
+        stopping: True if a stop or an abort was requested.
+        aborting: True if an abort was requested.
+        reason: reason of the first stop, or of the last abort.
+        by_person: True if a person or the operating system asked, not only the scan itself.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -206,10 +215,10 @@ class StopRequest:
             raise ScanAborted(f"Aborted: {self.reason}.")
 
     def stop(self, reason: str = "the operator asked for it", *, by_itself: bool = False) -> None:
-        """End cleanly: pending frames and missing references are still acquired, the stage returns.
+        """End cleanly: pending frames and the remaining darks and flats are still acquired, and the stage returns.
 
         Args:
-            by_itself: the scan asks, by what its frames show.
+            by_itself: True if the scan itself asks to stop, because of what its frames show.
         """
         self.by_person = self.by_person or not by_itself
         self.reason = self.reason or reason
@@ -225,5 +234,5 @@ class StopRequest:
 
     @property
     def seconds(self) -> float:
-        """Real s since the first request; 0 without one."""
+        """Real time in s since the first request; 0 without a request."""
         return self._now() - self._requested_at if self.stopping else 0.0

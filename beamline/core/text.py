@@ -1,4 +1,4 @@
-"""Text for people: angles, sizes, numbers of things, index ranges."""
+"""Text for people: angles, sizes, numbers of things, ranges of indices."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def with_points(numbers: Sequence[str]) -> list[str]:
     if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
         beside = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         raise ValueError(
-            f"{one_line(commas[0], 40)} has a comma{beside}, which may stand before decimals or not: write one number "
-            "a line, its decimals after a point"
+            f"{one_line(commas[0], 40)} has a comma{beside}, which may or may not be a decimal comma: write one number "
+            "a line, with a decimal point"
         )
     return [text.replace(",", ".") for text in numbers]
 

@@ -1,6 +1,6 @@
-"""Features: what a scan and its volume do not need. Each is a folder: commands, options, pages, and what they do.
+"""Features: everything that running and reconstructing a scan does not need, such as export or the pages.
 
-A feature enters by its folder: `beamline.cli.main` reads `COMMANDS` of each. The core imports no feature, and no
-feature another, so that a folder can be removed, with its tests. `[tool.splatline.features]` in pyproject.toml names
-the folders of each.
+Each feature is a folder with its commands, options and pages. `beamline.cli.main` finds it by reading `COMMANDS` of
+each folder. The core imports no feature, and no feature imports another one, so a folder can be removed together with
+its tests. `[tool.splatline.features]` in pyproject.toml lists the folders of each feature.
 """

@@ -1,1 +1,1 @@
-"""Instrument: a configuration becomes connected devices, real or simulated."""
+"""Instrument: connects the devices of a configuration, real or simulated."""

@@ -1,4 +1,4 @@
-"""Devices: the composition root, where a configuration becomes the devices of an instrument.
+"""Connects all devices of an instrument, as the configuration states them.
 
 Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
 that names a simulator.
@@ -58,14 +58,16 @@ else:
 
 from drivers.base.errors import DeviceError
 
-_STATE = "What was acquired so far is in the file"
+_STATE = "Frames taken so far are in the file"
 
 
 def ask_operator(request: str) -> None:
     """Ask the operator at the terminal, and wait for Enter. Raises DeviceError without a terminal or a confirmation."""
     if not sys.stdin.isatty():
-        advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
-        raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)
+        advice = "Run it in a terminal, or configure a shutter and a sample mover that are not moved by hand"
+        raise DeviceError(
+            "operator", "there is no terminal to ask the operator", request=request, advice=advice, state=_STATE
+        )
     try:
         # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
@@ -121,7 +123,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
     Raises:
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
     """
-    click.echo(f"Waiting for a cold sensor, at most {seconds:g} s; Ctrl-C ends it.", err=True)
+    click.echo(f"Waiting until the sensor is cold, at most {seconds:g} s; Ctrl-C ends the wait.", err=True)
     told = -math.inf
 
     def progress(celsius: float, status: str) -> None:
@@ -129,7 +131,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
         check_stop()
         if clock.now() - told >= TELL_EVERY:
             told = clock.now()
-            click.echo(f"The sensor has {celsius:.1f} °C, its cooler says {status}.", err=True)
+            click.echo(f"The sensor is at {celsius:.1f} °C; its cooler reports {status}.", err=True)
 
     camera.wait_until_cold(seconds, progress)
 
@@ -186,9 +188,9 @@ def connect(
     """Open every device that the configuration names. Nothing moves.
 
     Args:
-        clock: takes the place of the configured one.
-        ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
-        check_stop: called again and again while there is something to wait for; an exception from it ends the wait.
+        clock: replaces the configured clock.
+        ask: function that asks the operator to move shutter or sample by hand; default: ask at the terminal.
+        check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
         DeviceError: a device does not answer; those opened before it are closed again.
@@ -253,7 +255,7 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     A simulated scene is read, too, so that its faults are reported now.
 
     Returns:
-        the stage's limits, the camera's timing with the views' exposure, and the stage's radians to whole counts.
+        the stage's limits, the camera's timing with the projections' exposure, and the stage's radians to whole counts.
 
     Raises:
         ConfigError: settings that a device would refuse, or a scene that is wrong.
@@ -282,7 +284,7 @@ def _instrument(
 ) -> Devices:
     chosen = config.devices.camera
     if isinstance(chosen, SimulatedOrca):
-        raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
+        raise ConfigError("a real stage needs a real camera; set devices.camera.kind: dcam")
     stage = _held(config.devices.stage.connect(clock), opened)
     camera: Camera
     if isinstance(chosen, DcamOrca):

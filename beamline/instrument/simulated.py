@@ -79,7 +79,7 @@ class SimulatedScene:
     cone: tuple[float, float] | None
     # labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
     labels: Callable[[float], Sequence[Label]]
-    # rehearse: makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so
+    # rehearse: makes a frame with the camera's present settings; ConfigError if the scene cannot be exposed so
     rehearse: Callable[[], None]
 
 
@@ -174,8 +174,8 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     if energy is not None and isinstance(beam := mapping.get("beam"), dict):
         if wide := [name for name in ("spectrum", "tube") if beam.get(name) is not None]:
             raise ConfigError(
-                f"simulation.scene.beam has a {wide[0]}, and a monochromator gives one energy: name energy_kev there "
-                "instead. Nothing was started."
+                f"name energy_kev in simulation.scene.beam instead of {wide[0]}, because a monochromator "
+                "gives a single energy. Nothing was started."
             )
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:
@@ -193,15 +193,16 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     row0, _, rows, _ = camera.roi or (0, 0, height, width)
     if 2 * row0 + rows != height:
         raise ConfigError(
-            f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
-            f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
+            "devices.camera.roi: the scene is a cone beam, whose central ray must meet the middle of the "
+            f"sensor's rows. {rows} rows must then begin at {(height - rows) // 2}, not at {row0}. "
+            "Nothing was started."
         )
     if config.scan.offset_views:
-        raise ConfigError("scan.offset_views is for a parallel beam; the scene is a cone beam. Nothing was started.")
+        raise ConfigError("scan.offset_views needs a parallel beam, but the scene is a cone beam. Nothing was started.")
     if config.optics.axis_col is None:
         raise ConfigError(
-            "optics.axis_col: the scene is a cone beam, whose axis is not searched while views come; set it, here "
-            f"{axis_col_of(config, scene):g}. Nothing was started."
+            f"set optics.axis_col, here to {axis_col_of(config, scene):g}: the scene is a cone beam, "
+            "whose axis cannot be searched during the scan. Nothing was started."
         )
 
 

@@ -1,4 +1,4 @@
-"""States: what each device of a configuration says of itself and how it stands, before a scan. Nothing moves."""
+"""States: identity and status of each device of a configuration before a scan. Nothing moves."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Monitor: checks that look at every frame while it can still be repeated."""
+"""Monitor: checks every frame while it can still be repeated."""

@@ -1,9 +1,9 @@
-"""Beam: drift of the light against the flats, and its dips and flashes.
+"""Check `beam`: slow changes of the beam intensity relative to the flats, and sudden ones.
 
-The drift against the flats is judged in air: the brightest place of a view. It is reported when it begins, as a fact
-each time it has doubled. A dip is judged by the change from view to view
-(beamline.monitor.change), which needs no air. These changes have errors of one sign where dense particles turn fast;
-these would sum up to a dip. A change counts only where the light of the whole view moved with it.
+The slow change is measured in air, at the brightest part of a projection. It is reported when it starts, and as info
+each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change), which
+needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like a loss
+of beam. A change therefore counts only if the intensity of the whole projection changed with it.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from recon.base.setting import setting
 LASTS = 5  # views that a drift must last
 GROWN = 2.0  # times the reported drift, at which it is reported again
 REMEDY = (
-    "`beamline recon` takes it off where there is air beside the sample (--air auto); flats before and after the views "
-    "(scan.flats.at: both) tell it, too."
+    "`beamline recon` corrects this if there is air next to the sample (--air auto). Flats before and after the "
+    "projections (scan.flats.at: both) also correct it."
 )
-TAKEN_OFF = "`beamline recon` takes it off where there is air beside the sample (--air auto)."
+TAKEN_OFF = "`beamline recon` corrects this if there is air next to the sample (--air auto)."
 GONE = 0.5  # share of the limit below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual light
@@ -51,19 +51,19 @@ class BeamState:
 
 @dataclass(frozen=True)
 class BeamCheck(Logged):
-    """Score: lost fraction of the light (negative: gained).
+    """Score: lost fraction of the intensity (negative: gained).
 
-    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
-    allows. 10 % at once are no drift of a ring.
+    The defaults: 2 % of intensity are 0.02 of line integral in every ray, if it is not corrected with the air next to
+    the sample. A sudden change of 10 % cannot be the drift of a ring.
     """
 
     name: ClassVar[str] = "beam"
     bit: ClassVar[int] = 0
-    unit: ClassVar[str] = "fraction of the reference light"
-    meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
+    unit: ClassVar[str] = "fraction of the intensity in the flats"
+    meaning: ClassVar[str] = "the beam intensity differs from that in the flats, or from the projections before"
 
-    drift: float = setting(0.02, "fraction by which the light may drift, either way", ge=0)
-    dip: float = setting(0.10, "fraction of the light whose loss at once is an alarm", ge=0, lt=1)
+    drift: float = setting(0.02, "fraction by which the beam intensity may drift up or down", ge=0)
+    dip: float = setting(0.10, "fraction of the beam intensity whose sudden loss is an alarm", ge=0, lt=1)
 
     start = BeamState
 
@@ -84,7 +84,7 @@ class BeamCheck(Logged):
         if abs(score) <= self.drift:
             return None
         level, limit = (Level.ALARM, self.dip) if abs(score) > self.dip else (Level.WARN, self.drift)
-        advice = f"{_size(score)} light than in the flats before. {REMEDY}"
+        advice = f"Usually nothing to do: this flat is {_size(score)} than the flats before. {REMEDY}"
         return Flag(self.name, level, row, score, limit, advice)
 
     def _dip(
@@ -104,7 +104,8 @@ class BeamCheck(Logged):
             usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
             return replace(state, usual=usual, dipping=0), None
         advice = (
-            f"{_size(score)} light than in the views before. Check ring current, slits and filters; take new flats."
+            f"Check ring current, slits and filters, and take new flats: this projection is {_size(score)} than the "
+            "projections before."
         )
         return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
 
@@ -114,8 +115,9 @@ class BeamCheck(Logged):
             if state.covered:
                 return CheckResult(replace(state, drifting=0))
             advice = (
-                f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
-                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be measured."
+                "The drift of the beam cannot be measured, because no part of the frame gets more than "
+                f"{1 - score:.0%} of the intensity in the flats. The sample covers the whole frame, or the beam is "
+                "weaker than in the flats."
             )
             return CheckResult(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
         gone = state.told != 0 and abs(score) < GONE * self.drift
@@ -126,15 +128,14 @@ class BeamCheck(Logged):
         if gone:
             return CheckResult(replace(state, drifting=0, told=0.0))
         level = Level.INFO if state.told else Level.WARN  # a view is no worse for a drift that goes on
-        advice = f"{_size(score)} light than in the flats, where there is air. {REMEDY}"
+        advice = f"Usually nothing to do: air is {_size(score)} than in the flats. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
         return CheckResult(replace(state, drifting=0, told=score), flag)
 
 
 def in_air(context: ScanContext) -> float:
-    """Line integral of the brightest place of a view (light lost since the flats); NaN if it may be matter: above
-    COVERED, and unlike the air so far.
-    """
+    """Line integral of the brightest part of a projection (loss of beam since the flats). NaN if it may be sample,
+    because it is above COVERED and unlike the air so far."""
     if context.view is None or context.grid is None or not context.grid.flats:
         return math.nan
     brightest = brightest_place(context.view, context.grid)
@@ -142,20 +143,23 @@ def in_air(context: ScanContext) -> float:
 
 
 def _of_integrals(flag: Flag) -> Flag:
-    """The flag of a file without counts and flats, where nobody knows the light."""
+    """The flag for a file without counts and flats, in which the intensity is not known."""
     off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
         advice = f"No line integral of the frame is below {off:.3g}: the sample covers all of it, or air is not at 0."
     else:
-        advice = f"Line integrals are {off:+.3g} off, beside 0 in air or beside the views before. {TAKEN_OFF}"
+        advice = (
+            f"Line integrals are wrong by {off:+.3g}, compared with 0 in air or with the projections before. "
+            f"{TAKEN_OFF}"
+        )
     return replace(flag, advice=advice)
 
 
 def _size(score: float) -> str:
-    return f"{abs(score):.1%} {'less' if score > 0 else 'more'}"
+    return f"{abs(score):.1%} {'darker' if score > 0 else 'brighter'}"
 
 
 def _whole(view: CellView, grid: CellGrid) -> float:
-    """Logarithm of the mean transmission of the lit cells; NaN where none is."""
+    """Logarithm of the mean transmission of the cells with beam; NaN without such cells."""
     lit = grid.lit > 0
     return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan

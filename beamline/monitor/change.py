@@ -1,4 +1,4 @@
-"""Change: the difference of a view from earlier ones that the turning of the sample does not explain.
+"""Change: the difference between a projection and earlier ones that the rotation of the sample does not explain.
 
 Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
@@ -46,10 +46,10 @@ class SampleChange:
     steps: float = 1.0  # since the view before
 
     def beside_columns(self) -> tuple[float, float, float] | None:
-        """Shift across, shift down and turn, by differences between rows; None if rows are too similar.
+        """Shift across, shift down and turn, from differences between rows; None if rows are too similar.
 
-        A hump of light as high as the frame, such as a ghost, changes all rows of a column alike. It has no effect
-        here, while the motion of a sample has.
+        A change as high as the frame, such as a ghost, is the same in all rows of a column. It has no effect here,
+        unlike the motion of a sample.
         """
         if self.basis is None or self.weight is None or min(self.residual.shape) < 2:
             return None
@@ -113,7 +113,7 @@ def _smooth(image: CellValues) -> CellValues:
 
 
 def _spread(change: CellValues, weight: CellValues) -> float | None:
-    """Standard deviation of changes at weight 1, by one cell of five; None where no cell has a weight."""
+    """Standard deviation of changes at weight 1, from every fifth cell; None if no cell has a weight."""
     sample, weights = change.ravel()[::SAMPLED], weight.ravel()[::SAMPLED]
     lit = weights > 0
     return median_deviation(sample[lit] * np.sqrt(weights[lit])) if lit.any() else None

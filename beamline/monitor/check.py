@@ -1,7 +1,7 @@
-"""Check: the interface of the monitor's checks, with what they know of the scan and what they report.
+"""Check: the interface of the checks of the monitor, with their input (ScanContext) and their result (CheckResult).
 
-A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It looks at one
-frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
+A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It checks one
+frame after another. What it has to remember is an immutable state, so that a scan can be replayed.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ State = TypeVar("State")
 class Policy(StrEnum):
     """Effect of a check's alarms on the scan."""
 
-    LOG = "log"  # write it down: file, events, report
-    WARN = "warn"  # and print it on the terminal
-    PAUSE = "pause"  # and hold the scan until the operator or the check says that it may go on
-    STOP = "stop"  # and end the scan cleanly, as the first Ctrl-C does
+    LOG = "log"  # record it in file, events and report
+    WARN = "warn"  # also print it on the terminal
+    PAUSE = "pause"  # also pause the scan, until the operator or the check lets it continue
+    STOP = "stop"  # also end the scan cleanly, as the first Ctrl-C does
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,33 +38,34 @@ class ScanContext:
     """Input of the checks: the scan, the references so far, and quantities of the frame that several checks need.
 
     Attributes:
-        saturation: the count from which a pixel is saturated.
-        pixels: of a frame.
-        period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
-        step: rad from a view to the next, as planned: the median, with its sign; NaN: not known, or they do not turn
-            one way.
-        frames_per_view: at each angle; only the first of a view is compared with views before.
-        stored: views that are in an earlier file of the scan.
-        cone: the beam is one; else it is parallel.
-        axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
-        integrals: frames were line integrals, and are judged as counts of a beam without flats of its own.
-        dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
-        flat_exposure: s of these flats, which may have an exposure of their own.
-        grid: the cells of the views; None before the first projection.
-        spots: bright pixels of views and flats that the previous frame lacks.
-        follows: checks may compare it with the previous view, its neighbour in angle. False for repeated views, at a
-            new pass, and after views of another file: such checks begin anew there. True for the first view, and where
-            `step` is not known.
-        light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
-            projection.
-        view: the frame on this grid; None where it is no projection, or has no light, or is not its view's first.
-        truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
-        dimmer: logarithm of the light that the beam has lost since the flats, as air beside the sample shows it; NaN
-            where none has shown it yet.
-        shake: pixels across and down by which a view stands beside the sample's way at random, standard deviations; 0
-            where noise alone may give as much.
-        change: the part that turning since the views before does not explain; None where these are too few, or at
-            uneven steps.
+        saturation: counts from which a pixel is saturated.
+        pixels: number of pixels in a frame.
+        period: time in s between the triggers of a fly scan; None for a step scan.
+        step: planned angular step in rad between projections (median, with its sign); NaN if it is not known, or if
+            the angles are not in one direction.
+        frames_per_view: number of frames at each angle; only the first one is compared with earlier projections.
+        stored: projections that are in an earlier file of the scan.
+        cone: True for a cone beam, False for a parallel beam.
+        axis_col: rotation axis that the scan states, in pixel columns; None if it states none.
+        integrals: True if the frames were line integrals; they are checked like counts of a beam without flats.
+        dark, flat: float32 [preview row, preview col], mean of the latest group of darks and of flats; None before any.
+        flat_exposure: exposure of these flats in s; it may differ from that of the projections.
+        grid: the cells of the projections; None before the first projection.
+        spots: bright pixels of projections and flats that are not in the previous frame.
+        follows: True if the previous projection is the neighbour in angle, so that checks may compare with it. False
+            for repeated projections, at a new pass, and after projections of another file, where such checks start
+            again. True for the first projection, and if `step` is not known.
+        light_left: intensity relative to the last good projection, see beamline.monitor.view.light_left; 1 if the
+            frame is not a projection.
+        view: the frame on the grid; None if it is not a projection, has no beam, or is not the first one at its angle.
+        truncated: True if the sample is wider than the field of view, in this projection or an earlier one, or if
+            flats are missing.
+        dimmer: logarithm of the loss of beam intensity since the flats, measured in air next to the sample; NaN if no
+            air was seen yet.
+        shake: standard deviations of the random shifts of the sample, in pixels, horizontal and vertical; 0 if they
+            can be explained by noise.
+        change: the change that the rotation since the previous projections does not explain; None if these are too
+            few, or at uneven steps.
     """
 
     saturation: float
@@ -90,22 +91,22 @@ class ScanContext:
     change: SampleChange | None = None
 
 
-AGAIN = "`monitor.retake: true` in a configuration has a scan take such views again, after the last one."
-"""Advice of alarms that a view taken again has not."""
+AGAIN = "With `monitor.retake: true` in the configuration, the scan takes such projections again at its end."
+"""Advice for alarms that usually do not occur again when the projection is repeated."""
 
 
 def again_by(check: str) -> str:
-    """The policy of a check with this reaction to warnings."""
-    return f"`monitor.retake: [{check}]` in a configuration has a scan take such views again, after the last one."
+    """Advice for warnings of a check: how to have such projections taken again."""
+    return f"With `monitor.retake: [{check}]` in the configuration, the scan takes such projections again at its end."
 
 
 def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
-    """Counts above the dark [preview row, preview col]; the raw counts where no dark was seen."""
+    """Counts above the dark [preview row, preview col]; raw counts if there was no dark yet."""
     return preview if context.dark is None else preview - context.dark
 
 
 def at_edges(context: ScanContext) -> tuple[float, float]:
-    """Line integrals of matter at the left and the right edge of the field, corrected for a weakening beam."""
+    """Line integrals at the left and right edge of the field of view, corrected for the loss of beam intensity."""
     assert context.view is not None
     left, right = context.view.edges
     dimmer = 0.0 if math.isnan(context.dimmer) else context.dimmer
@@ -113,20 +114,20 @@ def at_edges(context: ScanContext) -> tuple[float, float]:
 
 
 def more_light(context: ScanContext, exposure: float) -> float:
-    """Light of an `exposure` (s) without a sample, relative to that of the flats, whose exposure may differ."""
+    """Intensity without a sample for this exposure (s), relative to the flats, whose exposure may differ."""
     return exposure / context.flat_exposure
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult(Generic[State]):
-    """Result of a check of one frame: the check's state after it, and its finding (None: nothing to report)."""
+    """Result of checking one frame: the new state of the check, and its flag (None: nothing to report)."""
 
     state: State
     flag: Flag | None = None
 
 
 class Logged:
-    """A check whose alarms are only logged, unless the configuration says otherwise."""
+    """A check whose alarms are only recorded, unless the configuration sets another policy."""
 
     policy: ClassVar[Policy] = Policy.LOG
 
@@ -134,16 +135,16 @@ class Logged:
 class Check(Protocol):
     """One check of the monitor: a frozen dataclass whose fields are its limits, each with a default.
 
-    The type of a field, with what `recon.base.setting.setting` declares of it, is what the configuration
-    `monitor.<check>.<limit>` accepts (see beamline.config.monitor).
+    The configuration `monitor.<check>.<limit>` accepts values according to the type of the field and to its
+    `recon.base.setting.setting` (see beamline.config.monitor).
 
     Attributes:
-        name: in the configuration, in events and in the legend of a file.
-        bit: in the bitmask of a frame in a file, 0 ... 15 or 32 ... 47. Never changed and never used again: old files
-            hold it.
-        unit: of the score and, unless a limit says otherwise, of the limits.
-        meaning: what the flag says of a frame, one sentence for the legend of a file.
-        policy: what its alarms do to a scan, unless the configuration says otherwise.
+        name: name of the check in the configuration, in events and in the legend of a file.
+        bit: its bit in the bitmask of a frame in a file, 0 ... 15 or 32 ... 47. A bit is never changed and never used
+            again, because old files contain it.
+        unit: unit of the score, and of the limits unless a limit states another one.
+        meaning: meaning of the flag, one sentence for the legend of a file.
+        policy: effect of its alarms on a scan, unless the configuration sets another one.
     """
 
     name: ClassVar[str]

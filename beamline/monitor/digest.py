@@ -109,11 +109,11 @@ def digest(
 
 
 def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: int) -> tuple[FrameDigest, FrameDigest]:
-    """The digest of a frame for the checks, with blocks of `check_block`, and that for a file, with blocks of
-    `preview_bin`: each to the bit as `digest` makes it.
+    """Two digests of a frame: one for the checks, with blocks of `check_block`, and one for the file, with blocks of
+    `preview_bin`. Each is bit-identical to the result of `digest`.
 
-    So what the checks find depends on the frames alone, and their file gives the same findings later. Where the sides
-    differ, the pixels are read twice.
+    What the checks find therefore depends only on the frames, and their file gives the same findings later. If the two
+    block sizes differ, the pixels are read twice.
     """
     seen = digest(image, saturation, check_block(image.shape))
     return seen, seen if preview_bin == check_block(image.shape) else digest(image, saturation, preview_bin)

@@ -1,4 +1,4 @@
-"""Evidence: what darks, flats and some views show, frame by frame, of a running scan or of a file."""
+"""Evidence: statistics of darks, flats and some projections, of a running scan or of a file."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ Group = Sequence[FrameStatistics]
 
 
 class BadFrames(NamedTuple):
-    """Frames of a group that cannot be used: the figure, the limit that it violates, and both in words, with advice.
+    """Frames of a group that cannot be used: the score, the violated limit, and a sentence with both and with advice.
 
-    Without frames it is said of all.
+    Without frames the sentence is about all of them.
     """
 
     frames: Group
@@ -101,14 +101,14 @@ class BadFrames(NamedTuple):
 
 
 def range_in_words(scores: Iterable[float]) -> str:
-    """The least and the largest in words."""
+    """The smallest and the largest score in words."""
     low, high = f"{min(scores):.3g}", f"{max(scores):.3g}"
     return low if low == high else f"{low} to {high}"
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Darks and flats by groups, of one kind each and in the order of the file, and some views."""
+    """Groups of darks and groups of flats, in the order of the file, and some projections."""
 
     groups: tuple[tuple[FrameStatistics, ...], ...] = ()
     views: tuple[FrameStatistics, ...] = ()
@@ -123,21 +123,21 @@ class Evidence:
 
     @cached_property
     def darkest(self) -> Group:
-        """The darks with the lowest level; empty without any."""
+        """The group of darks with the lowest level; empty without darks."""
         return min(self.of_kind(FrameKind.DARK), key=level, default=())
 
     @cached_property
     def brightest(self) -> Group:
-        """The flats with the most light; empty without any."""
+        """The group of flats with the highest intensity; empty without flats."""
         return max(self.of_kind(FrameKind.FLAT), key=self.light_of, default=())
 
     def light_of(self, group: Group) -> float:
-        """Counts of the bright part above the darks, a second where the exposure is known."""
+        """Counts of the bright part above the darks, per second if the exposure is known."""
         dark = level(self.darkest) if self.darkest else 0.0
         return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
 
     def with_frame(self, frame: FrameStatistics, begins: bool) -> Evidence:
-        """This evidence with the next frame of the scan; a dark or a flat may begin a group."""
+        """This evidence with the next frame of the scan. A dark or a flat may start a new group."""
         if frame.kind is FrameKind.PROJECTION:
             return replace(self, views=(*self.views, frame))
         begins = begins or not self.groups or self.groups[-1][0].kind is not frame.kind
@@ -152,7 +152,7 @@ class Evidence:
 
     @cached_property
     def base(self) -> F32 | float:
-        """Counts without light at the places of the frames, the mean of all darks; 0 without any."""
+        """Counts without beam, the mean of all darks; 0 without darks."""
         darks = [frame.places for frame in self.frames(FrameKind.DARK)]
         return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
 
@@ -162,42 +162,43 @@ class Evidence:
 
     @cached_property
     def lit_views(self) -> list[FrameStatistics]:
-        """The views with more light than with a closed shutter, and more than one value."""
+        """The projections that are brighter than with a closed shutter, and have more than one value."""
         light = [float(np.percentile(self.light(view), BRIGHT)) for view in self.views]
         least = UNLIT * max(light, default=0.0)
         return [view for view, bright in zip(self.views, light, strict=True) if bright > least and not view.constant]
 
 
 def level(group: Group) -> float:
-    """Counts in the bright part of a frame: a beam may be narrower than the detector."""
+    """Counts in the bright part of a frame, because the beam may be narrower than the detector."""
     return float(np.median([np.nanpercentile(frame.blocks, BRIGHT) for frame in group]))
 
 
 def offset(darks: Group | None) -> F32 | float:
-    """Mean counts of the blocks without light."""
+    """Mean counts of the blocks without beam."""
     return np.asarray(np.mean([dark.blocks for dark in darks], axis=0)) if darks else 0.0
 
 
 def pixel_noise(group: Group) -> float:
-    """Standard deviation of a pixel from frame to frame; of a single frame, from place to place."""
+    """Standard deviation of a pixel between frames; for a single frame, between pixels."""
     return deviation_between_frames(np.stack([frame.blocks for frame in group])) * group[0].block
 
 
 def place_noise(values: NDArray[np.floating]) -> float:
-    """Standard deviation of a place, by its neighbours along the row, as matter and beam change more slowly."""
+    """Noise of a place, from differences to its neighbours in the row, because sample and beam change more slowly."""
     return deviation_between_neighbours(values, 2)
 
 
 def lit_places(light: F32) -> Mask:
-    """Mask of the places where images of the beam have light."""
+    """Mask of the places that get beam."""
     return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
 
 
 def photons(flats: Group, darks: Group) -> float | None:
-    """Median number of photons in a lit pixel of the flats: light squared over the variance that it adds.
+    """Median number of photons in a pixel of the flats with beam: squared intensity divided by the variance it adds.
 
-    Photon transfer (Janesick 2007), of what changes from frame to frame between neighbouring blocks: a beam that
-    flickers or moves is no noise. None where frames or blocks are too few, or the flats have no noise by their light.
+    Photon transfer (Janesick 2007), with changes between frames of the difference of neighbouring blocks, so that a
+    flickering or moving beam does not count as noise. None if there are too few frames or blocks, or if the flats have
+    no photon noise.
     """
     light = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
     lit = light > UNLIT * float(np.nanpercentile(light, BRIGHT))
@@ -219,9 +220,10 @@ def full_scale(largest: float) -> float:
 
 
 def lights_in_turn(levels: NDArray[np.floating]) -> int:
-    """Number of light levels between which consecutive frames [frame] alternate, 2 or 3; 0: they do not alternate.
+    """Number of intensity levels between which consecutive frames [frame] alternate, 2 or 3; 0: they do not alternate.
 
-    They do where the change to the next frame of the same light is a third at most: of a drift it is more.
+    They alternate if the change between frames of the same level is at most a third of the difference between levels.
+    In a drift it is larger.
     """
     for n in range(2, min(3, levels.size // 2) + 1):
         between = float(np.ptp([np.median(levels[first::n]) for first in range(n)]))

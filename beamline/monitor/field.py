@@ -1,4 +1,5 @@
-"""Field: parts of the frame and pixels without light, a sample beyond its edges, and the total absorption within them.
+"""Checks `field`, `mass`, `pixels`: areas without beam, a sample larger than the field of view, total absorption, dead
+pixels.
 
 The total of a parallel projection is equal from every side, unless matter entered or left: the moment of order 0 of
 the consistency conditions of Helgason (1965) and Ludwig (1966).
@@ -24,15 +25,20 @@ from recon.base.noise import deviation_between_neighbours
 from recon.base.setting import setting
 from recon.voxels.field_edges import LEAST
 
-LASTS = 5  # views in a row with matter at an edge
-NO_BEAM = 3.0  # times the noise: a flat's bright part below this has no light; noise alone gives 1.3
-NAMED = 4  # most shadows that are named
+LASTS = 5  # projections in a row with sample at an edge
+NO_BEAM = 3.0  # times the noise; a flat whose bright part is below this has no beam (noise alone gives 1.3)
+NAMED = 4  # most shadows that the advice names
 
 
 @dataclass(frozen=True)
 class FieldState:
-    """Whether unlit flats were reported; whether a view held all matter; consecutive views with matter at the edges;
-    whether these were reported.
+    """State.
+
+    Attributes:
+        unlit: True if flats without beam were reported.
+        inside: True if the whole sample was in the field of view in some projection.
+        cut: number of consecutive projections with sample at the edges.
+        reported: True if this was reported.
     """
 
     unlit: bool = False
@@ -43,19 +49,20 @@ class FieldState:
 
 @dataclass(frozen=True)
 class FieldOfViewCheck(Logged):
-    """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
+    """Score: fraction of the frame without beam (flat), or line integral at the edge of the field of view (info, once a
+    scan).
 
-    The defaults: a line integral of 0.1 at the edges is a tenth of the value in a sample's middle. It is more than
-    phase fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
+    The defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample, and more than
+    phase fringes and scattered radiation leave there. Slits usually shadow a line or two at the edges of the frame.
     """
 
     name: ClassVar[str] = "field"
     bit: ClassVar[int] = 13
-    unit: ClassVar[str] = "share of the frame, or line integral at its edge"
-    meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
+    unit: ClassVar[str] = "fraction of the frame, or line integral at its edge"
+    meaning: ClassVar[str] = "a part of the frame gets no beam even without a sample"
 
-    unlit: float = setting(0.02, "share of the frame that may be without light", ge=0, lt=1)
-    edge: float = setting(LEAST, "line integral at the edges up to which the sample is inside", ge=0)
+    unlit: float = setting(0.02, "fraction of the frame that may be without beam", ge=0, lt=1)
+    edge: float = setting(LEAST, "line integral at the edges up to which the sample counts as inside", ge=0)
 
     start = FieldState
 
@@ -79,7 +86,7 @@ class FieldOfViewCheck(Logged):
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
         rows, cols = frame.counts.shape
         if bright <= NO_BEAM * deviation_between_neighbours(light[::2]):
-            advice = "No part of this flat has light that the darks have not: is the beam on, and the shutter open?"
+            advice = "Check that the beam is on and the shutter is open: this flat is as dark as the darks."
             return Flag(self.name, Level.WARN, frame.index, 1.0, self.unlit, advice, (0, rows, 0, cols))
         unlit = light < UNLIT * bright
         share = float(unlit.mean())
@@ -95,20 +102,18 @@ class FieldOfViewCheck(Logged):
         first, after, axis = max(strips, key=lambda strip: strip[1] - strip[0], default=(0, rows, 0))
         region = (first, min(after, rows), 0, cols) if axis == 0 else (0, rows, first, min(after, cols))
         advice = (
-            f"{share:.0%} of the frame gets no light, without a sample ({named or 'here and there'}): a slit or an "
-            "aperture shadows it. Open it, or choose a smaller region of the camera."
+            "Open the slit or aperture that shadows the frame, or choose a smaller region of the camera: without a "
+            f"sample, {share:.0%} of the frame gets no beam ({named or 'scattered pixels'})."
         )
         return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
     def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid, entered: bool) -> Flag:
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
-        beside = " It was inside before, so that it stands beside the rotation axis: centre it." * (
-            entered and len(cut) == 1
-        )
+        beside = " It was inside before, so it is off the rotation axis: centre it." * (entered and len(cut) == 1)
         advice = (
-            f"{beyond_the_field(cut)}{beside} The total absorption says nothing, floaters must be faster to be seen, "
-            "and reconstructions are brighter at the rim."
+            f"{beyond_the_field(cut)}{beside} This has three effects: the check `mass` is switched off, slow floaters "
+            "are not detected, and reconstructions are too bright at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)
@@ -117,10 +122,10 @@ class FieldOfViewCheck(Logged):
 
 
 def beyond_the_field(cut: Mapping[str, float]) -> str:
-    """A sentence for the edges ("left", "right") beyond which the sample extends, with the line integrals there."""
+    """A sentence that names the edges ("left", "right") beyond which the sample extends, with the line integral."""
     return (
-        f"The sample goes on beyond the {' and '.join(cut)} edge of the field (line integral {max(cut.values()):.2f} "
-        "there)."
+        f"The sample extends beyond the {' and '.join(cut)} edge of the field of view (line integral there: "
+        f"{max(cut.values()):.2f})."
     )
 
 
@@ -132,7 +137,7 @@ def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
 
 CALIBRATION = 10  # projections
 SIGMAS = 6.0
-EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
+EMPTY = 1e-3  # mean line integral below which the field of view is empty
 
 
 @dataclass(frozen=True)
@@ -147,15 +152,18 @@ class MassState:
 
 @dataclass(frozen=True)
 class MassCheck(Logged):
-    """Score: relative change of the mean line integral. None without light, or if the sample exceeds the field."""
+    """Score: relative change of the mean line integral. Not applied without beam, or if the sample is larger than the
+    field of view."""
 
     name: ClassVar[str] = "mass"
     bit: ClassVar[int] = 5
     unit: ClassVar[str] = "relative change"
-    meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
+    meaning: ClassVar[str] = (
+        "the total absorption differs from that of the first projections, in several projections in a row"
+    )
 
     warn: float = setting(0.03, "relative change of the total absorption", ge=0)
-    frames: int = setting(3, "projections in a row beyond the limit that make a finding", ge=1)
+    frames: int = setting(3, "projections in a row that must exceed the limit", ge=1)
 
     start = MassState
 
@@ -168,7 +176,7 @@ class MassCheck(Logged):
         lit = float(grid.lit.mean())
         if not lit:
             return CheckResult(state)
-        # A beam that weakens is no sample that enters; matter at an edge is no beam that weakens.
+        # Subtract the loss of beam intensity, so that it does not count as absorption.
         mass = float(view.depth.mean()) / lit - brightest_place(view, grid)
         if state.usual is None:
             return CheckResult(_calibrate(state, mass))
@@ -182,8 +190,8 @@ class MassCheck(Logged):
         if state.running < self.frames:
             return CheckResult(state)
         advice = (
-            f"The sample's total absorption changed by {score:+.1%} for {state.running} views: something "
-            f"{'entered' if score > 0 else 'left'} the field, or the sample changes. Look at the latest projection."
+            f"Look at the latest projection: the total absorption has changed by {score:+.1%} in {state.running} "
+            f"projections. Something {'entered' if score > 0 else 'left'} the field of view, or the sample changes."
         )
         return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
 
@@ -197,10 +205,10 @@ def _calibrate(state: MassState, mass: float) -> MassState:
     return replace(state, masses=masses, usual=usual, scatter=scatter)
 
 
-DEAD = 0.2  # share of the light of the darkest preview block around it
-NAMED_PIXELS = 5  # most pixels that are named
-HOLES = 1e-4  # share of the pixels that may hold no number; a column of 4096 is more
-HALF = 0.5  # share of the pixels: with more missing, a view is lost
+DEAD = 0.2  # a pixel is dead below this fraction of the intensity in the darkest preview block around it
+NAMED_PIXELS = 5  # most pixels that the advice names
+HOLES = 1e-4  # fraction of the pixels that may have no valid value; a column of 4096 is more
+HALF = 0.5  # fraction of the pixels; if more are missing, a projection is lost
 
 PixelPlaces = NDArray[np.int64]
 
@@ -220,18 +228,19 @@ class PixelsState:
 
 @dataclass(frozen=True)
 class PixelsCheck(Logged):
-    """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
-    of the light around them. It is reported at the first view, as a fact where they are few. In a view also the
-    fraction that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where
-    none does.
+    """Score: fraction of dead pixels, which in all flats of the first group have less than a fifth of the intensity
+    around them. It is reported at the first projection, as info if they are few. Of a projection, the score is also
+    the fraction of pixels that have no valid value (NaN, infinite, beyond LARGEST) although they have one in darks
+    and flats; of any frame, it is 1 if no pixel has a valid value.
 
-    The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
+    The default: a thousandth of the pixels is one pixel in every column of a detector of 1000 rows, each of which makes
+    a ring in a slice.
     """
 
     name: ClassVar[str] = "pixels"
     bit: ClassVar[int] = 12
     unit: ClassVar[str] = "fraction of the pixels"
-    meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
+    meaning: ClassVar[str] = "many pixels of the camera are dead, or have no value"
 
     warn: float = setting(1e-3, "fraction of the pixels that may be dead", ge=0, le=1)
 
@@ -261,9 +270,9 @@ class PixelsCheck(Logged):
 
     def _without_number(self, row: int, score: float) -> Flag:
         advice = (
-            f"{score:.2%} of the pixels hold no number (NaN, infinite or beyond {LARGEST:g}), more than in darks and "
-            "flats: the camera's link, or the program that wrote them. `beamline recon` fills pixels, and leaves out a "
-            "view without any."
+            f"Check the link of the camera, and the program that wrote the frames: {score:.2%} of the pixels have no "
+            f"valid value (NaN, infinite or above {LARGEST:g}), more than in darks and flats. `beamline recon` fills "
+            "such pixels, and does not use a projection without any valid pixel."
         )
         return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
 
@@ -273,16 +282,16 @@ class PixelsCheck(Logged):
         level = Level.WARN if score > self.warn else Level.INFO
         named = ", ".join(f"({row}, {col})" for row, col in zip(rows[:NAMED_PIXELS], cols[:NAMED_PIXELS], strict=True))
         advice = (
-            f"Pixels without light in the flats where their neighbours have some: {dead.size}, at (row, column) {named}"
-            f"{' ...' if dead.size > NAMED_PIXELS else ''}. Each is a ring in its slice; `beamline recon` fills them "
-            "from their neighbours."
+            f"Dead pixels: {dead.size}, at (row, column) {named}{' ...' if dead.size > NAMED_PIXELS else ''}. They are "
+            "dark in the flats, although their neighbours are not. Each would make a ring in its slice; `beamline "
+            "recon` replaces them with their neighbours."
         )
         region = int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1
         return Flag(self.name, level, frame.index, score, self.warn, advice, region)
 
 
 def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlaces:
-    """Places of the pixels of a flat that are dark within a lit block."""
+    """Positions of the pixels of a flat that are dark in a block with beam."""
     above = light(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above

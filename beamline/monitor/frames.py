@@ -1,4 +1,4 @@
-"""Checks of frames by themselves: saturation, repeated images, triggers, darks that drift, and a lost beam.
+"""Checks of single frames: `saturation`, `stuck` (repeated images), `timing`, `dark` (drift of darks), `lost` (beam).
 
 Noise never repeats, so an equal checksum is a frame that was delivered again. Only the alarms of `lost` end a scan by
 default.
@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import count
 from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest, subsampled
 from drivers.base.frame import Frame, FrameKind
@@ -23,7 +24,7 @@ FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
 
 @dataclass(frozen=True)
 class SaturationState:
-    """`hot`: the fraction of the pixels that is saturated even without light."""
+    """State. hot: fraction of the pixels that are saturated even without beam."""
 
     hot: float = 0.0
 
@@ -37,8 +38,8 @@ class SaturationCheck(Logged):
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "more pixels are saturated than in the darks"
 
-    warn: float = setting(1e-5, "fraction of saturated pixels above which it warns", ge=0)
-    alarm: float = setting(1e-3, "fraction of saturated pixels above which it is an alarm", ge=0)
+    warn: float = setting(1e-5, "fraction of saturated pixels above which there is a warning", ge=0)
+    alarm: float = setting(1e-3, "fraction of saturated pixels above which there is an alarm", ge=0)
 
     start = SaturationState
 
@@ -52,20 +53,20 @@ class SaturationCheck(Logged):
             return CheckResult(state)
         level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)
         advice = (
-            f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a "
-            "filter."
+            f"Shorten the exposure or add a filter: {score:.2%} of the pixels are saturated (at least "
+            f"{context.saturation:g} counts)."
         )
         return CheckResult(state, Flag(self.name, level, frame.index, score, limit, advice))
 
 
 @dataclass(frozen=True)
 class StuckState:
-    """Checksum and metadata of the frame before.
+    """Checksum and metadata of the previous frame.
 
     Attributes:
-        checksum, angle: of it.
-        repeats: how many frames in a row have had this checksum.
-        noiseless: darks or flats of a single grey value repeat: a simulation without noise.
+        checksum, angle: of the previous frame.
+        repeats: number of frames in a row with this checksum.
+        noiseless: True if darks or flats of a single grey value repeat, as in a simulation without noise.
     """
 
     checksum: int | None = None
@@ -81,7 +82,7 @@ class StuckCheck(Logged):
     name: ClassVar[str] = "stuck"
     bit: ClassVar[int] = 2
     unit: ClassVar[str] = "repetitions"
-    meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
+    meaning: ClassVar[str] = "the image is identical to the one before: the camera delivered a frame twice"
 
     start = StuckState
 
@@ -99,8 +100,8 @@ class StuckCheck(Logged):
             return CheckResult(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
-            f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
-            "the camera or its driver repeats a buffer. Stop and restart the camera."
+            "Stop and restart the camera: it or its driver delivers the same image again, "
+            f"{count(state.repeats, 'time')} in a row (all pixels are identical)."
         )
         return CheckResult(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))
 
@@ -143,7 +144,9 @@ class TimingCheck(Logged):
         lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
         if lost > 0:
             after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
-            advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
+            advice = (
+                f"{count(lost, 'frame')} missing before this one: the trigger exposed no frame, or the frame was lost."
+            )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
             return CheckResult(after)  # armed anew, for another pass, or the same one again, or after a pause
@@ -151,8 +154,8 @@ class TimingCheck(Logged):
         if abs(score) <= self.warn:
             return CheckResult(after)
         advice = (
-            f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not "
-            "turn evenly, or the trigger line picks up noise."
+            f"Check the stage and the trigger line: the frame came {abs(score):.0%} of a period too "
+            f"{'late' if score > 0 else 'early'}. The stage does not turn evenly, or the trigger line picks up noise."
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 
@@ -169,9 +172,10 @@ class DarkState:
 
 @dataclass(frozen=True)
 class DarkCheck(Logged):
-    """Score: counts of drift. Light in darks is a finding of `beamline.monitor.references`.
+    """Score: drift in counts. Beam in darks is a finding of `beamline.monitor.references`.
 
-    The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.
+    The drift is a trimmed mean over the blocks of the preview, because one zinger changes the mean of a small frame by
+    tens of counts.
     """
 
     name: ClassVar[str] = "dark"
@@ -193,14 +197,14 @@ class DarkCheck(Logged):
         if abs(drift) <= self.drift:
             return CheckResult(state)
         advice = (
-            f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
-            "light."
+            f"Check the cooling of the camera, and for stray light: the dark level changed by {drift:+.1f} counts "
+            "since the first dark."
         )
         return CheckResult(state, Flag(self.name, Level.WARN, frame.index, drift, self.drift, advice))
 
 
 def _trimmed_mean(values: NDArray[np.float32]) -> float:
-    """Mean without the lowest and highest few (at least one each, where there are three)."""
+    """Mean without some of the lowest and highest values (at least one of each, if there are three values)."""
     ordered = np.sort(values, axis=None)
     cut = min(max(1, ordered.size // TRIM), (ordered.size - 1) // 2)
     return float(ordered[cut : ordered.size - cut].mean())
@@ -213,19 +217,19 @@ class LostState:
 
 @dataclass(frozen=True)
 class LostCheck:
-    """Score: lost fraction of the light on nine tenths of the frame, relative to the last view with light.
+    """Score: lost fraction of the intensity in nine tenths of the frame, relative to the last projection with beam.
 
-    The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
-    that turns takes no light from all places at once.
+    The default: neither drift nor the decay of the ring current between two top-ups takes half of the intensity. A
+    rotating sample does not darken all places at once.
     """
 
     name: ClassVar[str] = "lost"
     bit: ClassVar[int] = 7
-    unit: ClassVar[str] = "fraction of the light"
+    unit: ClassVar[str] = "fraction of the intensity"
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: float = setting(0.5, "fraction of the light without which it is lost", ge=0.5, le=1)
+    alarm: float = setting(0.5, "fraction of the intensity whose loss means that the beam is lost", ge=0.5, le=1)
 
     start = LostState
 
@@ -233,9 +237,13 @@ class LostCheck:
         score = 1 - context.light_left
         if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
             return CheckResult(state)
-        empty = "Every pixel has one value: the frame was never written, or the camera gave none. Look at the file."
+        empty = (
+            "Look at the file: every pixel of this frame has the same value. The frame was never written, or the "
+            "camera sent none."
+        )
         advice = (
-            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
+            f"Check ring current, front end and shutter: the beam is lost ({score:.0%} of the intensity is gone). "
+            f"{AGAIN}"
             if digest.variance
             else empty
         )

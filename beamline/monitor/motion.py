@@ -1,10 +1,10 @@
-"""Motion: jumps and slips of the sample, beyond steady rotation, and a sample that shakes.
+"""Check `motion`: finds jumps, slips and shaking of the sample, beyond its steady rotation.
 
-Shake is random displacement from view to view, by vibration or runout of the stage.
-A view that stands x beside its way changes its own comparison with the views before by x, and the next one by -4/3 x:
-there it is the view before, and a third of the velocity. So changes that follow one another have a covariance of -4/3
-of the variance of x. What a model of the turning sample does not know changes slowly: its covariance is positive. This
-tells both apart, whatever the sample.
+Shaking is random displacement from projection to projection, by vibration or runout of the stage. If a projection is
+displaced by x, its own change relative to the projections before is x, and the change of the next one is -4/3 x,
+because there the displaced projection is the previous one and a third of the velocity. Consecutive changes therefore
+have a covariance of -4/3 of the variance of x. Errors of the model of the rotating sample change slowly, so their
+covariance is positive. This distinguishes the two, whatever the sample.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class Axis:
         return Axis(usual, away, square, product, noise)
 
     def size(self, pairs: int) -> float:
-        """Size of the shake: standard deviation in pixels, less the noise; 0 if noise alone may explain it.
+        """Size of the shaking: standard deviation in pixels without the noise; 0 if noise alone can explain it.
 
-        The squares tell it more exactly than the products, where these confirm it.
+        The squares give it more precisely than the products, if the products confirm it.
         """
         variance, n = -self.product / OWN, min(pairs, round(2 / SHAKE_MEMORY))
         if pairs < PAIRS or variance < self.noise * (1 + SHAKE_SIGMAS * SPREAD / math.sqrt(n)):
@@ -98,8 +98,14 @@ CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part
 
 @dataclass(frozen=True)
 class MotionState:
-    """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes; `told`: pixels
-    of the shake that was flagged last, 0: none, or it has gone."""
+    """State.
+
+    Attributes:
+        across, down: usual shifts in pixels.
+        turn: usual excess rotation in steps.
+        quiet: number of projections in which a jump still has an effect.
+        told: size in pixels of the shaking that was flagged last; 0 if none was, or if it has ended.
+    """
 
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
@@ -122,11 +128,13 @@ class MotionCheck(Logged):
     name: ClassVar[str] = "motion"
     bit: ClassVar[int] = 9
     unit: ClassVar[str] = "pixels, or steps of the stage"
-    meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
+    meaning: ClassVar[str] = (
+        "the sample jumped or slipped (alarm), or shakes (warning): projections do not fit together"
+    )
 
-    alarm: float = setting(0.5, "pixels by which the sample may shift between two views", ge=0)
-    steps: float = setting(3.0, "steps by which the stage may turn too far at once", ge=0)
-    shake: float = setting(0.25, "pixels, a standard deviation, by which views may stand beside the sample's way", ge=0)
+    alarm: float = setting(0.5, "pixels by which the sample may shift between two projections", ge=0)
+    steps: float = setting(3.0, "angular steps by which the stage may turn too far at once", ge=0)
+    shake: float = setting(0.25, "pixels (standard deviation) by which the sample may shake", ge=0)
 
     start = MotionState
 
@@ -157,16 +165,16 @@ class MotionCheck(Logged):
         if size <= max(limit, GROWN * state.told):
             return CheckResult(state)
         advice = (
-            f"The sample shakes: at random, views stand {across:.2f} px across and {down:.2f} px down beside its way "
-            "(standard deviations of the last hundred views or fewer). Look for vibration and for runout of the stage. "
-            "The views are of use: `beamline recon --calibrate shifts` finds the place of each."
+            f"Check for vibration and for runout of the stage: the sample shakes by {across:.2f} px horizontally and "
+            f"{down:.2f} px vertically (standard deviation over at most the last 100 projections). The projections can "
+            "still be used: `beamline recon --calibrate shifts` measures and corrects the shift of each one."
         )
         return CheckResult(replace(state, told=size), Flag(self.name, Level.WARN, row, size, limit, advice))
 
     def _jump(
         self, state: MotionState, after: MotionState, row: int, change: SampleChange
     ) -> CheckResult[MotionState] | None:
-        """A jump or a slip; None where there is none."""
+        """The flag for a jump or a slip; None if there is none."""
         usual = state.across, state.down, state.turn
         change_of_place = change.across, change.down, change.turn
         limits = self.alarm, self.alarm, self.steps
@@ -184,17 +192,17 @@ class MotionCheck(Logged):
         if abs(across) > limit_across or abs(down) > limit_down:
             score, limit = math.hypot(across, down), min(limit_across, limit_down)
             advice = (
-                f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
-                "on its holder, or something touched it. Fix it if it may go on. The views are of use: "
-                "`beamline recon` leaves out those of the shorter side; --calibrate shifts corrects "
-                "them (cones: choose one side with --views)."
+                f"Fix the sample if it may move again: it jumped by {across:+.1f} px horizontally and {down:+.1f} px "
+                "vertically between two projections, because it slipped on its holder or something touched it. The "
+                "projections can still be used: `beamline recon` uses the longer part of the scan, before or after the "
+                "jump. --calibrate shifts corrects the jump instead (in a cone beam choose one part with --views)."
             )
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
             advice = (
-                f"The sample turned by {turn:+.1f} steps more than its step: triggers were lost, the stage slipped, or "
-                "the sample turned on its holder. Compare the stage's encoder with the plan; `beamline recon` leaves "
-                "out the views of the shorter side."
+                f"Compare the encoder of the stage with the plan: the sample turned by {turn:+.1f} steps more than one "
+                "step. Triggers were lost, the stage slipped, or the sample turned on its holder. `beamline recon` "
+                "uses the longer part of the scan, before or after this."
             )
         else:
             return None

@@ -1,4 +1,4 @@
-"""Opposite: compares a view with the view from the other side, or with a repetition: a displaced or changed sample.
+"""Check `opposite`: compares a projection with the opposite one, or with a repetition, to find motion and change.
 
 Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
 degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
@@ -55,10 +55,13 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class ViewFit:
-    """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
-    remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
-    the shift. `unsure`: by how many pixels the extrapolation of the kept view may err by itself, without any motion; 0
-    where that is within the limit of a change.
+    """The fit of one projection to another, in pixels: shift across and down, its standard deviation `sigma` by noise,
+    and the remainder as an equivalent shift.
+
+    Attributes:
+        places: sum of squares of the weights that the positions of single projections have in the shift.
+        unsure: possible error of extrapolating the kept projection without any motion; 0 if it is within the limit
+            of a change.
     """
 
     across: float
@@ -80,22 +83,22 @@ class OppositeState:
 
 @dataclass(frozen=True)
 class OppositeCheck(Logged):
-    """Score: motion of the sample in pixels, or the motion of all of it that would change the view equally.
+    """Score: motion of the sample in pixels, or the motion of the whole sample that would change the projection as
+    much.
 
-    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
-    where that is more, since a shift is known no better. Flat faces and coarse steps leave a remainder of 0.3 cells.
+    The defaults: half a pixel, as for `motion`, because it doubles edges by as much as the resolution; or a twentieth
+    of a cell if that is more, because shifts are not known better. Flat faces and coarse steps leave a remainder of 0.3
+    cells.
     """
 
     name: ClassVar[str] = "opposite"
     bit: ClassVar[int] = 15
     unit: ClassVar[str] = "pixels"
-    meaning: ClassVar[str] = (
-        "the view from the other side, or the same view before, shows the sample elsewhere or changed"
-    )
+    meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
     warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
-    changed: float = setting(1.0, "pixels, as a shift of all, by which parts may differ", ge=0)
-    axis: float = setting(1.0, "pixels between the axis and its stated place that are said", ge=0)
+    changed: float = setting(1.0, "pixels by which parts may differ, as an equivalent shift of the whole sample", ge=0)
+    axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
 
     start = OppositeState
 
@@ -106,8 +109,8 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
-            advice = f"Views from opposite sides are not compared: {why}."
+            why = "they differ in a cone beam" if context.cone else "there are no flats"
+            advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
             )
@@ -122,8 +125,9 @@ class OppositeCheck(Logged):
     def _compared(
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState] | None:
-        """The view against one that was kept; None where they are neither opposite nor at one angle, or where the step
-        that gives its velocity is far and only a larger motion would show: the pair waits for views that are nearer."""
+        """Compare a projection with a kept one. None if they are neither opposite nor at the same angle, or if the step
+        that gives the velocity is so large that only a larger motion would show; the pair then waits for nearer
+        projections."""
         one, grid = state.kept[at], context.grid
         assert one.after is not None and grid is not None
         turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
@@ -140,7 +144,7 @@ class OppositeCheck(Logged):
         looked = (
             self._mirrored(state, one, fit, view, context)
             if mirrored
-            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
+            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index} at the same angle", context))
         )
         if unsure and looked.flag is None:
             return None
@@ -148,12 +152,13 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """Largest likely error, px, of a kept view extrapolated by some steps, see `ViewFit.unsure`.
+        """Largest likely error in px of a kept projection extrapolated by some steps, see `ViewFit.unsure`.
 
-        A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
-        differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
-        is smoothed so is at most √1.5 / SMOOTH of the first one. Where they differ by more, or the sample moved between
-        them, by more than the rim turns, there is no velocity: infinite.
+        A large step shows other material, most of all if the sample is wider than the field of view. If the two
+        projections of the step differ by less than the smoothing, the error of the line through them comes from the
+        second derivative, which is at most √1.5 / SMOOTH of the first one in a picture smoothed like this. If they
+        differ by more, or if the sample moved between them by more than the rim turns, the velocity is not known and
+        the result is infinite.
         """
         if min(abs(steps), abs(steps - 1)) < BESIDE - 1:
             return 0.0
@@ -177,7 +182,7 @@ class OppositeCheck(Logged):
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
-        flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context)
+        flag = self._moved(moved, view.index, f"the opposite frame {one.view.index}", context)
         state = state if fit.unsure else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
@@ -185,9 +190,9 @@ class OppositeCheck(Logged):
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return CheckResult(state, flag)
         advice = (
-            f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
-            f"{axis:.1f}; the scan states {stated:.1f}. The stated axis is wrong, or the sample moved by twice the "
-            "difference."
+            f"Check the rotation axis: the opposite frames {one.view.index} and {view.index} show it at column "
+            f"{axis:.1f}, but the scan states {stated:.1f}. Either the stated axis is wrong, or the sample moved by "
+            "twice the difference."
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
@@ -202,14 +207,15 @@ class OppositeCheck(Logged):
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])
         change = (
-            f"the sample is {fit.across:+.1f} px across and {fit.down:+.1f} px down"
+            f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
-            else f"parts of it differ as if all had moved by {fit.remainder:.1f} px: it shrank, bent or lost something"
+            else f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: it shrank, bent or "
+            "lost something"
         )
         advice = (
-            f"Against {other}, {change}. Look at both. Of views around a jump that `motion` saw, `beamline recon` "
-            "leaves out the shorter side. A sample that crept or changed is followed by `beamline recon --volumes N`; "
-            "or scan again, faster."
+            f"Compare the two frames: relative to {other}, {change}. If `motion` reported a jump, `beamline recon` "
+            "uses only the longer part of the scan. If the sample moved or changed slowly, use `beamline recon "
+            "--volumes N`, or repeat the scan faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 
@@ -235,9 +241,9 @@ def _folded(angle: float) -> float:
 
 
 def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
-    """Best fit of the kept view to a view some steps later; None if the view has too little structure.
+    """Best fit of the kept projection to a projection some steps later; None if that one has too little structure.
 
-    Least squares over light, shift across and shift down, from the best whole number of cells on.
+    Least squares for intensity, shift across and shift down, starting from the best whole number of cells.
     """
     assert one.after is not None
     first, last = grid.left, grid.right + 1

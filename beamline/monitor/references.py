@@ -1,4 +1,4 @@
-"""Darks and flats: saturated, without light, uneven, lit though they should be dark, never written, or with the sample.
+"""Rules for darks and flats: saturated, without beam, uneven, never written, with beam in darks, or with the sample.
 
 Bad references spoil a volume as surely as bad views. So the same rules judge them before the first projection is taken,
 in `validate` and before a reconstruction: each frame beside its group, the other groups and the views. A new check is a
@@ -50,35 +50,44 @@ INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best f
 
 @dataclass(frozen=True)
 class ReferenceLimits:
-    """Limits of the references, each with its reason.
+    """Limits for darks and flats, with reasons.
 
-    saturated: as the alarm of the check `saturation`: a cosmic ray hits a pixel or two, one in a thousand is exposure.
-    light_over_noise: a flat at the darks' level has no light; three times the noise of a pixel is the least that can
-        be told.
-    light_gone: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest
-        flats and against the views, which no sample makes brighter.
-    uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
-    unlit: a beam may be narrower than the detector, but not so that most of it is dark.
-    light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
-        variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
+    saturated: as for an alarm of the check `saturation`. A cosmic ray hits a pixel or two; one pixel in a thousand is
+    too long an exposure.
+
+    light_over_noise: a flat at the level of the darks has no beam. Three times the noise of a pixel is the smallest
+    difference that can be detected.
+
+    light_gone: no drift, top-up or decay of the ring current takes half of the intensity. Flats are compared with the
+    brightest flats, and with the projections, which no sample makes brighter.
+
+    uneven: flats are averaged, and projections are divided by the mean. 0.1 of intensity is 0.1 of line integral.
+
+    unlit: a beam may be narrower than the detector, but most of the detector must get beam.
+
+    light_in_darks: darks that were exposed have part of the level of the flats and, because of photon noise, part of
+    their variance. An offset raises only the level, readout noise only the variance. A fifth of both cannot come from
+    these.
     """
 
-    saturated: float = setting(1e-3, "fraction of the pixels of a flat at their end", ge=0, lt=1)
-    light_over_noise: float = setting(3.0, "light of a flat over the noise of a dark's pixel", ge=0)
-    light_gone: float = setting(0.5, "light that is gone, of the brightest flats", gt=0, lt=1)
-    uneven: float = setting(0.1, "relative change of the light between flats of a group", gt=0)
-    unlit: float = setting(0.5, "fraction of the frame that flats leave dark", gt=0, le=1)
-    light_in_darks: float = setting(0.2, "level and variance of darks over those of flats", gt=0, lt=1)
+    saturated: float = setting(1e-3, "fraction of the pixels of a flat that may be saturated", ge=0, lt=1)
+    light_over_noise: float = setting(
+        3.0, "least intensity of a flat, in units of the noise of a pixel in a dark", ge=0
+    )
+    light_gone: float = setting(0.5, "fraction of the intensity of the brightest flats that may be missing", gt=0, lt=1)
+    uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
+    unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
+    light_in_darks: float = setting(0.2, "level and variance of darks, relative to those of flats", gt=0, lt=1)
 
 
 DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
 
 
 def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
-    """Findings on darks and flats: errors on all of a kind, warnings on frames beside good ones.
+    """Findings about darks and flats: errors if all of a kind are bad, warnings if good frames remain.
 
-    A rule does not see the frames that earlier ones found, unless none would be left: then later ones mean nothing.
-    Rules that compare flats with the sample need `cells`.
+    A rule does not see the frames that earlier rules found. If these were all frames of a kind, later rules are not
+    applied. Rules that compare flats with the sample need `cells`.
     """
     judged: list[Finding] = []
     for name, kind, rule in RULES:
@@ -111,9 +120,9 @@ def _with_holes(kind: FrameKind) -> Rule:
             limit = min(min(frame.invalid for frame in group) + INVALID, 0.5)
             if odd := [frame for frame in group if frame.invalid > limit or frame.blank]:
                 text = range_in_words([frame.invalid for frame in odd])
-                sentence = f"a share of {text} of the pixels is not finite (limit {limit:.3g})."
+                sentence = f"a fraction of {text} of the pixels has no valid value (limit {limit:.3g})."
                 if all(frame.blank for frame in odd):
-                    sentence = f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
+                    sentence = f"no pixel has a valid value: all are NaN, infinite or above {LARGEST:g}."
                 yield BadFrames(odd, max(frame.invalid for frame in odd), limit, sentence)
 
     return with_holes
@@ -124,11 +133,11 @@ def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
     frames = evidence.frames(DARK)
     zero = [frame for frame in frames if not np.any(frame.blocks)]
     if zero and 2 * sum(not frame.constant for frame in frames) > len(frames):
-        yield BadFrames(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
+        yield BadFrames(zero, 0.0, 0.0, "every pixel is 0: the frame was never written, or it is not from the camera.")
 
 
 def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks above the darkest of their exposure: light only adds to counts."""
+    """Darks that are brighter than the darkest one of the same exposure, because beam only adds counts."""
     darks = evidence.frames(DARK)
     flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
     for exposure in {frame.rounded_exposure for frame in darks}:
@@ -141,15 +150,16 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
             odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
             yield BadFrames(odd, float(above.max()), limit, (
-                f"there is light in them, or their offset moved: {range_in_words(above)} counts above {least_dark} "
-                f"(limit {limit:.3g}, by the {light:.6g} of light in the flats)."
+                f"they were exposed to the beam, or their offset changed: they are {range_in_words(above)} counts "
+                f"above {least_dark} (limit {limit:.3g}, because the flats have {light:.6g} counts of beam)."
             ))  # fmt: skip
 
 
 def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with many pixels at the end of their counts, or all at one number.
+    """Flats with many saturated pixels, or with the same value in all pixels.
 
-    Not those that were written, not exposed: the number that stands for all light, such as 65535 beside 0.
+    Flats that were written instead of exposed are allowed: a single value that means full intensity, such as 65535 with
+    darks of 0.
     """
     darks = evidence.frames(DARK)
     hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
@@ -159,11 +169,11 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
         if all(frame.constant for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
             continue
         if over.any():
-            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), and their light is not known"
+            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), so the intensity is not known"
             odd = [group[at] for at in np.flatnonzero(over).tolist()]
             yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
-            what = f"every pixel of them holds {level(group):g}, though those of the darks vary: counts end there"
+            what = f"every pixel is {level(group):g}, although pixels of the darks vary: all pixels are saturated"
             yield BadFrames(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 
 
@@ -181,38 +191,42 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         light = level(group) - level(darks)
         if light <= limit * noise:
             yield BadFrames(group, light / noise if noise else 0.0, limit, (
-                f"there is no beam in them: their level {level(group):.6g} is {light:.3g} above the darks' "
-                f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limit:g} times it). Was the shutter "
-                "open for them, and closed for the darks?"
+                "they show no beam. Was the shutter open for the flats, and closed for the darks? The level of these "
+                f"flats, {level(group):.6g}, is {light:.3g} above that of the darks, {level(darks):.6g}; the noise of "
+                f"a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
             ))  # fmt: skip
 
 
 def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with much less light than the brightest group."""
+    """Flats with much less intensity than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
         gone = np.array([1 - evidence.light_of([flat]) / evidence.light_of(bright) for flat in group])
         if (gone > limit).any():
             others, most = spans([flat.row for flat in bright]), float(gone.max())
-            sentence = f"{most:.0%} of the light of the flats {others} is gone (limit {limit:.0%}): the beam was lost."
+            sentence = (
+                f"the beam was lost: they have {most:.0%} less intensity than the flats {others} (limit {limit:.0%})."
+            )
             yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
 def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats darker than views, if both exposures are known: a sample only takes light."""
+    """Flats that are darker than projections, if both exposures are known, because a sample can only absorb."""
     views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
     limit = 1 - limits.light_gone
     for group in evidence.of_kind(FLAT) if views else ():
         share = evidence.light_of(group) / evidence.light_of(views)
         if share < limit and all(flat.exposure > 0 for flat in group):
             yield BadFrames(group, share, limit, (
-                f"they have {share:.2%} of the light of the views (limit {limit:.0%}), though a sample only "
-                "takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
+                f"they have {share:.2%} of the intensity of the projections (limit {limit:.0%}), but a sample can only "
+                "absorb. During these flats the beam was lost or a filter was in the beam, or the stated exposure is "
+                "wrong."
             ))  # fmt: skip
 
 
 def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with other light than most of their group, as a whole or in places; all, where half of them have."""
+    """Flats whose intensity differs from most of their group, as a whole or locally. If half of them differ, all
+    flats."""
     base, limit = offset(evidence.darkest), limits.uneven
     for group in evidence.of_kind(FLAT):
         light = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
@@ -232,30 +246,30 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
         how = "from flat to flat" if whole else "from the usual flat of their group"
         if far.any():
             n = lights_in_turn(levels)
-            why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
-            sentence = f"their light differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
+            why = f"{n} thresholds, exposures or energies alternate" if n else "the beam is unstable"
+            sentence = f"their intensity differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (
-                f"in places their light differs by {places.max():.0%} {how} (limit {limit:.0%}): something was in the "
-                "beam. Is the sample out?"
+                f"something was in the beam. Is the sample out? The intensity differs locally by {places.max():.0%} "
+                f"{how} (limit {limit:.0%})."
             ))  # fmt: skip
 
 
 def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats that leave most of the frame dark."""
+    """Flats in which most of the frame gets no beam."""
     for group in evidence.of_kind(FLAT):
         light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
         score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
         if score > limit:
             yield BadFrames(group, score, limit, (
-                f"{score:.0%} of the frame has no light in them (limit {limit:.0%}): move beam and detector onto one "
-                "another, or read fewer pixels."
+                f"{score:.0%} of the frame gets no beam (limit {limit:.0%}). Align beam and detector, or read out a "
+                "smaller region."
             ))  # fmt: skip
 
 
 def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks with the level and the noise of light."""
+    """Darks with the level and the noise of an exposed frame."""
     flats = evidence.brightest
     for darks in evidence.of_kind(DARK) if flats else ():
         share = level(darks) / level(flats) if level(flats) > 0 else np.inf
@@ -266,10 +280,10 @@ def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Bad
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
         if min(share, variance) > limit and level(darks) > 0 and not unsure:
             yield BadFrames(darks, min(share, variance), limit, (
-                f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' "
-                f"{level(flats):.6g}"
-                + (f" and their variance {variance:.0%}" if known else "")
-                + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
+                "they were exposed to the beam. Was the shutter closed for the darks, and open for the flats? The "
+                f"level of these darks, {level(darks):.6g}, is {share:.0%} of that of the flats, {level(flats):.6g}"
+                + (f", and the variance is {variance:.0%}" if known else "")
+                + f" (limit {limit:.0%})."
             ))  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Flats with the sample in the beam: they look like views, or leave the views without the matter that turns in them.
+"""Rules that find flats with the sample in the beam, by comparing the intensity of flats and projections.
 
 Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
 """
@@ -48,13 +48,13 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     else:
         means = [np.mean(own, axis=0) for own in light]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
-    beside, odd = "others of their group" if single else "other flats", list[BadFrames]()
+    beside, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
         if others and (found := _nearest_view(image, others, seen)) is not None:
             off, like, nearest = found
             odd.append(BadFrames(frames, off, like / LIKER, (
-                f"they differ from the {beside} by {off:.3g} of line integral, and by {like:.2g} only from the view in "
-                f"frame {views[nearest].row}: the sample was in the beam."
+                f"the sample was in the beam: they differ from the {beside} by {off:.3g} in line integral, but from "
+                f"the projection in frame {views[nearest].row} only by {like:.2g}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
         yield from odd
@@ -71,13 +71,15 @@ def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tu
 
 
 class ViewsAboveFlats(NamedTuple):
-    """How much brighter than each group of flats [group] views are where they are emptiest, as line integrals.
+    """How much brighter projections are than each group of flats [group], at places with the least sample, as line
+    integrals.
 
     Attributes:
-        brightest: in the places where views are brightest; an open beam: 0.
-        at_edges: at that edge of the field, left or right, where it is less.
-        mismatch: by how much each group differs in places from the group with the least `brightest`, factors aside.
-        limit: what noise does not reach.
+        brightest: at the places at which projections are brightest; 0 for an open beam.
+        at_edges: at the left or right edge of the field of view, whichever is less.
+        mismatch: largest local difference between each group and the group with the smallest `brightest`, apart
+            from a factor.
+        limit: value that noise does not reach.
     """
 
     brightest: F64
@@ -108,9 +110,10 @@ def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
 
 
 def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Groups of flats that are darker than views in places where other flats are not: an object was in the beam.
+    """Groups of flats that are locally darker than projections although other flats are not: an object was in the beam.
 
-    Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
+    If two groups differ in shape, the projections show which of them is the open beam, because a sample can only
+    absorb.
     """
     groups = evidence.of_kind(FrameKind.FLAT)
     if len(groups) < 2 or (above := _views_above_flats(evidence)) is None:
@@ -119,9 +122,9 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     for group, top, mismatch in zip(groups, above.brightest.tolist(), above.mismatch.tolist(), strict=True):
         if min(top, top - least, mismatch) > above.limit:
             yield BadFrames(group, top, above.limit, (
-                f"in places the views are brighter than they by {top:.3g} of line integral (limit {above.limit:.2g}), "
-                f"and than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
-                "something else, was in the beam."
+                "the sample, or something else, was in the beam: projections are locally brighter than these flats by "
+                f"{top:.3g} in line integral (limit {above.limit:.2g}), but brighter than the other flats only by "
+                f"{max(least, 0.0):.2g}, and a sample can only absorb."
             ))  # fmt: skip
 
 
@@ -132,18 +135,20 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         top = float(above.brightest[most])
         if min(top, top - float(above.at_edges[most])) > above.limit:
             yield BadFrames((), top, above.limit, (
-                f"In places the views are brighter than the flats by {top:.2g} of line integral, though a sample only "
-                "takes light. Was the sample, or something else, in the beam for the flats, or did the beam change its "
-                "shape?"
+                "Was the sample, or something else, in the beam during the flats, or did the beam change its shape? "
+                f"The projections are locally brighter than the flats by {top:.2g} in line integral, but a sample can "
+                "only absorb."
             ))  # fmt: skip
 
 
 def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """All flats show the sample, even at an angle of no view or displaced.
+    """All flats show the sample, also if it was at another angle than in any projection, or displaced.
 
-    A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
-    as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
-    differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
+    Two signs: (1) If the sample is in flats and projections, both absorb the same in total. Divided by the flats, the
+    projections then have no net absorption: they are brighter at some places by as much as they are darker at others.
+    (2) The rotating part of the sample absorbs more than the projections show relative to the flats. It is measured by
+    the differences between projections, with its smallest absorption set to zero, because these do not depend on the
+    flats. Air is assumed at the edges of rows.
     """
     if (depth := _depth_over_air(evidence)) is None:
         return
@@ -152,9 +157,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
         yield BadFrames(flats, brighter, limit, (
-            f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
-            "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
-            "shape between flats and views."
+            "the sample was in the beam, or the beam changed its shape between flats and projections: the projections "
+            f"are locally brighter by {brighter:.2g} in line integral (limit {limit:.2g}), and elsewhere they do not "
+            "absorb more, but a sample can only absorb."
         ))  # fmt: skip
         return
     turning = depth - mean
@@ -163,8 +168,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     seen = float(masses.mean())
     if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
         yield BadFrames(flats, seen, LIGHTER * least, (
-            f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but "
-            f"against these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
+            f"the sample was in the beam: the rotating part of the sample absorbs at least {least:.2g} (line integral, "
+            f"mean over the frame), but relative to these flats only {seen:.2g} is absorbed (limit "
+            f"{LIGHTER * least:.2g})."
         ))  # fmt: skip
 
 
@@ -177,16 +183,16 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
     if all(most < limit for most, limit in zip(shown, limits, strict=True)):
         yield BadFrames((), max(shown), max(limits), (
-            f"No view looked at differs from the flats by more than noise (line integrals below {max(shown):.2g}). "
-            "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
-            "all sides."
+            "The projections show no sample: those that were checked differ from the flats only by noise (line "
+            f"integrals below {max(shown):.2g}). Either there is no sample, or it was also in the beam during the "
+            "flats and looks the same from all sides."
         ))  # fmt: skip
 
 
 def _depth_over_air(evidence: Evidence) -> F64 | None:
-    """Line integrals [view, row, col] of places, less the straight line between the edges of each row.
+    """Line integrals [view, row, col] of places, minus the straight line between the edges of each row.
 
-    Only views that have air there; None where they or places are too few.
+    Only of projections that have air at the edges. None if there are too few of them, or too few places.
     """
     light = np.mean([evidence.light(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
     lit = lit_places(light)
@@ -208,7 +214,8 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
 
 
 def log_ratio(image: F32, other: F32, lit: Mask) -> F32:
-    """Logarithm of the one over the other where there is light; what has none counts as a thousandth."""
+    """Logarithm of the ratio of two images at places with beam. Values near zero count as a thousandth of the bright
+    part."""
     least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
     least = max(least, 1e-30)
     return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
@@ -223,7 +230,7 @@ def _spread(values: F32) -> float:
 
 
 def _beyond_noise(values: F32) -> float:
-    """Their spread without the noise; 0 where it may all be noise."""
+    """Standard deviation of the values without the noise; 0 if all of it may be noise."""
     spread, noise = _spread(values), place_noise(values)
     chance = 1 + SIGMAS * (2 / max(values.size, 1)) ** 0.5
     return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0

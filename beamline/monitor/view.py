@@ -1,4 +1,4 @@
-"""View: a projection as the checks see it, line integrals on a coarse grid; the same for a large frame and a small one.
+"""View: a projection as the checks use it, as line integrals on a coarse grid, the same for large and small frames.
 
 Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
 takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
@@ -27,33 +27,33 @@ from recon.base.arrays import median_deviation
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
 UNLIT = 0.05  # share of the flats' bright part: a cell with less counts as unlit
-HOT = 0.1  # share of the flats' bright part: a cell with a higher dark than others by more is not used, either
-EDGE = 2  # cells at either edge that say whether the sample ends within the field
-SEEN = 0.02  # least transmission of a place that shows the beam
-PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
-COVERED = 0.1  # line integral at the brightest place: with more there is no air, or the beam fell earlier
-AIR = 0.05  # line integral up to which the sample leaves air at the edges, and a loss of light needs no view before
-DRIFT_STEP = 0.02  # logarithm of the light by which a beam may drift from a view to the next that shows it
-EVEN, EVEN_NOISE = 0.2, 0.01  # share of a loss of light by which both edges and the brightest place may differ; noise
-BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
+HOT = 0.1  # a cell is not used if its dark is higher than others by this fraction of the bright part of the flats
+EDGE = 2  # cells at each edge that show whether the sample ends within the field of view
+SEEN = 0.02  # least transmission of a place at which the beam is visible
+PLACES = (4, 16)  # parts of the field of view, vertical and horizontal; the brightest one counts as air
+COVERED = 0.1  # line integral at the brightest place; above it there is no air, or the beam got weaker earlier
+AIR = 0.05  # line integral up to which the edges are air, so that one projection is enough to measure a beam loss
+DRIFT_STEP = 0.02  # log intensity by which the beam may drift between two projections that show air
+EVEN, EVEN_NOISE = 0.2, 0.01  # allowed difference of edges and brightest place: fraction of the beam loss; noise
+BRIGHT = 90.0  # percentile of the cells of the flats that represents the bright part
 
 CellValues = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class CellGrid:
-    """The cells of a frame, and the light in them without a sample."""
+    """The cells of a frame, and their intensity without a sample."""
 
-    cell: int  # pixels a side of a cell
-    blocks: int  # preview blocks a side of a cell
-    dark: CellValues  # counts [row, col] of the cells without light; 0 where no dark was seen
-    full: CellValues  # counts above it with the beam and no sample, at the flats' exposure
-    lit: CellValues  # float32 [row, col], 1 where a cell has enough light, else 0
-    flats: bool  # there were flats; otherwise `full` is 1 and line integrals are relative
-    # row_dark, col_dark: dark counts of each preview row and column, means
+    cell: int  # side of a cell in pixels
+    blocks: int  # side of a cell in preview blocks
+    dark: CellValues  # counts [row, col] of the cells without beam; 0 if there was no dark yet
+    full: CellValues  # counts above the dark with beam and without sample, at the exposure of the flats
+    lit: CellValues  # float32 [row, col], 1 if a cell gets enough beam, otherwise 0
+    flats: bool  # False without flats: `full` is then 1, and line integrals are relative
+    # row_dark, col_dark: mean dark counts of each preview row and column
     row_dark: CellValues
     col_dark: CellValues
-    # left, right: first and last column of cells with most of them lit
+    # left, right: first and last column of cells in which most cells get beam
     left: int
     right: int
 
@@ -62,7 +62,7 @@ class CellGrid:
         return self.full.shape
 
     def region(self, row: float, col: float, height: float, width: float) -> PixelBox:
-        """Box in pixels of the cells around a place, within the grid."""
+        """Box in pixels of the cells around a position, within the grid."""
         rows, cols = self.shape
         top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
         below, right = min(rows, math.ceil(row + 0.5 + height / 2)), min(cols, math.ceil(col + 0.5 + width / 2))
@@ -73,17 +73,17 @@ class CellGrid:
 class CellView:
     """A projection on the grid."""
 
-    index: int  # its row in the file
+    index: int  # row in the file
     angle: float  # radians
-    # depth: float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour, or
-    # 0 where they are not lit either
+    # depth: float32 [row, col], line integrals; in a cell without beam the mean of its left and right neighbour, or 0
+    # if they have no beam either
     depth: CellValues
-    weight: CellValues  # float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere
-    # rows, cols: float32 [preview row], [preview col]: mean counts above the dark
+    weight: CellValues  # float32 [row, col], photons relative to the open beam: exp(-depth), 0 in cells without beam
+    # rows, cols: float32 [preview row], [preview col], mean counts above the dark
     rows: CellValues
     cols: CellValues
-    edges: tuple[float, float]  # line integrals at the left and the right edge of the lit cells, medians over rows
-    brighter: float = 0.0  # change of the logarithm of the light since the view before, where it is known
+    edges: tuple[float, float]  # line integrals at the left and right edge of the cells with beam, medians over rows
+    brighter: float = 0.0  # change of the log intensity since the previous projection; 0 if not known
 
 
 def grid_of(
@@ -109,7 +109,7 @@ def grid_of(
 
 
 def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
-    """A projection on the grid; `more_light`: its exposure over that of the flats."""
+    """A projection on the grid. more_light: its exposure divided by that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
     through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / more_light), darkest)
@@ -124,10 +124,11 @@ def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: flo
 
 
 def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
-    """Upper bound of the light in nine tenths of the places, over the last good view, or over the flats before one.
+    """Upper bound of the intensity in nine tenths of the cells, relative to the last good projection (before the first
+    one: relative to the flats).
 
-    A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
-    Opaque places do not count.
+    A rotating sample makes some cells darker and others brighter; only a loss of beam makes all of them darker.
+    Opaque cells do not count.
     """
     if last is None:
         if not grid.flats:
@@ -145,7 +146,7 @@ def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
 
 
 def brightest_place(view: CellView, grid: CellGrid) -> float:
-    """Mean line integral of the brightest place of the lit field: 0 in air."""
+    """Mean line integral of the brightest part of the field of view with beam: 0 in air."""
     depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
     down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
     sums, cells = (sums_of_places(part, down, across) for part in (depth, lit))
@@ -154,13 +155,13 @@ def brightest_place(view: CellView, grid: CellGrid) -> float:
 
 
 def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
-    """Logarithm of the light that the beam has lost since the flats, as air shows it; NaN where none has shown it yet.
+    """Logarithm of the loss of beam intensity since the flats, measured in air; NaN if no air was seen yet.
 
-    A beam that weakens takes the same share of the light everywhere, from flats that were the same: both edges and the
-    brightest place are then equally dark, and hardly darker than in the views before. A sample that enters is not.
+    A weaker beam is weaker by the same factor everywhere: both edges and the brightest part are then equally dark, and
+    hardly darker than in the previous projection. A sample that enters the beam does not look like this.
 
     Args:
-        before: the figure of the view before.
+        before: the result for the previous projection.
     """
     if not grid.flats:
         return math.nan

@@ -1,4 +1,4 @@
-"""Monitor: all checks together. It takes frames and returns flags; its state is a value."""
+"""Monitor: runs all checks on each frame and returns their flags. Its state is an immutable value."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class Monitor:
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
-    """Median step from one of these angles, in the order of their views, to the next. NaN where they do not turn one
-    way (golden or random angles): no view then has its neighbour beside it."""
+    """Median step between these angles, in the order of their projections. NaN if they are not in one direction (golden
+    or random angles), because a projection is then not followed by its neighbour."""
     steps = np.diff(np.where(np.isfinite(angles), angles, np.nan))
     steps = steps[np.isfinite(steps) & (steps != 0)]
     share = float((steps > 0).mean()) if steps.size else 0.5
@@ -102,14 +102,14 @@ def without(monitor: Monitor, name: str) -> Monitor:
 def look(
     monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
 ) -> tuple[Monitor, tuple[Flag, ...]]:
-    """Look at the next frame: the monitor after it, and what the checks found. O(blocks of the preview).
+    """Check the next frame. Returns the monitor after it, and the flags. O(blocks of the preview).
 
     Args:
-        begin: is called with the name of each check before it looks.
+        begin: called with the name of each check before the check runs.
 
     Raises:
-        CheckError: a check raised, whatever it was, or returned no `CheckResult`. The monitor that came in is as it
-            was: go on `without` that check.
+        CheckError: a check raised any exception, or did not return a `CheckResult`. The given monitor is unchanged:
+            continue with the monitor `without` that check.
     """
     if blank := digest.invalid_fraction == 1:  # only the check of pixels has something to say
         monitor = replace(monitor, context=replace(monitor.context, view=None, change=None, spots=NO_SPOTS))
@@ -145,7 +145,9 @@ def look_past_failures(
         except CheckError as failed:
             monitor = without(monitor, failed.name)
             cause = failed.__cause__
-            failures.append(f"{failed} at frame {frame.index} and is off, the other checks go on: {cause!r}")
+            failures.append(
+                f"{failed} at frame {frame.index} and is switched off; the other checks continue: {cause!r}"
+            )
         else:
             return monitor, flags, tuple(failures)
 
@@ -215,7 +217,8 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
 
 
 def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ...], grid: CellGrid) -> Monitor:
-    """The monitor with a projection that has light; `recent`: those before it, each a neighbour in angle."""
+    """The monitor after a projection with beam. recent: the projections before it, each a neighbour in angle of the
+    next."""
     context = monitor.context
     change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
@@ -236,13 +239,13 @@ def _of_one_view(apart: float, step: float) -> bool:
 
 
 def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:
-    """The view that is nearest in angle, within EVERY; None where none is."""
+    """The projection nearest in angle, if it is within EVERY; otherwise None."""
     apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in kept]
     return kept[int(np.argmin(apart))] if apart and min(apart) < EVERY else None
 
 
 def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
-    """The monitor with the frame's preview in the mean of its group, where it is a dark or a flat."""
+    """The monitor after a dark or a flat, whose preview is added to the mean of its group."""
     counted = monitor.counted + 1 if frame.kind is monitor.kind else 1
     context = monitor.context
     if frame.kind is FrameKind.DARK:

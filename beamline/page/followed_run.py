@@ -1,4 +1,4 @@
-"""The newest run of a folder for control systems: its values with the time and the alarm of what set each last."""
+"""The newest run of a folder, for control systems: its values, each with a time and an alarm state."""
 
 from __future__ import annotations
 
@@ -38,54 +38,61 @@ def published(name: str, about: str, default: Any, unit: str = "") -> Any:
 class RunValues:
     """The current values of a run for control systems. Unknown numbers are NaN or -1.
 
-    Names that tomoscan (APS) has are as there.
+    Values that tomoscan (APS) also has have the same names.
     """
 
     run: str = published("Run", "folder of the run", "")
     sample: str = published("SampleName", "name of the sample", "")
     file: str = published("FileName", "scan file", "")
     state: str = published("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done, died ...", "idle")
-    message: str = published("Message", "what the scan said last", "")
-    planned: int = published("ImagesPlanned", "frames that the scan takes in all", -1)
+    message: str = published("Message", "last message of the scan", "")
+    planned: int = published("ImagesPlanned", "total number of frames of the scan", -1)
     exposed: int = published("ImagesCollected", "frames exposed", 0)
     stored: int = published("ImagesSaved", "frames in the file", 0)
     percent: float = published("PercentComplete", "of the frames planned", 0.0, "%")
-    rate: float = published("FrameRate", "frames a second", math.nan, "Hz")
+    rate: float = published("FrameRate", "frames per second", math.nan, "Hz")
     time_left: float = published("RemainingTime", "until the last frame", math.nan, "s")
     mean: float = published("MeanCounts", "of the newest frame", math.nan, "counts")
     beam: float = published("Beam", "last reading of the beam monitor", math.nan)
-    warnings: int = published("Warnings", "flags of the monitor that warn", 0)
-    alarms: int = published("Alarms", "flags of the monitor that are alarms", 0)
+    warnings: int = published("Warnings", "warnings of the monitor", 0)
+    alarms: int = published("Alarms", "alarms of the monitor", 0)
     last_flag: str = published("LastFlag", "check, frame and advice of the last flag", "")
-    views: int = published("ReconViews", "views in the live volume", 0)
+    views: int = published("ReconViews", "projections in the live volume", 0)
     free: float = published("DiskFree", "of the disk with the scan file", math.nan, "GB")
-    age: float = published("FrameAge", "since the last frame came into the file", math.nan, "s")
-    data_rate: float = published("DataRate", "data a second", math.nan, "MB/s")
-    residual: float = published("ReconResidual", "of the views that the live volume has not learnt", math.nan)
-    skipped: int = published("SkippedLines", "lines of the log that are no events", 0)
+    age: float = published("FrameAge", "time since the last frame arrived in the file", math.nan, "s")
+    data_rate: float = published("DataRate", "data per second", math.nan, "MB/s")
+    residual: float = published("ReconResidual", "projections that the live volume has not used yet", math.nan)
+    skipped: int = published("SkippedLines", "lines of the log that are not events", 0)
     angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
-    flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each of FlagNames", ())
-    pass_number: int = published("PassNumber", "of the pass of views that ended last, from 1", 0)
+    flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
+    pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
     options: tuple[str, ...] = published("Options", "what can be measured after it: next, again, wide ...", ())
-    option_gains: tuple[float, ...] = published("OptionGains", "by each of Options, as predicted", (), "dB")
-    option_lows: tuple[float, ...] = published("OptionGainsLow", "low ends of OptionGains", (), "dB")
-    option_highs: tuple[float, ...] = published("OptionGainsHigh", "high ends of OptionGains", (), "dB")
-    option_times: tuple[float, ...] = published("OptionTimes", "that each of Options takes", (), "s")
-    option_doses: tuple[float, ...] = published("OptionDoses", "of each of Options, of the plan's dose", (), "%")
-    option_sizes: tuple[float, ...] = published("OptionSizes", "of the data of each of Options", (), "GB")
-    recommended: str = published("Recommended", "the one of Options that the program takes or would take", "")
-    wait: float = published("AnswerWithin", "for which the operator is asked what is next; 0: nobody is", 0.0, "s")
+    option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
+    option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")
+    option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
+    option_times: tuple[float, ...] = published("OptionTimes", "time that each of Options needs", (), "s")
+    option_doses: tuple[float, ...] = published(
+        "OptionDoses", "dose of each of Options, as a share of the plan's dose", (), "%"
+    )
+    option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
+    recommended: str = published("Recommended", "the one of Options that the program chooses or would choose", "")
+    wait: float = published(
+        "AnswerWithin",
+        "time left for the operator to decide what is next; 0: the scan does not wait for a decision",
+        0.0,
+        "s",
+    )
     decision: str = published("Decision", "what was chosen last, by whom, and why", "")
-    predicted_gain: float = published("PredictedGain", "by an earlier choice, as predicted then", math.nan, "dB")
-    measured_gain: float = published("MeasuredGain", "by an earlier choice, as measured", math.nan, "dB")
+    predicted_gain: float = published("PredictedGain", "improvement predicted for an earlier choice", math.nan, "dB")
+    measured_gain: float = published("MeasuredGain", "improvement measured for an earlier choice", math.nan, "dB")
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
-    """The choice that an operator's word names. Raises ConfigError if it is not on offer."""
+    """The choice that an operator's word names. Raises ConfigError if it is not possible now."""
     if word in values.options and word in [*Choice]:  # a log of another version may have others
         return Choice(word)
-    offer = f"on offer: {', '.join(values.options)}" if values.options else "no pass has ended yet"
+    offer = f"possible: {', '.join(values.options)}" if values.options else "no pass has ended yet"
     raise ConfigError(f"{one_line(word)!r} cannot be chosen now; {offer}. Nothing was changed.")
 
 
@@ -112,8 +119,8 @@ class StampedValues:
     """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
 
     Attributes:
-        began: time of what nothing has set yet, s since the Unix epoch.
-        unread: why the file cannot be read any more, so that its values are old; "" where it can.
+        began: time of values that nothing has set yet, s since the Unix epoch.
+        unread: why the file can no longer be read, so that its values are old; "" if it can.
     """
 
     values: RunValues
@@ -213,7 +220,7 @@ class FollowedRun:
         """The reader of the run's files. Raises DataError if there is no run yet."""
         with self._lock:
             if self._reader is None:
-                raise DataError("There is no run so far.")
+                raise DataError("There is no run yet.")
             return self._reader
 
     def look(self) -> StampedValues:

@@ -1,4 +1,4 @@
-"""Recording: the page's data from a scan file, also from a growing one. All calls come from one thread (HDF5)."""
+"""Recording: the page's data from a scan file, also a growing one. All calls must come from one thread (HDF5)."""
 
 from __future__ import annotations
 
@@ -122,14 +122,14 @@ class Recording:
         """Part of a frame, binned to a tile: counts, or transmission.
 
         Returns:
-            Values, the region that they show, and their binning. Where references are missing `corrected` gives counts.
+            Values, the region that they show, and their binning. Without darks and flats, `corrected` gives counts.
 
         Raises:
-            DataError: the file has no such frame, or does not give it.
+            DataError: the file does not have this frame, or it cannot be read.
         """
         frames = self.progress().frames
         if not 0 <= frame < frames:
-            raise DataError(f"Frame {frame} is not in the file, which holds {frames}.")
+            raise DataError(f"Frame {frame} is not in the file, which has {frames}.")
         region = region.inside(self.shape)
         rows, cols = region.slices
         factor = region.binning()
@@ -195,11 +195,11 @@ class Recording:
 
 def _foreign(path: Path) -> DataError:
     return DataError(
-        f"{path} was not written by `beamline scan`, so that there is nothing to follow: `beamline view {path}` shows "
-        f"what it holds, and `beamline recon {path}` reconstructs a scan."
+        f"{path} was not written by `beamline scan`, so it cannot be followed. `beamline view {path}` "
+        f"shows what it contains, and `beamline recon {path}` reconstructs a scan."
     )
 
 
 def _json_number(value: Any) -> float | None:
-    """The number; None for NaN and infinity, which have no place in JSON."""
+    """The number; None for NaN and infinity, which JSON cannot represent."""
     return float(value) if np.isfinite(value) else None

@@ -58,25 +58,26 @@ def watched(path: Path) -> Watched:
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
             raise DataError(
-                f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file; `beamline "
-                f"view {path}` shows images."
+                f"{path} is not the folder of a run: it has no {EVENTS}. Name a run, or a scan file; "
+                f"`beamline view {path}` shows images."
             )
         return Watched(_joined(folder), folder)
     if not path.is_file():
-        raise DataError(f"{path} is not there.")
+        raise DataError(f"{path} does not exist.")
     of_run = path.name == SCAN and is_below(path.parent, SCAN) and is_below(path.parent, EVENTS)
     return Watched(_joined(path.parent), path.parent) if of_run else Watched(path, None)
 
 
 def _joined(part: Path) -> Path:
-    """The file that joins a part of a run with the others, else its own."""
+    """The file that joins a part of a run with the others, otherwise its own file."""
     joined = joined_file_of(part / SCAN) if is_below(run_of(part), JOINED) else None
     return part / SCAN if joined is None else joined[0]
 
 
 class EventLog:
     """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line comes with the
-    next call; one that is no event is skipped, and counted."""
+    next call; a line that is not an event is skipped, and counted.
+    """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder, self._at, self._within = folder, 0, False

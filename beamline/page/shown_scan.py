@@ -1,4 +1,6 @@
-"""ShownScan: a scan in any format on the page: its views over flats as a stack, means, and one slice for any axis."""
+"""ShownScan: a scan in any format on the page: its flat-field corrected projections as a stack, means, and one slice
+for any axis.
+"""
 
 from __future__ import annotations
 
@@ -31,15 +33,15 @@ _VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
 _MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
 _CENTRED = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
 _BESIDE = 2  # rows beside that of the slice, by which the axis is found
-_MISSES = math.radians(2)  # by which a pair may miss half a turn
+_MISSES = math.radians(2)  # by which a pair may miss 180 degrees
 
 
 class _OverFlats:
-    """Views [view, row, col] as the share of the light that the sample lets through; as they are without flats.
+    """Projections [view, row, col] as transmission; without flats, as they are.
 
     Attributes:
         dark, flat: means [row, col] of the first darks and flats; None without.
-        light: [view] mean of each view that was read, else NaN.
+        light: [view] mean of each projection that was read, else NaN.
     """
 
     dtype = np.dtype(np.float32)
@@ -47,7 +49,7 @@ class _OverFlats:
     def __init__(self, source: ScanSource) -> None:
         self.source, self.frames = source, source.table.views
         if not self.frames.size:
-            raise DataError(f"{source.path} has no projections to show: `beamline info` says what its frames are.")
+            raise DataError(f"{source.path} has no projections to show: `beamline info` lists the kinds of its frames.")
         self.shape = self.frames.size, *source.shape
         self.dark, self.flat = self._mean(FrameKind.DARK), self._mean(FrameKind.FLAT)
         self._zero = np.zeros(source.shape, np.float32) if self.dark is None else self.dark
@@ -76,7 +78,7 @@ class ShownScan:
     """A scan, opened. All calls come from one thread (HDF5).
 
     Attributes:
-        stack: its views as slices: across views, rows and columns.
+        stack: its projections as slices: across projections, rows and columns.
 
     Raises:
         DataError: it has no projections.
@@ -96,20 +98,21 @@ class ShownScan:
         self._source.close()
 
     def facts(self) -> dict[str, Any]:
-        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each view so far (null:
-        not read), two views about half a turn apart and the degrees by which they miss it (null: none)."""
+        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each projection so far
+        (null: not read), two projections about 180 degrees apart and the degrees by which they miss it (null: none)."""
         known = self._degrees[np.isfinite(self._degrees)]
-        angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles not known: give --angles"
-        over = "as they are: there are no flats" if self._views.flat is None else "over flats"
+        angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
+        over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"
         return {
-            "said": f"{self._source.format}, {known.size} of {self._degrees.size} views with angles, {angles}; {over}",
+            "said": f"{self._source.format}, {known.size} of {self._degrees.size} projections with angles, "
+            f"{angles}; {over}",
             "means": [name for name, mean in self._means().items() if mean is not None],
             "light": [float(each) if np.isfinite(each) else None for each in self._views.light],
             "pair": self._pair(),
         }
 
     def mean(self, kind: str) -> F32:
-        """The mean [row, col] of the views that were read so far, or of the first flats or darks.
+        """The mean [row, col] of the projections that were read so far, or of the first flats or darks.
 
         Raises:
             DataError: the scan has no frames of this kind.
@@ -119,28 +122,28 @@ class ShownScan:
         return mean
 
     def axis(self, row: int) -> dict[str, Any]:
-        """The axis of the file, or as one row shows it, in columns, and where it comes from; whether it may lean.
+        """The axis from the file, or found from one row, in columns; where it comes from; and True if it may be tilted.
 
         Raises:
-            DataError: the views cannot be corrected, or have no angles.
+            DataError: the projections cannot be corrected, or have no angles.
         """
         self._read(row, 0.0)
-        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the detector's middle", self._cone is not None
+        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the middle of the detector", self._cone is not None
         if self._source.axis_col is not None:
-            axis, said = self._source.axis_col, "as the file states"
+            axis, said = self._source.axis_col, "from the file"
         elif not is_cone:
             with suppress(ValueError):
                 found = find_axis(self._lines, self._source.table.angles[self._ids])
-                axis, said = found.value, f"found by row {row}{'' if found.confident else ', not a clear optimum'}"
+                axis, said = found.value, f"found from row {row}{'' if found.confident else ', not a clear optimum'}"
         return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
-        """A part of the slice that a row shows, by FBP with this axis; `fast`: of fewer views, with larger voxels.
+        """A part of the FBP slice of one row with this axis; `fast`: from fewer projections, with larger voxels.
 
         Raises:
             DataError: as `axis`.
         """
-        from recon.voxels.direct import direct  # here: it loads numba, which slices of views do not need
+        from recon.voxels.direct import direct  # here: it loads numba, which slices of projections do not need
 
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
@@ -187,7 +190,7 @@ class ShownScan:
         """Correct the rows that a slice needs, which are kept for the next slices."""
         rows, cols = self._source.shape
         if not 0 <= row < rows:
-            raise DataError(f"Row {row} is not on a detector of {rows} rows.")
+            raise DataError(f"Row {row} is outside the detector, which has {rows} rows.")
         beside = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
         if row == self._row and beside <= self._beside:
             return
@@ -199,7 +202,7 @@ class ShownScan:
             near, far = min(near, math.floor(min(edges))), max(far, math.ceil(max(edges)))
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
-            raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
+            raise DataError(f"Give --angles FILE: a slice needs angles, and {self._source.path} states none.")
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
@@ -208,12 +211,12 @@ class ShownScan:
             )
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:
-            raise DataError(f"The views cannot be corrected: {error}.") from error
+            raise DataError(f"The projections cannot be corrected: {error}.") from error
         self._lines, self._ids = corrected.data, corrected.view_ids
         self._row, self._beside, self._band = row, beside, band
 
     def _line(self, data: F32, row: int, tilt_deg: float) -> F32:
-        """The row [view, col] of views that are turned by the tilt, linear between pixels."""
+        """The row [view, col] of projections that are turned by the tilt, linear between pixels."""
         if not tilt_deg:
             return data[:, row - self._band.start]
         turned = TiltAndLens(tilt_deg).of(self._source, Selection().of(self._source))

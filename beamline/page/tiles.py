@@ -1,4 +1,6 @@
-"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers; answers that hold them."""
+"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers, and the web answers
+with them.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,7 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
 
 
 def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray[np.float32]:
-    """The flat with NaN where it has no light, as behind slits: ratios there are noise."""
+    """The flat with NaN in pixels without intensity, for example behind slits, because ratios there are noise."""
     light = flat - dark
     return np.where(light > UNLIT * np.nanpercentile(light, BRIGHT), flat, np.float32(np.nan))
 
@@ -94,7 +96,7 @@ def tile_of(values: Any, facts: dict[str, Any]) -> Response:
 
 
 class _Number(IntegerConvertor):
-    """A whole number in a path; one of more digits is none that anything here has."""
+    """An integer in a path; one with more digits cannot be the number of anything here."""
 
     regex = "[0-9]{1,9}"
 
@@ -114,7 +116,7 @@ def numbers_of(request: Request, name: str, n: int, what: str) -> list[float]:
         numbers = [float(word) for word in request.query_params.get(name, "").split(",")]
         if len(numbers) == n and all(abs(each) < 1e6 for each in numbers):
             return numbers
-    raise DataError(f"The query lacks {name}={what}.")
+    raise DataError(f"{name}={what} is missing in the query.")
 
 
 def region_of(request: Request) -> TileRegion:

@@ -41,8 +41,11 @@ def slices_of(path: Path, values: Any, held: int) -> ScaledSlices | CopiedSlices
 
 
 class ScaledSlices:
-    """Slices of a file with scales: the one that a tile needs, or a coarser one where that reads over
-    `SLICE_READ_BYTES`. Methods as of CopiedSlices. All calls come from one thread (HDF5)."""
+    """Slices of a file with several scales: at the scale that a tile needs, or a coarser one if that would read more
+    than `SLICE_READ_BYTES`.
+
+    Methods as in CopiedSlices. All calls must come from one thread (HDF5).
+    """
 
     bin, ready = 1, 1.0
 
@@ -75,11 +78,13 @@ class ScaledSlices:
 
 
 class CopiedSlices:
-    """Slices of a file whose slices across y and x are spread over all of it: these come from a copy, those across z
-    from the file. The copy is read a slice at a time, first a few from all over the volume, then those between them.
+    """Slices of a file whose slices across y and x are spread over all of it: these come from a copy in memory, those
+    across z from the file.
+
+    The copy is read a slice at a time, first a few from all over the volume, then those between them.
 
     Attributes:
-        bin: binning of slices across y and x, however far one zooms in.
+        bin: binning of slices across y and x, at any zoom.
     """
 
     def __init__(self, path: Path, values: Any, held: int) -> None:
@@ -222,8 +227,9 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, views, angles of
-        the views that are the slices (empty: it is a volume) and of those that a sector lacks, windows of all times."""
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, projections,
+        angles of the projections that are the slices (empty: it is a volume) and of those that a sector lacks, windows
+        of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
@@ -283,12 +289,12 @@ class ShownVolume:
         return list(np.asarray(self._parameters.get(name, ()), np.float64).tolist())
 
     def _at(self, time: int) -> ScaledSlices | CopiedSlices:
-        """At one of the times; a volume that does not change is the same at all."""
+        """The volume at one of the times; a volume that does not change is the same at all."""
         return self._slices[min(time, len(self._slices) - 1)]
 
     def _part(self, axis: int, index: int, region: TileRegion, time: int) -> tuple[NDArray[Any], TileRegion, int]:
         if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
-            raise DataError(f"Slice {index} across axis {axis} is not in a volume of {self.shape}.")
+            raise DataError(f"Slice {index} across axis {axis} is outside the volume of {self.shape}.")
         return self._at(time).part(axis, index, region)
 
     def _sample(self, time: int) -> F32:
@@ -296,7 +302,7 @@ class ShownVolume:
         return values[np.isfinite(values)]
 
     def _meant(self, values: NDArray[Any]) -> F32:
-        """The values that grey values stand for."""
+        """The values that grey values represent."""
         if self._grey is None:
             return np.asarray(values, np.float32)
         low, step = self._grey

@@ -1,1 +1,1 @@
-"""Plan: angles, trigger trains, timeline and limits of a scan before it starts."""
+"""Plan: angles, trigger trains, timeline and limits of a scan, before it starts."""

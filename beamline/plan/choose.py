@@ -1,4 +1,4 @@
-"""What can be measured after a pass, what each choice costs and would bring, and which one a target asks for."""
+"""The choices after a pass: their cost, their expected improvement, and the one that the target asks for."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from recon.base.error_law import ErrorLaw, Gain
 
 @dataclass(frozen=True)
 class PassOption:
-    """One choice with what it costs, and the gain in dB of PSNR that is predicted of it (NaN: no law is known).
+    """One choice, with its cost and the predicted improvement in PSNR in dB (NaN: no error model is known).
 
     Attributes:
-        frames, seconds, bytes: that it takes.
-        dose: its share of the exposures of the whole plan with light on the sample.
-        low, high: ends of the range of the gain, as of `recon.base.error_law.Gain`.
+        frames, seconds, bytes: what it costs.
+        dose: its exposures of the sample, as a fraction of those of the whole plan.
+        low, high: ends of the range of the improvement, as in `recon.base.error_law.Gain`.
     """
 
     choice: Choice
@@ -35,12 +35,12 @@ class PassOption:
 
 @dataclass(frozen=True)
 class ScanTarget:
-    """What a scan is to reach; None: no such target.
+    """What a scan has to reach. None: no such target.
 
     Attributes:
-        quality_db: dB of PSNR by which the volume may stay below that of the whole plan.
-        seconds: of the scan, at most.
-        dose: share of the plan's, at most.
+        quality_db: dB of PSNR by which the volume may be worse than that of the whole plan.
+        seconds: longest duration of the scan.
+        dose: largest dose, as a fraction of that of the plan.
     """
 
     quality_db: float | None = None
@@ -49,18 +49,18 @@ class ScanTarget:
 
 
 def frame_dose(timeline: Timeline) -> float:
-    """The share of one frame in the exposures of the whole plan with light on the sample."""
+    """The dose of one frame, as a fraction of that of the whole plan."""
     return 1 / sum(block.n for block in timeline.blocks if block.kind in (FrameKind.PROJECTION, FrameKind.OFFSET_VIEW))
 
 
 def options(
     passes: Passes, law: ErrorLaw | None, timeline: Timeline, seconds_of: Callable[[Block], float]
 ) -> tuple[PassOption, ...]:
-    """What is possible now; ENOUGH, which always is, comes last.
+    """The choices that are possible now. ENOUGH is always possible and comes last.
 
     Args:
-        law: with `passes.n_frames` as its `n_views`; None: not known.
-        seconds_of: duration of a block, from where the stage stands.
+        law: the error model with `passes.n_frames` as its `n_views`; None: not known.
+        seconds_of: gives the duration of a block, from the present position of the stage.
     """
 
     def option(choice: Choice, frames: int, seconds: float, **added: Any) -> PassOption:
@@ -96,19 +96,19 @@ def choose(
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
-            f"all that the plan still has would add {remaining.mean:.2f} dB ({remaining.low:.2f} to "
-            f"{remaining.high:.2f}); {target.quality_db:g} dB less is accepted"
+            f"the rest of the plan would add {remaining.mean:.2f} dB ({remaining.low:.2f} to {remaining.high:.2f}); a "
+            f"loss of {target.quality_db:g} dB is accepted"
         )
     excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]
     if not allowed:
-        return Choice.ENOUGH, next(iter(excesses.values()), "nothing that is left would improve the volume")
+        return Choice.ENOUGH, next(iter(excesses.values()), "no choice would improve the volume")
     best = max(allowed, key=lambda option: option.gain / option.seconds)
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
     taken = following if best.low / best.seconds <= following.high / following.seconds else best
     return taken.choice, (
-        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; "
-        "no other choice is clearly better per second"
+        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; no other choice is "
+        "significantly better per second"
     )
 
 

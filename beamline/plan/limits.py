@@ -1,4 +1,4 @@
-"""Plan checks: positions of triggers in counts, the limits that a plan breaks, and remarks for the operator."""
+"""Checks of a plan: positions of the triggers in counts, violated limits, and remarks for the operator."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
         ValueError: one sentence that says why the plan cannot be flown.
     """
     if angles.size < 2:
-        raise ValueError(f"a fly scan needs at least 2 views, the plan has {angles.size}; use scan.mode: step")
+        raise ValueError(
+            f"a fly scan needs at least 2 projections, but the plan has {angles.size}. Use scan.mode: step"
+        )
     scale = Scale.of(to_counts)
     index, step = _lattice(angles, abs(scale.per_count))
     exact = step / abs(scale.per_count)
@@ -80,8 +82,8 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     spacing = {abs(train.interval) for train in runs}
     if len(spacing) > 1 or min(train.n for train in runs) < 2:
         raise ValueError(
-            "the views do not come in passes of equal steps, so a turning stage cannot trigger them in this order. "
-            "Use scan.mode: step, or a fixed, sector or interlaced plan"
+            "a rotating stage cannot trigger the projections in this order, because they are not in passes of equal "
+            "steps. Use scan.mode: step, or a fixed, sector or interlaced plan"
         )
     drift = float(np.abs(scale.angles(counts) - angles).max())
     return Flight(tuple(runs), spacing.pop(), whole, exact, drift)
@@ -98,8 +100,8 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
         if np.unique(index).size == angles.size and off <= max(count / 2, step / 100):
             return index, step
     raise ValueError(
-        "the views are not equally spaced, so a turning stage cannot trigger them at a fixed distance; "
-        "use scan.mode: step, or a fixed, sector or interlaced plan"
+        "a rotating stage cannot trigger at these angles, because they are not equally spaced. Use scan.mode: step, or "
+        "a fixed, sector or interlaced plan"
     )
 
 
@@ -156,19 +158,19 @@ def violations(facts: PlanFacts) -> Iterator[str]:
         yield from _timing(facts)
         yield from _speed(facts)
         if not facts.stage.trigger_output:
-            yield "the stage has no trigger output, which a fly scan needs; use scan.mode: step"
+            yield "a fly scan needs a stage with a trigger output, but this stage has none. Use scan.mode: step"
         elif facts.flight:
             yield from _spacing(facts.flight.interval, facts.stage)
     yield from _limits(facts)
     cols = facts.camera.shape[1]
     if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
         yield (
-            f"optics.axis_col {facts.axis_col:g} lies outside the frame's columns 0 ... {cols - 1}; it counts "
-            "columns of the region that is read, after binning"
+            f"optics.axis_col {facts.axis_col:g} is outside the columns of the frame, 0 ... {cols - 1}. Columns are "
+            "counted in the region that is read out, after binning"
         )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
-            yield f"no {name}: scan.{name}.count is 0; take at least one, or set at: none if that is meant"
+            yield f"no {name}: scan.{name}.count is 0; take at least one, or set at: none if you want none"
     if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
         yield (
             f"scan.pass_views {plan.pass_views} divides {plan.n_views} views into more than {MOST_PASSES} passes; "
@@ -177,9 +179,9 @@ def violations(facts: PlanFacts) -> Iterator[str]:
     needed = facts.total_bytes + facts.retake_bytes
     if facts.free_bytes is not None and needed * ROOM + CLOSING > facts.free_bytes:
         yield (
-            f"the file needs {size(needed)} and a tenth more, and {size(CLOSING)} to be closed; the disk has "
-            f"{size(facts.free_bytes)} free; "
-            "free some, choose another storage.folder, or reduce views, roi or binning"
+            f"not enough disk space: the file needs {size(needed)} plus a tenth, and {size(CLOSING)} more when it is "
+            f"closed, but {size(facts.free_bytes)} is free. Free some space, choose another storage.folder, or reduce "
+            "the number of projections, the region or the binning"
         )
 
 
@@ -190,13 +192,14 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     period = facts.views.period
     if facts.flight and abs(period - plan.period) > 1e-3 * plan.period:
         yield (
-            f"period_s {plan.period:g} would be {facts.flight.interval / plan.period:.6g} counts/s of the stage; it "
-            f"turns at {facts.flight.interval / period:.6g}, so that views come every {period:.6g} s"
+            f"period_s {plan.period:g} would be {facts.flight.interval / plan.period:.6g} counts/s of the stage. The "
+            f"stage turns at {facts.flight.interval / period:.6g} counts/s, so there is a projection every "
+            f"{period:.6g} s"
         )
     if plan.mode is Mode.FLY and camera.min_period <= period < MARGIN * camera.min_period:
         yield (
-            f"a trigger every {period:.6g} s leaves less than 1 % over the camera's least "
-            f"{camera.min_period:.6g} s; a pulse that comes early is ignored without a word"
+            f"a trigger every {period:.6g} s is less than 1 % above the camera's minimum of {camera.min_period:.6g} s. "
+            "If a trigger comes slightly early, the camera ignores it and reports no error"
         )
     if facts.blur_px > 1:
         exposure = plan.exposure / facts.blur_px
@@ -212,8 +215,8 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     criterion = math.ceil(math.pi / 2 * camera.shape[1])
     if plan.n_views < criterion:
         yield (
-            f"{plan.n_views} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
-            "filtered back-projection will show streaks towards the edge"
+            f"{plan.n_views} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: filtered "
+            "back-projection will show streaks towards the edge"
         )
     if plan.retakes:
         yield (
@@ -221,7 +224,9 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
             f"(monitor.retake_share): {facts.retake_seconds:.0f} s and {size(facts.retake_bytes)} more at most"
         )
     yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")
-    yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")
+    yield from _reference(
+        "darks", plan.darks, plan.exposure, "their hot pixels and dark current differ from those of the projections"
+    )
 
 
 def _timing(facts: PlanFacts) -> Iterator[str]:
@@ -234,7 +239,7 @@ def _timing(facts: PlanFacts) -> Iterator[str]:
     if period < camera.min_period:
         rows, cols = camera.shape
         yield (
-            f"period_s {period:.4g} is below the camera's least {camera.min_period:.6g} s between triggers "
+            f"period_s {period:.4g} is below the camera's minimum of {camera.min_period:.6g} s between triggers "
             f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
             f"{rounded(camera.min_period * MARGIN, up=True):g}, expose shorter or read fewer pixels"
         )

@@ -1,4 +1,4 @@
-"""Passes: the parts of a scan's views, and what can be measured after each."""
+"""Passes: parts of the projections of a scan, and the choices of what to measure after each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Choice(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> Choice | None:
-        """Files of earlier versions have `wide` for the offset views."""
+        """Files of earlier versions call the offset projections `wide`."""
         return cls.OFFSET if value == "wide" else None
 
 
@@ -31,10 +31,10 @@ class Passes:
     """A scan at the end of a pass.
 
     Attributes:
-        done: passes of views so far, oldest first; one that was taken again stands there twice.
-        to_come: passes of the plan that are still to be taken.
-        offset: blocks of offset views that were not taken yet.
-        retakes: views that can be taken again now.
+        done: passes so far, oldest first; a pass that was taken again is listed twice.
+        to_come: passes of the plan that are not taken yet.
+        offset: blocks of offset projections that are not taken yet.
+        retakes: number of projections that can be taken again now.
     """
 
     done: tuple[Block, ...]
@@ -44,21 +44,21 @@ class Passes:
 
     @property
     def n_frames(self) -> int:
-        """Frames of views so far: of each view `ScanPlan.frames_per_view`."""
+        """Number of frames of projections so far (`ScanPlan.frames_per_view` for each projection)."""
         return sum(block.n_to_take for block in self.done)
 
     @property
     def n_planned(self) -> int:
-        """Frames of views so far and to come, without retakes."""
+        """Number of frames of projections so far and to come, without retakes."""
         return self.n_frames + sum(block.n_to_take for block in self.to_come)
 
     @property
     def may_repeat(self) -> bool:
-        """Whether the last pass can be taken again: a pass is still to come, with at least as many views."""
+        """Whether the last pass can be taken again: only if a pass of at least the same length is still to come."""
         return bool(self.to_come) and self.done[-1].n_to_take <= self.to_come[-1].n_to_take
 
     def after(self, choice: Choice) -> Passes:
-        """The scan at the end of what it chose. Where the last pass cannot be taken again, AGAIN is NEXT."""
+        """The scan after this choice is done. If the last pass cannot be taken again, AGAIN means NEXT."""
         match choice:
             case Choice.AGAIN if self.may_repeat:
                 return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
@@ -68,7 +68,7 @@ class Passes:
                 return replace(self, offset=())
             case Choice.ENOUGH:
                 return replace(self, to_come=())
-        return self  # retakes are of no pass
+        return self  # retakes do not belong to a pass
 
 
 def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
@@ -80,13 +80,15 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
     after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
     chosen = f" of the {by}" if by else ""
-    chosen += f": {why}".rstrip(".") if why and by != "operator" else ""  # whose reason is that they chose it
+    chosen += (
+        f": {why}".rstrip(".") if why and by != "operator" else ""
+    )  # the reason of the operator is only that the operator chose it
     rest = f" {left} planned frames were not taken." if left else ""
     return f"Ended after pass {after or last.get('number')} by the choice `enough`{chosen}.{rest}" if last else ""
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:
-    """Triggers, counted within a block, of the frames that one of these parts of it takes."""
+    """Triggers, counted within a block, of the frames that are taken in one of these parts of the block."""
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 

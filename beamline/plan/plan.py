@@ -1,4 +1,4 @@
-"""ScanPlan: the planned scan as a value, and its angles by each scheme; its timeline gives times, speeds and bytes."""
+"""ScanPlan: the planned scan as a value, with its angles by each scheme."""
 
 from __future__ import annotations
 
@@ -44,27 +44,29 @@ class ScanPlan:
     """The requested scan.
 
     Attributes:
-        angles: float64 [frame] radians, in the order of acquisition; `frames_per_view` at each.
+        angles: float64 [frame] radians, in the order of acquisition, with `frames_per_view` frames at each angle.
         mode: FLY (pulses from the moving stage) or STEP (move, settle, expose).
-        exposure: s per view.
-        period: s between views of a fly scan (sets the speed); for a step scan the least time per view.
-        settle: s to wait after each move of a step scan.
-        darks, flats: reference frames.
-        scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
-        retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
-        stored: triggers of views, and after them of offset views, that need not be taken: earlier files of the scan
-            have them, or the scan decided against them.
-        choices: what earlier files of the same scan chose after each pass that ended in them (`passes.Choice`), oldest
-            first. A scan that goes on is in the pass that the last one began.
-        choice_due: that pass has ended, and nothing was chosen yet.
-        pass_views: views of a pass of a step scan; 0: all. The passes of a fly scan are its trains.
-        warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
-        end_references: kinds of references that are still to be taken after the views, where all else but offset views
-            is stored. None: all that are planned, before and after the views.
-        offset_views: angles, evenly spread, of one frame each with the sample at each of `offset_places`, in mm aside.
-        filter: the place of the filter for all frames; None: as it stands.
-        energy: keV of the monochromator for all frames; None: as it stands.
-        frames_per_view: of a step scan; the stage neither moves nor settles between them.
+        exposure: exposure of a frame in s.
+        period: time in s between the projections of a fly scan (sets the speed); least time per projection of a step
+            scan.
+        settle: waiting time in s after each move of a step scan.
+        darks, flats: plans of the darks and flats.
+        scheme: how the angles were chosen ("fixed", "golden", ...); only recorded.
+        retake_share: largest fraction of the projections that are repeated after an alarm of the monitor; 0: none.
+        stored: triggers of projections, and after them of offset projections, that are not taken, because earlier files
+            of the scan have them or because the scan decided so.
+        choices: the choices (`passes.Choice`) in earlier files of the same scan after each of their passes, oldest
+            first. A continued scan is in the pass that the last choice started.
+        choice_due: True if that pass has ended, and no choice was made yet.
+        pass_views: number of projections in a pass of a step scan; 0: all. The passes of a fly scan are its trains.
+        warm_up: time in s for which the scintillator is exposed each time the shutter opens, before frames with beam.
+        end_references: kinds of darks and flats that remain to be taken after the projections, if everything else
+            except offset projections is stored. None: all that are planned, before and after the projections.
+        offset_views: number of evenly spread angles at which one frame is taken with the sample shifted sideways to
+            each of `offset_places` (mm).
+        filter: position of the filter for all frames; None: leave it as it is.
+        energy: energy of the monochromator for all frames in keV; None: leave it as it is.
+        frames_per_view: number of frames at each angle of a step scan; the stage does not move between them.
     """
 
     angles: NDArray[np.float64]
@@ -90,12 +92,12 @@ class ScanPlan:
 
     @property
     def n_views(self) -> int:
-        """Views, each of `frames_per_view` frames."""
+        """Number of projections, each of `frames_per_view` frames."""
         return int(self.angles.size) // self.frames_per_view
 
     @property
     def retakes(self) -> int:
-        """Largest number of repeated views."""
+        """Largest number of repeated projections."""
         return max(1, int(self.retake_share * self.angles.size)) if self.retake_share > 0 else 0
 
 
@@ -106,15 +108,15 @@ class Block:
     Attributes:
         kind: what the frames show.
         mode: how they are triggered.
-        first_trigger: of the block's first frame, within the whole plan.
-        angles: float64 [frame] radians at whole counts, the angles of the rows. NaN in darks and flats until
-            acquisition fills in where the stage stands.
-        exposure, period: s.
-        trains: for FLY, one pulse train a pass (interlaced plans need several); their n add up to the block's.
-        speed: rad/s during the pulses (FLY).
-        taxi: radians of run-up before the first and after the last pulse (FLY).
+        first_trigger: trigger of the first frame of the block, counted in the whole plan.
+        angles: float64 [frame] radians at whole counts, the angles of the rows. NaN in darks and flats until the
+            acquisition fills in the angle of the stage.
+        exposure, period: in s.
+        trains: for FLY, one pulse train per pass (interlaced plans have several).
+        speed: speed of the stage in rad/s during the pulses (FLY).
+        taxi: run-up in radians before the first and after the last pulse (FLY).
         stored: frames of the block, counted within it, that are not taken.
-        aside: mm, where the sample stands, as of `Frame.aside`.
+        aside: sideways shift of the sample in mm, as in `Frame.aside`.
     """
 
     kind: FrameKind
@@ -206,7 +208,7 @@ def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.f
 
 
 def sector(views: int, first: float, last: float) -> NDArray[np.float64]:
-    """Equal steps from `first` to `last`, both included: a limited-angle scan. One view stands at `first`."""
+    """Equal steps from `first` to `last`, both included: a limited-angle scan. A single projection is at `first`."""
     _require(views)
     return np.linspace(first, last, views)
 
@@ -264,7 +266,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     follow a point or a comma.
 
     Args:
-        unknown: lines may hold nan, as the log of a scan has it for darks and flats.
+        unknown: True if lines may be nan, as in the log of a scan for darks and flats.
 
     Raises:
         ValueError: a line is not a finite number (the message names it), or the file has no line.
@@ -288,13 +290,13 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
             raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("it holds no angle; expected one angle in degrees a line")
+        raise ValueError("it contains no angle; expected one angle in degrees a line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 
 @dataclass(frozen=True)
 class Retake:
-    """A view to repeat: its frame in the file (-1 if it has none), and its trigger within the views."""
+    """A projection to repeat: its frame in the file (-1 if it has none), and its trigger among the projections."""
 
     row: int
     trigger: int
@@ -308,7 +310,7 @@ def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
     """float64 [view] radians that the stage turns from the trigger to the middle of each exposure.
 
-    0 for a step scan. A standing stage at this angle shows the same as the view of a fly scan.
+    0 for a step scan. A stage at rest at this angle shows the same as the projection of a fly scan.
     """
     turned = np.zeros(views.n)
     first = 0
@@ -320,13 +322,14 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
 
 
 def offset_block(views: Block, n: int, aside: float) -> Block:
-    """The block of offset views with the sample `aside`, at `n` evenly spread angles; the stage stands for each."""
+    """The block of offset projections with the sample shifted by `aside`, at `n` evenly spread angles; the stage is
+    at rest."""
     triggers = np.argsort(views.angles, kind="stable")[np.arange(n) * views.n // n]
     return replace(retake_block(views, triggers), kind=FrameKind.OFFSET_VIEW, aside=aside)
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:
-    """The block that repeats these views, in their order; the stage stands during each exposure."""
+    """The block that repeats these projections, in this order; the stage is at rest during each exposure."""
     angles = views.angles[triggers] + middle_of_exposure(views)[triggers]
     period = views.exposure if views.trains else views.period
     return Block(FrameKind.PROJECTION, Mode.STEP, views.first_trigger + views.n, angles, views.exposure, period)

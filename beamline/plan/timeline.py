@@ -1,4 +1,4 @@
-"""Timeline: a plan computed for one stage and one camera, as values and as lines for the operator.
+"""Timeline: speeds, times and sizes of a plan with one stage and one camera, as values and as lines for the operator.
 
 Darks then flats come before the views; offset views, flats, then darks after them. A fly scan turns at step /
 period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
@@ -47,17 +47,17 @@ def work_out(
     preview_bin: int = 4,
     free_bytes: int | None = None,
 ) -> Timeline:
-    """Compute blocks, times, bytes, and every violated limit; no device is asked, so a dry run is the same call.
+    """Compute blocks, times, bytes and all violated limits. No device is used, so a dry run makes the same call.
 
-    The duration is that of a stage that stands at its zero and goes back there at the end, without shutter and sample
-    moves.
+    The duration assumes that the stage starts at its zero and returns there, and does not include moves of shutter and
+    sample.
 
     Args:
-        to_counts: the stage's conversion of radians to whole counts.
-        camera: its timing with the views' exposure.
+        to_counts: conversion of the stage from radians to whole counts.
+        camera: timing of the camera with the exposure of the projections.
         axis_col: column of the rotation axis (None: the middle), for blur and skew at the farther edge.
-        preview_bin: pixels per side of the previews that the file holds beside the frames.
-        free_bytes: of the disk; None leaves it unchecked.
+        preview_bin: side in pixels of the blocks of the previews that the file also has.
+        free_bytes: free bytes of the disk; None: not checked.
     """
     scale = Scale.of(to_counts)
     flight, broken = _flight(plan, to_counts)

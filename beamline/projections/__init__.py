@@ -1,1 +1,1 @@
-"""Projections: frames of a scan become line integrals."""
+"""Projections: converts the frames of a scan to line integrals."""

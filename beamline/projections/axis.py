@@ -1,4 +1,4 @@
-"""The rotation axis of a scan: given, found by its views, or stated by the file."""
+"""Rotation axis of a scan: stated by the user, found from the projections, or stated by the file."""
 
 from __future__ import annotations
 
@@ -26,12 +26,15 @@ from recon.prep.axis_ends import ENDS
 from recon.prep.axis_wedge import AGREE
 from recon.prep.projections import Projections
 
-_AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
+_AXIS_VIEWS = 360  # more projections do not make the axis more accurate, they only take time to read
 _AXIS_ROWS = 64
-_COMPARED, _FEWEST = 90, 20  # views that are enough for an axis that is given; fewer may be sure and wrong
-_CONFIRMED = 0.5  # columns, of binned views, up to which those held out confirm an axis
-_CANDIDATES = 14  # of the axis of a cone, usually
-_GUESSED = 0.01  # of the mass in filled pixels moves the centre of mass by at most a hundredth of half the width
+# projections that are enough to check an axis that is given. With fewer, the result may look certain and be wrong
+_COMPARED, _FEWEST = 90, 20
+# columns of binned projections: an axis is confirmed if the held-out projections find it within this distance
+_CONFIRMED = 0.5
+_CANDIDATES = 14  # candidates for the axis of a cone beam, the usual number
+# share of the total absorption in replaced pixels. It shifts the centre of mass by at most 1 % of half the width
+_GUESSED = 0.01
 
 
 def rotation_axis(
@@ -45,10 +48,10 @@ def rotation_axis(
 ) -> tuple[float, AxisEstimate | None]:
     """The rotation axis in columns of the full detector, and how it was found (None if the user gave it).
 
-    With `poses`, opposite views are no mirror images.
+    With `poses`, opposite projections are not mirror images.
 
     Raises:
-        DataError: no axis explains the views.
+        DataError: no axis explains the projections.
         ConfigError: it lies outside the detector.
     """
     if poses is not None and poses.vectors is not None:
@@ -70,15 +73,16 @@ def rotation_axis(
 
 
 def _compare_with_views(given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn) -> None:
-    """Warn where some of the views clearly show another column than the one that was given."""
+    """Warn if some of the projections clearly show another axis than the one that was given."""
     with suppress(DataError):
         some = spread(frames, _COMPARED)
         shown, estimate = locate_axis(correction.quiet(), some, lambda _: None, all_there=False)
         if estimate.confident and abs(shown - given) > AGREE * correction.binning:
             warn(
-                f"The views show the rotation axis in column {shown:.2f}; column {given:g} was given. Columns are "
-                "counted from 0 at the centre of the first. Unless the sample moved, leave --axis out, or compare axes "
-                "by `beamline sweep FILE axis=A:B:STEP`."
+                f"Check --axis: the projections show the rotation axis at column {shown:.2f}, but "
+                f"{given:g} was given. Columns are counted from 0 at the centre of the first column. "
+                "Unless the sample moved, omit --axis, or compare columns with `beamline sweep FILE "
+                "axis=A:B:STEP`."
             )
 
 
@@ -90,12 +94,12 @@ def _axis_by_views(
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
-    """The axis by views held out. What the file states stays, unless they agree better with another one."""
+    """The axis found with held-out projections. The file's axis is kept unless they agree better with another one."""
     source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if selection.axis_rows is not None:
         selection = replace(selection, rows=selection.axis_rows)
     rows = selection.detector_rows
-    # Few rows would leave columns fine, for which volumes take minutes: rows beside them are read, too.
+    # With few rows, columns would not be binned and volumes would take minutes, so more rows around them are read.
     height = max(rows.stop - rows.start, min(cols // COLS, source.shape[0]))
     first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
     binning = max(selection.binning, min(cols // COLS, height))
@@ -113,7 +117,7 @@ def _axis_by_views(
         if stated is None:
             raise _not_found(source, error) from error
         if isinstance(error, AxisError):
-            warn(f"The file's rotation axis, column {stated:.2f}, was not confirmed: {error}.")
+            warn(f"The rotation axis in the file, column {stated:.2f}, could not be confirmed: {error}.")
         return stated, None
     axis_col = unbinned(estimate.value, binning)
     if stated is None:
@@ -122,14 +126,15 @@ def _axis_by_views(
         return axis_col, estimate
     if not estimate.confident:
         warn(
-            f"The file's rotation axis, column {stated:.2f}, was not confirmed: views held out show no axis clearly. "
-            "Check the slices for doubled edges, or give --axis COLUMN."
+            "Check the slices for double edges, or give --axis COLUMN: the rotation axis in the file, "
+            f"column {stated:.2f}, could not be confirmed, because the held-out projections do not show "
+            "an axis clearly."
         )
     if not estimate.confident or abs(axis_col - stated) <= _CONFIRMED * binning:
         return stated, None
     warn(
-        f"Views held out agree better with a rotation axis in column {axis_col:.2f} than with the file's {stated:.2f}: "
-        f"the former is used. --axis {stated:g} keeps the file's."
+        f"The rotation axis at column {axis_col:.2f} is used, because held-out projections agree better "
+        f"with it than with the file's column {stated:.2f}. To use the file's, give --axis {stated:g}."
     )
     return axis_col, estimate
 
@@ -140,7 +145,9 @@ def _axis_beside_jumps(
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate]:
-    """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
+    """The rotation axis from the longest part between jumps of the sample, if that part shows it clearly, otherwise
+    from all projections.
+    """
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
@@ -158,20 +165,22 @@ def locate_axis(
     *,
     all_there: bool = True,
 ) -> tuple[float, AxisEstimate]:
-    """Find the rotation axis, in columns of the full detector, from a band of rows of views spread over `frames`.
+    """Find the rotation axis, in columns of the full detector, from a band of rows of projections spread over
+    `frames`.
 
-    An estimate without a clear optimum gives way to what the file states. If it states nothing and the views are
-    `all_there`, the estimate gives way to views held out; those of a part of the turn would mislead, and those of half
-    a turn of a sample wider than the field.
+    If the estimate has no clear optimum, the axis stated in the file is used. If the file states none and the
+    projections are `all_there`, held-out projections find the axis. They would mislead if only a part of the turn
+    was measured, or 180 degrees of a sample wider than the field of view.
 
     Raises:
-        DataError: no axis in the search range explains the views.
+        DataError: no axis in the search range explains the projections.
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start, source = max(0, (height - _AXIS_ROWS) // 2), correction.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
-    hidden = band.masked.all(axis=0)  # columns behind slits, which were filled: their noise has a long lever
+    # columns behind slits, which were replaced; noise there has a large effect on the axis
+    hidden = band.masked.all(axis=0)
     lit = np.flatnonzero(~hidden | hidden.all())
     angles = source.table.angles[band.view_ids]
     try:
@@ -191,26 +200,28 @@ def locate_axis(
         warn(_unclear(axis_col))
         return axis_col, estimate
     warn(
-        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
-        "used. Check the slices, or give --axis COLUMN."
+        f"Check the slices, or give --axis COLUMN: the rotation axis found, column {axis_col:.2f}, is not "
+        f"a clear optimum, so the file's column {source.axis_col:.2f} is used."
     )
     return source.axis_col, estimate
 
 
 def _hides_matter(band: Projections) -> bool:
-    """Whether parts of rows that measured nothing in a view were filled with matter, whose place is a guess."""
+    """True if parts of rows without data in a projection were filled with sample material, whose place is a guess."""
     if not band.unmeasured.size or (lit := band.lit) is None:
         return False
     return bool(band.data[~lit & lit.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
 
 
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
-    """The axis of a sample wider than the field, or of a detector in part without beam; None: not found so either.
+    """The axis of a sample wider than the field of view, or of a detector partly without beam; None: not found this
+    way either.
 
-    A part without beam leaves it unsure: half a column, and more where the sample leaves the field, too.
+    A part without beam makes the axis uncertain by half a column, and by more if the sample also leaves the field of
+    projection.
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
-        return None  # columns would stay fine, and volumes take minutes
+        return None  # columns would not be binned, and volumes would take minutes
     dark, some, lit = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
     data = np.ascontiguousarray(band.data[some])
     with suppress(ValueError):
@@ -223,28 +234,30 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
 
 
 def stated_axis(source: ScanSource) -> float:
-    """The rotation axis stated by the file of a cone-beam scan, for a scan that is still running.
+    """The rotation axis stated by the file of a cone-beam scan that is still running.
 
     Raises:
-        DataError: it states none.
+        DataError: the file states none.
     """
     if source.axis_col is None:
         raise DataError(
-            f"{source.path} does not say where the rotation axis is, and that of a cone beam is not searched while "
-            "views come. Give it with --axis COLUMN (0 is the centre of the first column)."
+            "Give the rotation axis with --axis COLUMN (0 is the centre of the first column): "
+            f"{source.path} does not state it, and the axis of a cone beam cannot be searched during the "
+            "scan."
         )
     return source.axis_col
 
 
 def _not_found(source: ScanSource, error: Exception) -> DataError:
     return DataError(
-        f"{source.path}: the rotation axis was not found: {error}. Give it with --axis COLUMN (0 is the centre of "
-        "the first column)."
+        f"{source.path}: no rotation axis was found: {error}. Give it with --axis COLUMN (0 is the centre "
+        "of the first column)."
     )
 
 
 def _unclear(axis_col: float) -> str:
     return (
-        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum. Check the slices for doubled edges "
-        "(`beamline sweep FILE axis=A:B:STEP` compares columns), or give --axis COLUMN."
+        f"Check the slices for double edges, because the rotation axis found, column {axis_col:.2f}, is "
+        "not a clear optimum. `beamline sweep FILE axis=A:B:STEP` compares columns, and --axis COLUMN "
+        "sets one."
     )

@@ -1,4 +1,6 @@
-"""Consistency: conditions that hold for all views of a sample at rest, and light that matches its flats."""
+"""Consistency: conditions that all projections of a sample at rest must meet, and whether their intensity matches
+the flats.
+"""
 
 from __future__ import annotations
 
@@ -31,42 +33,56 @@ from recon.prep.tilt import roll_of_mean_view
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import circle_weights, covers_the_circle
 
-_VIEWS = 180  # more do not sharpen the moments, they only cost reading
-_COLUMN_VIEWS = 32  # whose columns are looked at
-_LEAST_VIEWS, _LEAST_ROWS = 12, 8  # with fewer rows nobody knows how much they disagree
-_HALF_A_PIXEL = 0.5  # doubles edges as far as the resolution, as for the monitor's `opposite`
-_MOST_OF_THEM = 5, 95  # percent of views: one that a crumb crosses does not count
-_NOISE = 3.3  # standard deviations between these percentiles, of noise alone
-_ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
-_STEP_OF_LIGHT = 0.1  # of line integral, as the monitor's alarm `gain`
-_OF_LOCAL = 3.0  # times the change to the next view, as angles differ by so much
-_BESIDE = np.radians(4.1)  # a slab 20 times as long as thick, wider than the field, is no spike in views so dense
-_MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
-_MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
-_FEW = 0.2  # of the views: so many are named, however far they are off
-_STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
-# Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
+_VIEWS = 180  # projections used for the moments; more do not make them more accurate, they only take time to read
+_COLUMN_VIEWS = 32  # projections whose columns are examined
+_LEAST_VIEWS, _LEAST_ROWS = 12, 8  # with fewer rows, the disagreement between rows cannot be estimated
+_HALF_A_PIXEL = 0.5  # a larger shift doubles edges visibly; the same limit as of the monitor's check `opposite`
+# percentiles over the projections: a single projection with a particle in front of the sample does not count
+_MOST_OF_THEM = 5, 95
+_NOISE = 3.3  # distance of these percentiles in standard deviations, if there is only noise
+_ACROSS = 1.0  # columns. A teapot with 12 % beam hardening has 0.7, a measured tooth 0.5
+_STEP_OF_LIGHT = 0.1  # line integral; the same limit as of the monitor's alarm `gain`
+_OF_LOCAL = 3.0  # times the change to the next projection, because opposite angles may differ by up to one step
+# radians. With steps this small, even a slab 20 times as long as thick and wider than the field makes no single
+# outlier
+_BESIDE = np.radians(4.1)
+# share of the total absorption (as the monitor's `mass`); standard deviations of most projections
+_MASS, _OUTLIERS = 0.03, 6.0
+# share between these percentiles of the projections: Diamond 24737 has 0.011, a tooth 0.019
+_MASSES, _TENTHS = 0.06, (10, 90)
+_FEW = 0.2  # share of the projections up to which outliers are named one by one, however large they are
+# relative error of the angular range. A thorax with 12 % hardening has 0.011, measured scans up to 0.009, 60 other
+# scans at rest less
+_STRETCH = 0.015
+# In steps: how close the measured range must be to the other way of counting the ends of a 180° or 360° scan (with or
+# without both ends, a step apart). Found in 31 of 40 scans with this error, and in none of 232 without it.
 _OF_A_STEP = 1 / 3
-_BESIDE_ROW = 8  # rows on both sides of the plane of the source that count as in it
-_OFTEN, _AGREE, _FAN = 1.3, 0.01, 2.5  # times the least disagreement, which is a share of the variance; degrees
-_SAME_AXIS = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
-_FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
-_FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
-_AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
+_BESIDE_ROW = 8  # rows above and below the plane of the source that count as in the plane
+# times the least disagreement; the least disagreement as a share of the variance; degrees
+_OFTEN, _AGREE, _FAN = 1.3, 0.01, 2.5
+# columns between the axis found from the moments and the axis used; beyond that, angles are not checked
+_SAME_AXIS = 1.0
+_FAINT = 0.3  # line integral. In fainter samples, the error that the air may have at an edge is a large part
+# share of pixels below the smallest transmission, whose line integrals are too small; another warning reports them
+_FLOORED = 1e-3
+# share of the largest line integral; an edge may have that much although the sample is inside the field of view
+_AIR = 0.1
 _SURE = 4.0  # standard deviations
 # Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
-_SCALED = ", as one also seems to where the pixel size differs from view to view"  # in width and height alike
+_SCALED = ". A difference in pixel size between the projections looks the same"  # in width and height alike
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
 @dataclass(frozen=True)
 class ConsistencyCondition:
-    """A consistency condition of all views of a sample at rest, and the residual that the views leave in it.
+    """A condition that all projections of a sample at rest must meet, and by how much they violate it.
 
     Attributes:
-        tolerance: more is reported; by hardening, phase and scatter in scans at rest, and by the views' noise.
-        sentence: where and how it is broken, and what to do.
+        residual: by how much the condition is violated, in `unit`.
+        tolerance: larger residuals are reported. Hardening, phase, scatter and noise cause smaller ones in scans at
+            rest.
+        sentence: what was found, where, and what to do.
     """
 
     name: str
@@ -84,13 +100,12 @@ class ConsistencyCondition:
 
 
 def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelection, warn: Warn) -> dict[str, str]:
-    """Warn of consistency conditions that the views violate; returns the residual of each in words, by name.
+    """Warn of consistency conditions that the projections violate; returns the residual of each in words, by name.
 
-    Angles, heights, turned frames, masses and an axis that moments of the views disagree with, which hold for a
-    parallel beam and a sample within the field; and for others, whether views of the same rays agree. Moments of a part
-    of the rows are passed over: those of Diamond
-    24737 above its metal seem to turn by 14 % more, for a reason that is not known. Views that measured a part of their
-    pixels are left out.
+    In a parallel beam, with the sample inside the field of view, moments of the projections check angles, heights,
+    turned frames, total absorption and the rotation axis. In other scans, projections of the same rays are compared.
+    The moments are not checked for a part of the rows: those of Diamond 24737 above its metal indicate a range of
+    angles 14 % too large, for an unknown reason. Projections that measured only a part of their pixels are left out.
     """
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)
@@ -106,7 +121,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
 
 
 def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[ConsistencyCondition]:
-    """The conditions that these views have to obey; `whole`: all rows of the detector are there."""
+    """The conditions that apply to this scan; `whole`: the data contain all detector rows."""
     geometry, data = prepared.geometry, prepared.projections.data
     some = spread(np.arange(len(data)), _VIEWS)
     edges, frames = FieldEdges.of(data, geometry), prepared.projections.view_ids
@@ -127,14 +142,14 @@ def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[Consis
 
 
 def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[ConsistencyCondition]:
-    """Laws of parallel views that show the whole sample, by some of the views."""
+    """Conditions for parallel projections that show the whole sample, from a subset of the projections."""
     geometry, data = prepared.geometry, prepared.projections.data
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
     shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
     masses = _masses(shown, angles, frames, of_mass)
-    if masses.broken:  # such views spoil the other moments
+    if masses.broken:  # such projections falsify the other moments
         return [masses]
     near = abs(shown.axis_col - geometry.axis_col) <= _SAME_AXIS
     turn = _angles(shown, geometry.angles)
@@ -146,18 +161,18 @@ def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np
 def compare_with_flats(
     scan: ScanEvidence, selection: ScanSelection, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
-    """Warn of views whose light does not match their flats; returns in words how bright their air is relative to the
-    flats.
+    """Warn of projections whose intensity does not match their flats. Returns in words how bright their air is
+    relative to the flats.
 
     Args:
         refused: a difference that no beam has is an error.
 
     Raises:
-        DataError: such a difference, and the references are checked.
+        DataError: the difference is larger than any beam's, and the flats and darks are checked.
     """
     if scan.beam is None or not len(projections.data):
         return {}
-    said = selection.step(Air).model != "auto"  # columns that are said to be air
+    said = selection.step(Air).model != "auto"  # the user states which columns are air
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
@@ -174,16 +189,25 @@ def compare_with_flats(
 
 
 def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
-    """How faint matter is: above 1 it may leave the field unnoticed, corrected as air, which moments do not bear.
-    Whether edges are far from 0, as where the light drifts without --air: such air has moments, too."""
+    """Two facts about the edges: how weakly the sample absorbs, and whether the air is far from zero.
+
+    Returns:
+        Faintness. Above 1, material that leaves the field of view may go unnoticed, because it is corrected as air;
+        the moments are not valid then.
+        True if the edges are far from 0, for example if the beam drifts and --air does not correct it: such air
+        contributes to the moments.
+    """
     edges = np.abs([np.median(data[view][:, [0, -1]]) for view in some])
     deepest = float(np.median([data[view].max() for view in some]))
     return _FAINT / max(deepest, 1e-6), float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
 
 
 def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[float, float]:
-    """Standard deviations of a view's mass, by the noise of its pixels and of the air it was divided by, and of its
-    centre of mass in columns, by the slope of the line through that air, which all rows share."""
+    """Standard deviations of the total absorption of a projection, and of its centre of mass in columns.
+
+    The first comes from the noise of the pixels and of the air by which the projection was divided. The second comes
+    from the slope of the line through that air, which is the same for all rows.
+    """
     mass = float(np.median([view.sum(dtype=np.float64) for view in views]))
     if not mass > 0:
         return np.inf, np.inf
@@ -191,7 +215,8 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
     air = [rows * columns for columns in prepared.projections.air_columns if columns]
     pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / sum(air) if air else 0.0)
     slope = rows * cols**2 / 12 * float(np.sqrt(sum(1 / n for n in air))) if len(air) > 1 else 0.0
-    some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]  # that it reads: all together may not fit
+    # only these are read, because all together may not fit in memory
+    some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]
     noise = noise_level(np.stack(some)) / mass
     return noise * float(np.sqrt(pixels)), noise * slope
 
@@ -199,7 +224,7 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
 def _steady(
     data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]
 ) -> ConsistencyCondition:
-    """Views half a turn apart are mirror images, where no air tells of the light."""
+    """Projections 180° apart must be mirror images; used if no air shows the intensity."""
     reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
     around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
     levels = np.array([np.median(data[view][:, around]) for view in some])
@@ -211,22 +236,25 @@ def _steady(
     first, last = np.unravel_index(int(change.argmax()), change.shape)
     size = float(max(change[first, last], 0)) if opposite.any() else np.nan
     what = (
-        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, half a turn apart, see one and the "
-        f"same matter, but differ by {abs(levels[first] - levels[last]):.2f} of line integral"
+        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, show the same "
+        f"sample but differ by {abs(levels[first] - levels[last]):.2f} in line integral"
     )
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
-        size, more = odd, f"by {odd:.2f} of line integral more than these change"
-        what = f"Frame {frames[at]} differs as a whole from those beside it, {more}"
+        size, more = odd, f"by {odd:.2f} in line integral more than these differ from each other"
+        what = f"Frame {frames[at]} as a whole differs from its neighbours in angle, {more}"
     sentence = (
-        f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
-        "another scan are among them. Choose views that belong together with --views, or say which columns are air."
+        f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
+        "filter changed, or projections of another scan are among them. Use --views to choose "
+        "projections that belong together, or --air to state which columns are air."
     )
     return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
 
 
 def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
-    """The view most out of line with its neighbours in angle, and by how much more than these differ otherwise."""
+    """The projection that differs most from its neighbours in angle, and by how much more than the neighbours
+    differ.
+    """
     order = np.argsort(angles, kind="stable")
     steps = np.diff(levels[order])
     there, back = steps[1:-2], steps[2:-1]
@@ -238,34 +266,37 @@ def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
 
 
 def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: float) -> ConsistencyCondition:
-    """One mass in all views, but for what hardening makes of the longer side of a sample, twice a turn."""
+    """The total absorption must be the same in all projections, except for hardening along the longer side of a
+    sample, which varies twice a turn.
+    """
     parts = np.column_stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
     rest = shown.mass - parts @ np.linalg.lstsq(parts, shown.mass, rcond=None)[0]
     low, high = np.percentile(rest, _TENTHS)
     tolerance = max(_MASSES, 2 * _NOISE * noise)
     limit = max(_MASS, _OUTLIERS * median_deviation(shown.mass))
     odd = np.abs(shown.mass) > limit
-    because = "where a sample within the field has one mass in all views"
+    because = "a sample inside the field of view has the same total absorption in all projections"
     if odd.any() and (high - low <= tolerance or odd.mean() < _FEW):
         most = shown.mass[odd][np.abs(shown.mass[odd]).argmax()]
         sentence = (
-            f"{count(int(odd.sum()), 'view')} of {odd.size} looked at ({frames_text(frames[odd])}) with "
-            f"{most:+.1%} matter beside the others, at most, {because}: something else stood in the beam, or the light "
-            "is wrong. Look at them; --views leaves them out."
+            f"Look at these frames: {count(int(odd.sum()), 'projection')} of {odd.size} checked "
+            f"({frames_text(frames[odd])}) {'differs' if odd.sum() == 1 else 'differ'} from the others by "
+            f"up to {most:+.1%} in total absorption, but {because}. Something else stood in the beam, or "
+            "the intensity is wrong. --views leaves projections out."
         )
         return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the mass", sentence)
     sentence = (
-        f"The mass of the views changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%}, {because}: it is least "
-        f"in frame {frames[shown.mass.argmin()]} and greatest in frame {frames[shown.mass.argmax()]}. Did the energy "
-        "or the sample change within the scan, or are views of another scan, exposure or reference among them? Choose "
-        "views that belong together with --views (every:2, where two lights take turns); --volumes where the sample "
-        "changes."
+        f"The total absorption changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%} during the "
+        f"scan (lowest in frame {frames[shown.mass.argmin()]}, highest in frame "
+        f"{frames[shown.mass.argmax()]}), but {because}. Did the energy or the sample change, or do some "
+        "projections belong to another scan, exposure or flat field? Use --views to choose projections "
+        "that belong together (every:2 if two intensities alternate), or --volumes if the sample changes."
     )
     return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the mass", sentence)
 
 
 def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
-    """The law that the mean view of a full turn is its own mirror image about the axis, in a cone, too."""
+    """In a 360° scan the mean projection is its own mirror image about the axis, also in a cone beam."""
     weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
     mean = np.zeros(data.shape[1:])
     for view, weight in zip(some, weights, strict=True):
@@ -275,15 +306,15 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
         return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
-        f"The rotation axis seems to lean by {tilt_text(roll, sigma)} in the detector's plane, {abs(roll) * rows:.1f} "
-        f"px over {rows} rows: edges double in the first and last slices. Give --calibrate axis,roll with an iterative "
-        "method, such as -m fista-tv."
+        "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis "
+        f"seems to be tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} "
+        f"px over {rows} rows. Otherwise edges are doubled in the first and last slices."
     )
     return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
 
 
 def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
-    """Rays measured from both sides of a full turn agree, by the rows next to the plane of the source."""
+    """Rays measured from both sides in a 360° scan must agree; checked in the rows next to the plane of the source."""
     row = int(np.clip(geometry.axis_row if geometry.is_cone else data.shape[1] / 2, 0, data.shape[1] - 1))
     rows = slice(max(row - _BESIDE_ROW, 0), row + _BESIDE_ROW + 1)
     pitch, across = geometry.pixel_pitch, max(geometry.axis_col, data.shape[2] - 1 - geometry.axis_col)
@@ -293,13 +324,15 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     told, shown = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
     away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
     check = (
-        "Check --cone SOD:SDD: both are in mm, and SDD goes from the source to the detector, not from the axis."
+        "Check --cone SOD:SDD: both are in mm, and SDD is the distance from the source to the detector, "
+        "not from the axis."
         if geometry.is_cone
-        else "If the beam is a cone, give --cone SOD:SDD in mm; without, densities and shapes are wrong."
+        else "If the beam is a cone, give --cone SOD:SDD in mm. Without it, densities and shapes are wrong."
     )
     sentence = (
-        f"The views disagree with the stated geometry: rays that are measured from both sides agree for a fan of "
-        f"{shown:.3g} degrees across the detector{away} instead of {told:.3g}. {check}"
+        f"{check} The projections contradict the stated geometry: rays that were measured from both sides "
+        f"agree for a fan of {shown:.3g} degrees across the detector{away}, but the stated fan has "
+        f"{told:.3g} degrees."
     )
     sure = off > _OFTEN * least and least < min(_AGREE, usual / 2)  # a round sample agrees for every fan
     return ConsistencyCondition(
@@ -310,9 +343,10 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
 def _across(shown: ViewMoments) -> ConsistencyCondition:
     left, right = np.percentile(shown.across, _MOST_OF_THEM)
     sentence = (
-        f"The centre of mass leaves its way about the axis by {right - left:.1f} columns, from one view to another "
-        f"(uncertain by {shown.across_sigma:.2g}): the sample or the stage moved across, or frames are not those of "
-        "their angles. Give --calibrate shifts, or --poses; --volumes where the sample changes."
+        "The sample or the stage moved sideways, or frames have wrong angles: the centre of mass strays "
+        f"by {right - left:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
+        "rotating sample. Use --calibrate shifts or --poses to correct it, or --volumes if the sample "
+        "changes."
     )
     tolerance = max(_ACROSS, 2 * _NOISE * shown.across_sigma)
     return ConsistencyCondition("centre of mass on a sine", float(right - left), tolerance, "columns", sentence)
@@ -321,10 +355,11 @@ def _across(shown: ViewMoments) -> ConsistencyCondition:
 def _heights(shown: ViewMoments) -> ConsistencyCondition:
     low, high = np.percentile(shown.down, _MOST_OF_THEM)
     sentence = (
-        f"From view to view the matter stands up to {high - low:.1f} rows higher or lower (from {shown.down[0]:+.1f} "
-        f"rows in the first view to {shown.down[-1]:+.1f} in the last; uncertain by {shown.down_sigma:.2g}), where "
-        "each row of a sample at rest holds one mass in all views: slices are blurred across rows. Give --calibrate "
-        "shifts where the sample or the stage moved, or --poses; --volumes where the sample changes."
+        "Slices are blurred vertically: from projection to projection the sample moves by up to "
+        f"{high - low:.1f} rows (from {shown.down[0]:+.1f} rows in the first to {shown.down[-1]:+.1f} in "
+        f"the last; uncertainty {shown.down_sigma:.2g}). For a sample at rest, each row has the same "
+        "total absorption in all projections. Use --calibrate shifts or --poses if the sample or the "
+        "stage moved, or --volumes if the sample changes."
     )
     known = np.isfinite([*shown.down, shown.down_sigma]).all()
     tolerance = max(_HALF_A_PIXEL, 2 * _NOISE * shown.down_sigma)
@@ -334,10 +369,11 @@ def _heights(shown: ViewMoments) -> ConsistencyCondition:
 def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> ConsistencyCondition:
     span = float(np.degrees(np.ptp(angles)))
     sentence = (
-        f"The views seem to turn by {span * (1 + shown.stretch):.4g} degrees, and are stated to turn by {span:.4g} "
-        f"({shown.stretch:+.1%} ± {shown.stretch_sigma:.1%}, by the moments of their rows). Are the angles those of "
-        "another scale or range, are views missing within the scan, or did the sample move? Give the right angles with "
-        "--angles FILE (degrees, one a line), or compare slices made with them."
+        f"The angles seem wrong: the projections seem to cover {span * (1 + shown.stretch):.4g} degrees, "
+        f"but the stated angles cover {span:.4g} ({shown.stretch:+.1%} ± {shown.stretch_sigma:.1%}, from "
+        "the moments of their rows). Do the angles have another scale or range, are projections missing "
+        "within the scan, or did the sample move? Give the right angles with --angles FILE (degrees, one "
+        "per line), or compare slices made with different angles."
     )
     tolerance = max(_STRETCH, _SURE * shown.stretch_sigma)
     return ConsistencyCondition(
@@ -346,8 +382,12 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> ConsistencyCond
 
 
 def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
-    """A sentence where the angles are spread over half a turn or a turn with both ends, and the views without, or the
-    reverse: by what the first and the last view show, and by the excess of the turn over the stated one."""
+    """A sentence if the ends of a 180° or 360° scan are counted wrongly: the stated angles include both ends and the
+    projections do not, or the reverse.
+
+    It is found from the first and the last projection, and from the difference between the measured and the stated
+    range.
+    """
     order = np.argsort(geometry.angles, kind="stable")
     (first, second, *_, late, last), span = order, float(np.ptp(geometry.angles))
     step = span / (order.size - 1)
@@ -363,18 +403,20 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     alike = change < of_step / 2  # 0 and noise where they are of one ray, 1 where they are a step apart
     if alike == closed or not abs(stretch * order.size + (1 if closed else -1)) < _OF_A_STEP:
         return ""
-    what = "a step apart" if closed else "of the same rays"
+    what = "directions one step apart" if closed else "the same rays"
     return (
-        f"The first and the last view are {what}, where the stated angles {'have' if closed else 'lack'} both ends of "
-        f"{math.degrees(turn):.4g} degrees: the step is {'too large' if closed else 'too small'}, by 1 in {order.size}."
+        f"The first and the last projection show {what}, but the stated angles "
+        f"{'include' if closed else 'do not include'} both ends of {math.degrees(turn):.4g} degrees. The "
+        f"angular step is {'too large' if closed else 'too small'}, by 1 in {order.size}."
     )
 
 
 def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> ConsistencyCondition:
-    """Views of the same rays, early and late, show one sample, in any beam and however wide it is.
+    """Projections of the same rays, early and late in the scan, must show the same sample, in any beam and for any
+    sample width.
 
     Args:
-        faint: the least reported changes are so many times as large: a beam whose shape drifts looks like them.
+        faint: factor on the smallest changes that are reported, because a beam whose shape drifts looks like them.
     """
     worst, sentence = np.nan, ""
     for (first, later), between, change, sigma in changes_seen(data, geometry):
@@ -384,10 +426,11 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
         if not off.max() <= worst:
             worst = float(off.max())
             sentence = (
-                f"Frames {frames[first]} and {frames[later]}, as others that see the same rays at two times, show "
-                f"another sample: it becomes {', '.join(np.array(words)[off > 1])}"
-                f"{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. One volume blurs what changes: "
-                "give --volumes N for several in time, --calibrate shifts where the sample moved as a whole, or "
-                "--views for a part of the scan."
+                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure "
+                "the same rays at two times, and in the later one the sample is "
+                f"{', '.join(np.array(words)[off > 1])}{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. "
+                "Other such pairs show the same. One volume blurs what changes. Use --volumes N for "
+                "several volumes in time, --calibrate shifts if the sample moved as a whole, or --views "
+                "for a part of the scan."
             )
     return ConsistencyCondition("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)

@@ -1,4 +1,4 @@
-"""Correction of a scan's frames by one plan: at once, in batches, or as they come while the scan still runs."""
+"""Correction of a scan's frames with one plan: all at once, in batches, or one by one during the scan."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from recon.prep.counts_plan import CorrectionPlan, UnlitViewsError
 from recon.prep.lines_plan import LinesPlan
 from recon.prep.projections import Projections, merge_and_empty
 
-_COPIES = 3  # float32 copies of the views that are corrected at once
-_STEPS = 3  # of a frame: it is read, divided by the flat, and freed of spots
+_COPIES = 3  # float32 copies of the projections that are corrected at once
+_STEPS = 3  # steps per frame in the progress: reading, dividing by the flat, removing zingers
 NO_VIEWS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class ScanCorrectionPlan:
-    """What converts the frames of one scan to line integrals, in the rows and with the binning of a selection.
+    """How the frames of one scan are converted to line integrals, for the rows and the binning of a selection.
 
     Attributes:
-        filters: of views, with the rows and the binning.
-        beam: the open beam; None: the frames are line integrals.
-        preparation: of the selection; logarithms where filters mix pixels.
-        shadow: what stands in the beam of all views; None: not looked for.
+        filters: of projections, with the rows and the binning.
+        beam: the open beam; None: the frames are line integrals already.
+        preparation: of the selection; logarithms if filters mix pixels.
+        shadow: what stands in the beam of all projections; None: not searched for.
     """
 
     filters: ViewFilters
@@ -73,7 +73,9 @@ class ScanCorrectionPlan:
         )  # fmt: skip
 
     def in_shadow(self, source: ScanSource, views: NDArray[np.int64]) -> ScanCorrectionPlan:
-        """The plan with what stands in the beam of all views of a finished scan, as some of these show it."""
+        """The plan with the objects that stand in the beam of all projections of a finished scan, found in some of
+        these.
+        """
         read, n = self.filters.read(None), self.filters.selection.binning
         if not source.finished:
             return self
@@ -86,12 +88,13 @@ class ScanCorrectionPlan:
 def survey(
     scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
 ) -> ScanCorrectionPlan:
-    """Read the reference frames that the scan has, and of a finished scan some views.
+    """Read the reference frames that the scan has, and some projections of a finished scan.
 
-    Groups of references with a fault are used only where no other is left.
+    Groups of references with a fault are used only if no other group is left.
 
     Args:
-        views: rows of the file, usable views that show what stands in the beam of all; none: it is not looked for.
+        views: rows of the file: usable projections, in which objects that stand in the beam of all are searched for;
+            empty: no search.
 
     Raises:
         ConfigError: rows or binning that do not fit the detector; counted photons of a scan without counts, or
@@ -108,46 +111,46 @@ def survey(
     if source.quantity == "counts":
         beam = OpenBeam.of(scan, selection, filters.read(None), warn)
     elif asked.noise == "counts":
-        raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
+        raise ConfigError(f"Omit --noise counts: {source.path} contains line integrals, not counts.")
     elif asked.by_current:
-        current_scale(scan)  # refuses a file without any
+        current_scale(scan)  # raises an error if the file has no ring current
     plan = ScanCorrectionPlan(filters, beam, asked)
     return plan.in_shadow(source, views) if views.size else plan
 
 
 @contextmanager
 def refused(source: ScanSource, asked: Preparation) -> Iterator[None]:
-    """Turn what is wrong with numbers into a DataError that names the file."""
+    """Turn a ValueError about the numbers into a DataError that names the file."""
     try:
         yield
     except UnlitViewsError as error:
-        advice = "" if asked.judged else " (--flags judge leaves out what the monitor finds dark)"
+        advice = "" if asked.judged else " (--flags judge leaves out frames that the monitor finds dark)"
         raise DataError(
-            f"{source.path} cannot be corrected: {error}{advice}; if the sample covers these columns, --air none"
+            f"{source.path} cannot be corrected: {error}{advice}. If the sample covers these columns, give --air none"
         ) from error
     except ValueError as error:
         raise DataError(f"{source.path} cannot be corrected: {error}") from error
 
 
 class ScanCorrection:
-    """Converts frames of one scan to line integrals by its plan.
+    """Converts frames of one scan to line integrals with its plan.
 
-    `at_once` corrects frames that are all there. `feed` takes them in batches as they come. It gives the same line
-    integrals to the bit, as long as the references and the air columns stay the same. `outdated` says when they did
-    not. Then `renewed` corrects by what is known now.
+    `at_once` corrects frames that are all present. `feed` takes them in batches as they arrive. Both give
+    bit-identical line integrals as long as the references and the air columns stay the same. `outdated` is True when
+    they have changed; `renewed` then corrects with what is known now.
     """
 
     def __init__(
         self, scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
     ) -> None:
-        """Survey the scan; arguments and errors are those of `survey`."""
+        """Read references and some projections; arguments and errors are those of `survey`."""
         self.plan = survey(scan, selection, warn, views)
         self.rows, self.binning = selection.detector_rows, selection.binning
         self._scan, self.source, self._selection = scan, scan.source, selection
         references = None if self.plan.beam is None else self.plan.beam.references
         self._reader = ViewReader(scan, selection, self.plan.filters, references, warn)
-        self._stream: CorrectionPlan | LinesPlan | None = None  # with the views fed so far
-        self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
+        self._stream: CorrectionPlan | LinesPlan | None = None  # with the projections fed so far
+        self._columns: set[tuple[int, int]] = set()  # air columns with which projections were corrected
         self._fed = NO_VIEWS
 
     def at_once(
@@ -156,19 +159,21 @@ class ScanCorrection:
         rows: slice | None = None,
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
-        """Line integrals of `frames` (rows of the file), without views that have no finite pixel: see `view_ids`.
+        """Line integrals of `frames` (rows of the file), without projections that have no finite pixel: see
+        `view_ids`.
 
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            progress: how many of how many frames are done; each is read, divided by the flat, and freed of spots.
+            progress: how many of how many frames are done; each is read, divided by the flat, and cleared of
+                zingers.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
         steps = 1 if self.plan.beam is None else _STEPS
         data, usable = self._reader.read(frames, rows, lambda n, of: progress(n // steps, of))
-        if rows is None:  # in a band it says nothing of the views
+        if rows is None:  # a band of rows does not show whether a projection is usable
             self._reader.tell_unlit(frames, usable)
         if not (n := usable.size):
             raise self._reader.no_view()
@@ -194,8 +199,8 @@ class ScanCorrection:
         """
         if self.plan.beam is not None and self.plan.beam.photons is not None:
             raise DataError(
-                f"{self.source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
-                f"{2 * self.binning}."
+                f"{self.source.path}: --noise counts needs all projections in memory. Give --noise log, "
+                f"or --bin {2 * self.binning}."
             )
         in_time, frames = np.sort(frames), frames[_by_angle(self.source.table, frames)]
         parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
@@ -218,7 +223,7 @@ class ScanCorrection:
         self._reader.tell_unlit(in_time, ids)
         if not ids.size:
             raise self._reader.no_view()
-        for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the views that are left out
+        for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
             if at != place:
                 out[at] = out[place]
         masked = np.logical_and.reduce([part.masked for part in kept])
@@ -241,17 +246,17 @@ class ScanCorrection:
     def _next(
         self, data: NDArray[Any], frames: NDArray[np.int64], plan: Plan, last: bool
     ) -> tuple[Projections | None, Plan]:
-        """Line integrals of the next frames, None where none is ready; and the plan of those that follow."""
+        """Line integrals of the next frames, None if none is ready; and the plan of those that follow."""
         if not frames.size and not (last and plan.spots.waiting is not None):
             return None, plan
         lines, plan = apply(data, frames.astype(np.float64), plan, frames, last=last)
         return self.plan.filters.apply(lines, None), plan
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
-        """Line integrals of the next frames; None while none is ready: the newest view waits for its successor.
+        """Line integrals of the next frames; None while none is ready: the newest projection waits for the next one.
 
         Args:
-            frames: rows of the file, those after the frames fed before; may be none where `last`.
+            frames: rows of the file, those after the frames fed before; may be none if `last`.
             last: no frame will come after these.
 
         Raises:
@@ -268,18 +273,18 @@ class ScanCorrection:
         return lines
 
     def newest(self) -> Projections | None:
-        """Line integrals of the newest view, which still waits for its successor, as if none followed.
+        """Line integrals of the newest projection, which still waits for the next one, as if none followed.
 
-        It keeps waiting, because all its spots show only beside both neighbours.
+        It keeps waiting, because all its zingers are found only if both neighbours are known.
         """
         none = np.empty((0, 0, 0), np.float32)
         return None if self._stream is None else self._next(none, NO_VIEWS, self._stream, last=True)[0]
 
     def open_beam(self, most: int) -> NDArray[np.float32]:
-        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
+        """Line integrals [frame, row, col] of at most N consecutive flats, corrected like projections.
 
-        They are scaled so that their noise is that of the exposure of a view. No frame where the scan has line
-        integrals already.
+        They are scaled so that their noise is that of the exposure of a projection. No frames if the scan contains
+        line integrals already.
 
         Raises:
             DataError: as `at_once`.
@@ -292,8 +297,8 @@ class ScanCorrection:
 
     @property
     def outdated(self) -> bool:
-        """Whether views already fed would now be corrected differently: by references that came later, other air
-        columns, or neighbours in angle that were not taken beside them.
+        """True if projections already fed would now be corrected differently: references came later, the air columns
+        changed, or neighbours in angle were not known then.
         """
         finds_spots = np.isfinite(self.plan.preparation.zinger_threshold)
         if finds_spots and (np.diff(_by_angle(self.source.table, self._fed)) != 1).any():
@@ -304,7 +309,9 @@ class ScanCorrection:
         return then != now or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
+        """True if `feed` took an object that stands in the beam of all these projections of a finished scan for
+        sample.
+        """
         shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self.source, views).shadow
         return shadow is not None and any(part.any() for part in shadow)
 
@@ -315,22 +322,24 @@ class ScanCorrection:
         return other
 
     def renewed(self, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrection:
-        """A correction with all references recorded by now; `views` as of `survey`."""
+        """A correction with all references recorded by now; `views` as in `survey`."""
         return ScanCorrection(self._scan.renewed(), self._selection, self._reader.warn, views)
 
 
 def line_integrals_of(scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64]) -> Projections:
-    """Line integrals of some frames of a finished scan, corrected for themselves and without a warning.
+    """Line integrals of some frames of a finished scan, corrected on their own and without a warning.
 
     Raises:
-        ConfigError, DataError: as of `survey` and `ScanCorrection.at_once`.
+        ConfigError, DataError: as in `survey` and `ScanCorrection.at_once`.
     """
     return ScanCorrection(scan, selection, lambda sentence: None, frames).at_once(frames)
 
 
 def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
-    """The order of frames in which neighbours are beside each other: as taken, unless that skips angles or has the
-    sample aside in some, which then come together.
+    """The order of frames in which neighbours in angle follow one another.
+
+    It is the order of the scan, unless that skips angles, or the sample is offset in some frames; these are then
+    grouped.
     """
     angles, places = table.angles[frames], np.zeros(frames.size)
     if table.aside is not None:
@@ -341,7 +350,7 @@ def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def at_once_memory(source: ScanSource, selection: ScanSelection, frames: int, rows: slice | None = None) -> int:
-    """Memory in bytes for correcting so many frames at once, line integrals included; `rows` as in `at_once`.
+    """Memory in bytes for correcting N frames at once, line integrals included; `rows` as in `at_once`.
 
     Raises:
         ConfigError: the selection does not fit the scan.

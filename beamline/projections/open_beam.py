@@ -1,4 +1,6 @@
-"""The open beam of a scan: its darks and flats, ring current and photons, and what stands in the beam of all views."""
+"""Open beam of a scan: darks and flats, ring current, photon statistics, and objects that stand in the beam of all
+projections.
+"""
 
 from __future__ import annotations
 
@@ -33,24 +35,26 @@ from recon.prep.lines_plan import LinesPlan
 from recon.prep.references import SHADOW_REACH, References, shadowed
 from recon.prep.unmeasured import foreign_rows
 
-_LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
+# for an object in the beam: fewest and most projections that are examined, and rows at a time
+_LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64
 
-# bool [row, col], objects in the beam of all views; bool [row], rows in which objects come and go that are not of the
+# bool [row, col], objects in the beam of all projections; bool [row], rows in which objects other than the sample come
+# and go
 # sample (`foreign_rows`).
 Shadow = tuple[Mask, Mask]
 
 
 @dataclass(frozen=True, eq=False)
 class OpenBeam:
-    """The open beam that divides the views of a scan in counts.
+    """The open beam by which the projections of a scan in counts are divided.
 
     Attributes:
         references: of the detector rows that are read, binned.
         settings: of the correction.
         photons: how pixels count photons; None: logarithms are taken.
-        light: float64 [frame], by how much that of a view grows to the usual exposure and, where it is asked for, the
-            median ring current; None: all views are alike.
-        done: what flats, defects and noise came to, by these names.
+        light: float64 [frame], factor to the usual exposure and, if asked for, to the median ring current; None: 1
+            for all.
+        done: what was done about flats, defects and noise, by these names.
     """
 
     references: References
@@ -65,10 +69,11 @@ class OpenBeam:
 
         Args:
             read: detector rows that are read.
-            warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
+            warn: takes a sentence on damaged frames, on zingers, and on parts of the scan without flats.
 
         Raises:
-            ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
+            ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring
+                current.
             DataError: references that cannot be used.
         """
         asked = selection.step(Preparation)
@@ -98,7 +103,7 @@ class OpenBeam:
         return cls(references, settings, photons, light, done)
 
     def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
-        """What stands in the beam of all views, judged from some of these; None if they are too few to tell.
+        """Objects in the beam of all projections, found in some of these; None if they are too few.
 
         Args:
             first: the detector row at which the rows read begin.
@@ -120,7 +125,7 @@ class OpenBeam:
 
 
 def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
-    """As `OpenBeam.shadow`, of line integrals, in which nothing tells what stands there in all views."""
+    """As `OpenBeam.shadow`, for line integrals, which do not show objects that stand still in all projections."""
     if views.size < SHADOW_VIEWS:
         return None
     some = spread(views, SHADOW_VIEWS)
@@ -129,19 +134,19 @@ def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, 
     return np.zeros(lines.data.shape[1:], np.bool_), foreign
 
 
-_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
-_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
+_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's range on either side
+_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not make the gain more accurate, they only take time to read
 
 
 def photons_of(scan: ScanEvidence, references: References, selection: ScanSelection) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
-    The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
-    of the largest group of darks.
+    The gain is that of the selection, or from the photon transfer of the largest group of flats. The readout noise
+    is that of the largest group of darks.
 
     Raises:
-        ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
-            the open beam too many or too few for any detector.
+        ConfigError: counts are asked for, and the flats do not determine the gain. Or the gain given makes the
+            photons of the open beam too many or too few for any detector.
     """
     model = selection.step(Preparation)
     if model.noise == "log":
@@ -154,13 +159,13 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (scan.used.flats, scan.used.darks)
     )
-    if model.gain is not None:  # a mean of n pixels has n times as many photons a count
+    if model.gain is not None:  # a mean of n pixels has n times as many photons per count
         light = _counts_of_light(references) * binning**2 / model.gain
         low, high = _PHOTONS
         if not low <= light <= high:
             raise ConfigError(
-                f"--gain {model.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
-                f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
+                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} means {light:.3g} "
+                f"photons per pixel in the open beam of {source.path}; expected {low:g} to {high:g}."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
         photons = Photons(model.gain / binning**2, variance)
@@ -171,9 +176,10 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
             if model.noise == "auto":
                 return None
             raise ConfigError(
-                f"--noise counts: {source.path} does not show the counts per photon: {error}. Give --gain COUNTS."
+                "Give --gain COUNTS for --noise counts, because the counts per photon could not be found "
+                f"in {source.path}: {error}."
             ) from error
-    # A mean of n frames has n times as many photons a count, too; flats and darks are single frames.
+    # A mean of n frames also has n times as many photons per count; flats and darks are single frames.
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
     if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
         return None
@@ -181,7 +187,7 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons per pixel in the open beam, the median of the flats where the beam is, see `lit_places`."""
+    """Photons per pixel in the open beam, the median of the flats inside the beam, see `lit_places`."""
     return _counts_of_light(references) / photons.gain
 
 
@@ -191,11 +197,11 @@ def _counts_of_light(references: References) -> float:
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:
-    """How counts are converted to line integrals, in words; empty if by logarithms."""
+    """How counts are converted to line integrals, in words; empty if with logarithms."""
     if photons is None:
         return ""
     light, readout = light_of(references, photons), photons.variance**0.5
     return (
-        f"Photons are counted: {light:.3g} a pixel in the open beam, {photons.gain:.3g} counts each, readout "
-        f"noise {readout:.3g} counts"
+        f"Photon statistics are used (--noise counts): {light:.3g} photons per pixel in the open beam, "
+        f"{photons.gain:.3g} counts per photon, readout noise {readout:.3g} counts"
     )

@@ -1,4 +1,6 @@
-"""Preparation of a scan: line integrals and their geometry; only the views and rows asked for are ever held."""
+"""Preparation of a scan: reads, corrects and aligns the chosen projections. Only the projections and rows asked for
+are held in memory.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,7 @@ class DiskBuffer:
 
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
-        batch: views that are corrected at a time.
+        batch: projections that are corrected at a time.
     """
 
     views: NDArray[np.float32]
@@ -67,15 +69,15 @@ def prepare_projections(
     check: Callable[[Geometry], object] = lambda geometry: None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
-    """Read, correct and align the views of `selection`.
+    """Read, correct and align the projections of `selection`.
 
     Args:
         source: a finished scan.
         selection: what to use.
-        warn: takes a sentence on everything that is not as it should be though work goes on.
-        buffer: takes the line integrals on disk, with rays that were not measured or weigh nothing by the flags
+        warn: takes a sentence on everything that is unusual but does not stop the work.
+        buffer: takes the line integrals on disk, with missing rays and rays of weight 0 (because of flags)
             interpolated, and no `shares`; None: they stay in memory.
-        check: raises what is wrong with the geometry of the views, before these are corrected.
+        check: raises an error if the geometry of the projections is wrong, before they are corrected.
         phases: takes the name of each phase as it begins.
 
     Raises:
@@ -107,11 +109,11 @@ def prepare_projections(
     geometry = view_geometry.of(projections.view_ids)
     if estimated := _estimated(source, selection, projections, geometry):
         selection = selection.with_steps(*estimated)
-        correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were given
+        correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were already given
         if any(step.on(source, selection)[0] is not None for step in estimated):
             projections = _corrected(correction, used, buffer, phases)
     light = compare_with_flats(scan, selection, projections, warn)
-    phases.enter("background, rings, views held out, hardening", "corrections")
+    phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
@@ -124,7 +126,7 @@ def prepare_projections(
 def _estimated(
     source: ScanSource, selection: ScanSelection, projections: Projections, geometry: Geometry
 ) -> list[ViewStep]:
-    """The steps whose settings follow from the corrected views, with these settings."""
+    """The steps whose settings follow from the corrected projections, with these settings."""
     steps = [step for step in in_order(selection) if isinstance(step, EstimatedStep)]
     found = [step.estimated(source, selection, projections, geometry) for step in steps]
     return [step for step in found if step is not None]
@@ -133,7 +135,9 @@ def _estimated(
 def _with_held_out(
     prepared: PreparedProjections, correction: ScanCorrection, view_geometry: ViewGeometry, others: NDArray[np.int64]
 ) -> PreparedProjections:
-    """Add the line integrals of the views held out; without any, or if none has light, nothing is added."""
+    """Add the line integrals of the held-out projections; nothing is added if there are none, or if none has
+    intensity.
+    """
     if not others.size:
         return prepared
     with suppress(NoViewError):
@@ -153,7 +157,9 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 
 
 def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
-    """The usable views, their stated poses, and rows of offset views; refuses faults before any frame is read."""
+    """The usable projections, their stated poses, and rows of offset projections; raises errors for faults before
+    any frame is read.
+    """
     source = scan.source
     usable = checked_views(scan, selection, warn)
     warn_of_units(source, selection, warn)
@@ -171,7 +177,7 @@ def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[U
 def _chosen(
     view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the file of the views that are used, and of some others that are held out."""
+    """Rows of the file of the projections that are used, and of some others that are held out."""
     source, selection, frames = view_geometry.scan.source, view_geometry.selection, usable.frames
     chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
@@ -187,16 +193,16 @@ def _corrected(
     buffer: DiskBuffer | None,
     phases: Phases,
 ) -> Projections:
-    """Line integrals of these rows of the file. DataError where fewer than half of them can be used."""
+    """Line integrals of these rows of the file. DataError if fewer than half of them can be used."""
     if buffer is None:
         projections = correction.at_once(used, progress=phases.progress)
     else:
         projections = correction.in_batches(used, buffer.views, buffer.batch, phases.progress)
     if 2 * (n := projections.view_ids.size) < used.size:
         raise DataError(
-            f"{correction.source.path}: only {n} of {used.size} views can be used; the others have no light, "
-            "no finite pixel, or not the pixels that were written. These are too few for the scan: choose those that "
-            "can be used with --views, or repeat the others."
+            f"{correction.source.path}: only {n} of {used.size} projections can be used, which are too "
+            "few for the scan. The others are without beam, have no finite pixel, or differ from what "
+            "was written. Choose those that can be used with --views, or repeat the others."
         )
     return projections
 
@@ -204,9 +210,9 @@ def _corrected(
 def _after_scan_steps(
     source: ScanSource, selection: ScanSelection, prepared: PreparedProjections, phases: Phases
 ) -> PreparedProjections:
-    """The views after the steps on all of them, which change line integrals in place."""
+    """The projections after the steps on all of them, which change line integrals in place."""
     done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
-    prepared = replace(prepared, done=done)  # a step sees what those before it did
+    prepared = replace(prepared, done=done)  # a step has access to what the steps before it did
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(prepared, source.table.angles[prepared.projections.view_ids], phases.progress)
         phases.progress(n, len(steps))
@@ -214,7 +220,9 @@ def _after_scan_steps(
 
 
 def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
-    """Fill, view by view and in place, what `ray_weights` says weighs nothing, as `masked` does for all views."""
+    """Fill rays of weight 0 (see `ray_weights`), projection by projection and in place, as is done for pixels
+    `masked` in all projections.
+    """
     data, geometry = prepared.projections.data, prepared.geometry
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
@@ -241,25 +249,28 @@ def assemble(
     warn: Warn,
     on_disk: bool = False,
 ) -> PreparedProjections:
-    """Corrected views with their geometry, after reporting the pixels that the correction repaired.
+    """Corrected projections with their geometry, after reporting the pixels that the correction replaced.
 
     Args:
-        geometry: of these views.
-        axis: the column, and how it was found; None where it was given.
-        usable: the views that were chosen from.
-        on_disk: weights of rays in the regions of flags are made when wanted.
+        geometry: of these projections.
+        axis: the column, and how it was found; None if it was given.
+        usable: the projections that were chosen from.
+        on_disk: weights of rays in the regions of flags are computed on request.
 
     Raises:
-        DataError: fewer than two views, or nothing in the beam.
+        DataError: fewer than two projections, or nothing in the beam.
     """
     source, (height, width) = scan.source, geometry.detector_shape
     rows = selection.detector_rows
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
     ids = projections.view_ids
     if ids.size < 2:
-        raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
+        raise DataError(f"{source.path}: only {ids.size} of the chosen projections can be used; at least 2 are needed.")
     if not projections.data.any():
-        raise DataError(f"{source.path}: the chosen views are zero everywhere: there is no sample in the beam.")
+        raise DataError(
+            f"{source.path}: there is no sample in the beam: the line integrals of the chosen projections are "
+            "zero everywhere."
+        )
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
@@ -294,17 +305,17 @@ def assemble(
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
-    """Height of the source's pixels over their width.
+    """Height of the source's pixels divided by their width.
 
     Raises:
-        DataError: they are not square, and rows show no slices.
+        DataError: pixels are not square, and a detector row does not show one slice.
     """
     if source.row_pitch_mm is None or source.pixel_size_mm is None:
         return 1.0
     if resampled or not geometry.rows_show_slices:
         raise DataError(
-            f"{source.path}: pixels are {source.pixel_size_mm:g} mm wide and {source.row_pitch_mm:g} mm high; expected "
-            "square ones where views are moved along the axis, turned, or of a cone. Bin the columns or the rows of a "
-            "copy of the file."
+            f"Bin the columns or the rows of a copy of {source.path}, because its pixels are "
+            f"{source.pixel_size_mm:g} mm wide and {source.row_pitch_mm:g} mm high. Square pixels are "
+            "needed in a cone beam, and if projections are shifted along the axis or rotated."
         )
     return source.row_pitch_mm / source.pixel_size_mm

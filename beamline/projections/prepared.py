@@ -1,4 +1,4 @@
-"""Prepared projections: line integrals ready for reconstruction, weights of their rays, and views held out."""
+"""Prepared projections: line integrals ready for reconstruction, weights of their rays, and held-out projections."""
 
 from __future__ import annotations
 
@@ -28,29 +28,32 @@ class PreparedProjections:
     """Line integrals ready for reconstruction.
 
     Attributes:
-        projections: of the views used; view_ids are their rows in the file.
-        geometry: of these views, binned; mm, or px where the pixel size is unknown.
+        projections: of the projections used; view_ids are their rows in the file.
+        geometry: of these projections, binned; mm, or px if the pixel size is unknown.
         axis_col: rotation axis in columns of the full detector.
-        axis: how it was found; None where it was given.
-        held_out: some views that are not used, with weights as `projections.weights` of the views used (None: as a
-            usual ray of these); None where all are used.
-        held_out_ids: rows of the file of these views; None: unknown.
-        n_projections: how many views the scan has.
+        axis: how it was found; None if it was given.
+        held_out: some projections that are not used, with weights as `projections.weights` of those used (None: the
+            weight of a usual ray of these); None if all are used.
+        held_out_ids: rows of the file of these projections; None: unknown.
+        n_projections: how many projections the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
-        view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
-        left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
+        view_weights: float32 [view], less than 1 for projections with a warning of the monitor; None: 1 for all.
+        left_out: projections with an alarm of the monitor, or after a jump of the sample: the selection does not
+            choose from them.
         flags: of all frames of the scan; None if the file has no flags.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
-        done: what each step did, by name, in the order in which it did.
-        shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
-            None: as `shares` says.
+        done: what each step did, by name, in the order of the steps.
+        shares_of: `shares` of some projections and rows, computed on request if line integrals are on disk; None:
+            use `shares`.
         times: [view] s when each was exposed; None: no method asked for it.
-        laws: what the views leave of the laws that hold for all of them, in words, by name.
-        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or measured.
-        inside: what the sample outside the volume adds to the views was subtracted from them.
-        stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
+        laws: the residuals of the consistency conditions, in words, by name.
+        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or
+            measured.
+        inside: True if the contribution of the sample outside the volume was subtracted from the projections.
+        stretch: height of a pixel divided by its width. `geometry` has square pixels; slices are this much farther
+            apart.
     """
 
     projections: Projections
@@ -85,22 +88,22 @@ class PreparedProjections:
 
     @property
     def is_wide(self) -> bool:
-        """Whether the sample was measured, and is wider than the field."""
+        """True if the sample was measured, and is wider than the field of view."""
         return isinstance(self.sample_radius, SampleRadius)
 
     @property
     def box(self) -> Grid:
-        """The box of the field, or as wide as the sample was measured to be."""
+        """The box of the field of view, or as wide as the sample was measured to be."""
         grid, sample = Grid.matching(self.geometry), self.sample_radius
         return grid.reaching(sample.radius, self.geometry) if isinstance(sample, SampleRadius) else grid
 
     @property
     def on_disk(self) -> bool:
-        """Whether line integrals are stored on disk, with rays of zero weight filled from their neighbours."""
+        """True if line integrals are stored on disk, with rays of zero weight replaced from their neighbours."""
         return isinstance(self.projections.data, np.memmap)
 
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
-        """The same views restricted to the detector rows of `geometry`; line integrals are not copied."""
+        """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
         def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if array is None else array[..., rows, :]
@@ -119,15 +122,17 @@ class PreparedProjections:
 
     @property
     def centred(self) -> PreparedProjections:
-        """The same views without wide ones, which show the sample more than half a field beside its usual place."""
+        """The same projections without laterally offset ones, in which the sample is displaced by more than half a
+        field of view.
+        """
         return self.wanted(self.geometry.is_centred)
 
     def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
-        """The same views without those that are not wanted, [view]."""
+        """The same projections without those that are not wanted, [view]."""
         return self if views.all() else self.of_views(np.flatnonzero(views))
 
     def of_views(self, views: I64) -> PreparedProjections:
-        """Some of the views used, by number and in this order; held-out views are unchanged."""
+        """Some of the projections used, by number and in this order; held-out projections are unchanged."""
 
         def some(array: Any) -> Any:
             return None if array is None else array[views]
@@ -150,17 +155,21 @@ class PreparedProjections:
 
     @property
     def whole_views(self) -> I64:
-        """Numbers of the views of which every pixel measured something, but for pixels that are masked in all."""
+        """Numbers of the projections in which every pixel measured something, except for pixels that are masked in
+        all.
+        """
         return np.flatnonzero(~np.isin(self.projections.view_ids, self.projections.unmeasured[:, 0]))
 
     @property
     def unmeasured_rows(self) -> tuple[I64, I64]:
-        """Rows of the detector, binned, that no ray measured; and those of them that lie between others that were, as
-        a line that is not read, and are interpolated."""
+        """Detector rows, binned, that no ray measured; and those of them that lie between measured rows, such as a
+        line that the camera does not read, and are interpolated.
+        """
         runs, (height, width) = self.projections.unmeasured, self.geometry.detector_shape
         known = np.ones((height, width), np.bool_) if self.measured is None else self.measured
-        before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))  # [row, col + 1], pixels known to the left
-        _, row, left, right = runs[np.isin(runs[:, 0], self.projections.view_ids)].T  # of these views
+        # [row, col + 1], number of known pixels to the left
+        before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))
+        _, row, left, right = runs[np.isin(runs[:, 0], self.projections.view_ids)].T  # of these projections
         lengths = before[row, right] - before[row, left]  # runs end at masked areas
         unseen = np.bincount(row, lengths, height) >= before[:, -1] * self.projections.view_ids.size
         lost = unseen | self.projections.masked.all(axis=1)
@@ -168,21 +177,21 @@ class PreparedProjections:
 
     @property
     def leaves_slices(self) -> bool:
-        """Whether views of a parallel beam see beyond the slices of the volume, because they are shifted along it or
-        tilted.
+        """True if projections of a parallel beam see beyond the slices of the volume, because they are shifted along
+        the axis or tilted.
         """
         moved = np.ptp(self.geometry.shifts[:, 1]) > 0
         return not self.geometry.is_cone and (bool(moved) or not self.geometry.is_straight)
 
     @property
     def views(self) -> Views:
-        """The views used, with weights that are computed where they are read."""
+        """The projections used, with weights that are computed on request."""
         weights: Any = self.ray_factors()
         return Views(self.projections.data, self.geometry, weights)
 
     @property
     def views_held_out(self) -> Views | None:
-        """The views held out, likewise; None where all are used."""
+        """The held-out projections, with weights that are computed on request; None if all projections are used."""
         if self.held_out is None:
             return None
         weights, n = self.ray_factors(self.held_out.geometry.n_views), self.geometry.n_views
@@ -196,7 +205,7 @@ class PreparedProjections:
 
     @property
     def without_warnings(self) -> PreparedProjections:
-        """The same views without the warnings of the monitor: unmeasured rays have weight 0, all others weight 1."""
+        """The same projections without the warnings of the monitor: missing rays have weight 0, all others weight 1."""
         shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
         return replace(self, view_weights=None, shares=shares, shares_of=None)
 
@@ -204,7 +213,8 @@ class PreparedProjections:
         """Weights [view, row, col], computed only on request; None if all rays have weight 1.
 
         Args:
-            others: views held out after these. Without weights of their own they weigh 1, as a usual ray of these does.
+            others: held-out projections, appended to these. Without weights of their own they get weight 1, the
+                weight of a usual ray of these.
         """
         factors: list[NDArray[np.float32]] = []
         if self.view_weights is not None:
@@ -234,12 +244,12 @@ class PreparedProjections:
 
 
 def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
-    """The values of views, and ones for others after them."""
+    """The values of projections, and ones for others after them."""
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
 
 
 def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
-    """Used and held-out views as one set, and the numbers of the held-out views in it.
+    """Used and held-out projections as one set, and the numbers of the held-out ones in it.
 
     The two geometries are of the same set-up.
     """
@@ -252,14 +262,14 @@ def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) 
 def hold_out(
     prepared: PreparedProjections, one_in: int, *, most: int | None = None, advice: str
 ) -> PreparedProjections:
-    """Hold out every `one_in`-th view, evenly spread; unchanged if the selection already holds some out.
+    """Hold out every `one_in`-th projection, evenly spread; unchanged if the selection already holds some out.
 
     Args:
-        most: number of views held out at most.
+        most: number of held-out projections at most.
         advice: how to do without, for the error.
 
     Raises:
-        ConfigError: fewer than two views would be left.
+        ConfigError: fewer than two projections would be left.
     """
     if prepared.held_out is not None:
         return prepared
@@ -267,14 +277,14 @@ def hold_out(
     count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
-        raise ConfigError(f"{n} views are too few for held-out views; choose more with --views, or {advice}.")
-    # Neither the first nor the last: they have a neighbour on one side only.
+        raise ConfigError(f"{n} projections are too few to hold some out; choose more with --views, or {advice}.")
+    # Neither the first nor the last: these have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     return with_views_held_out(prepared, held)
 
 
 def with_views_held_out(prepared: PreparedProjections, held: I64) -> PreparedProjections:
-    """The same views with those of these numbers, sorted, held out."""
+    """The same projections with those of these numbers, sorted, held out."""
     projections = prepared.projections
     return replace(
         prepared.of_views(np.setdiff1d(np.arange(prepared.geometry.n_views), held)),

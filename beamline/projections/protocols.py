@@ -1,7 +1,8 @@
-"""What a step can do: a filter of each view, a search for where the sample was, or a change of all views.
+"""Protocols of a correction step: a filter of each projection, a search for the sample's position, or a change of
+all projections.
 
-A plug-in meets one of `ViewStep`, `PlaceStep` and `ScanStep`. The module of a step is imported for every
-help text: what reads files or needs numba, torch or scipy is imported where it is called.
+A plug-in meets one of `ViewStep`, `PlaceStep` and `ScanStep`. The module of a step is imported for every help text:
+import what reads files or needs numba, torch or scipy in the function that uses it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class ScanPart:
     """The part of a scan that is to be used, before any frame is read.
 
     Attributes:
-        geometry: of views as many and as large, binned, as those that are used.
+        geometry: of as many projections as are used, of the same size, binned.
     """
 
     source: ScanSource
@@ -38,7 +39,7 @@ class ScanPart:
     geometry: Geometry
 
     def view_bytes(self, reach: int = 0) -> int:
-        """Bytes of a float32 view, with so many rows on either side as far as the detector has them."""
+        """Bytes of a float32 projection with this many more rows on either side, as far as the detector has them."""
         rows, cols = self.geometry.detector_shape
         return 4 * min(rows + 2 * reach, self.source.shape[0] // self.selection.binning) * cols
 
@@ -48,10 +49,12 @@ class PrepStep(NamedStep, Protocol):
 
     @property
     def needs_finished(self) -> str:
-        """Why the scan must have ended, as a sentence for who follows one; empty: it need not."""
+        """Why the step needs a finished scan, as a sentence for the user who follows a running one; empty: it does
+        not need one.
+        """
 
     def memory(self, part: ScanPart) -> StepMemory:
-        """The memory that it takes, known before any frame is read.
+        """The memory that it needs, known before any frame is read.
 
         Raises:
             ConfigError: the step does not fit the scan.
@@ -60,13 +63,13 @@ class PrepStep(NamedStep, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ViewFilter:
-    """A step on the views of one scan, which it takes a batch at a time.
+    """A step on the projections of one scan, a batch at a time.
 
     Attributes:
-        apply: views, and the row of the detector at which they begin, to as many views filtered; line integrals may be
+        apply: (projections, detector row at which they begin) to as many filtered projections; line integrals may be
             changed in place.
-        reach: rows, binned, beside a row from which it takes something.
-        mixes: the subject and verb that say who mixes neighbouring pixels.
+        reach: how many rows, binned, above and below a row it needs.
+        mixes: subject and verb of a sentence that says which option mixes neighbouring pixels.
     """
 
     apply: Callable[[Projections, int], Projections]
@@ -76,35 +79,37 @@ class ViewFilter:
 
 @runtime_checkable
 class ViewStep(PrepStep, Protocol):
-    """A step on each view alone, also of a scan that still runs."""
+    """A step on each projection alone, also of a scan that is still running."""
 
     def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
-        """The filter of a scan, None where nothing is to be done; and what it does.
+        """The filter of a scan, None if there is nothing to do; and what it does.
 
         Raises:
-            ConfigError: the scan does not say what the step needs, or the step does not fit it.
+            ConfigError: the scan does not state what the step needs, or the step does not fit it.
         """
 
 
 @runtime_checkable
 class EstimatedStep(Protocol):
-    """A step whose settings may be estimated from the corrected views of a finished scan."""
+    """A step whose settings may be estimated from the corrected projections of a finished scan."""
 
     def estimated(
         self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
     ) -> ViewStep | None:
-        """The step with the settings that these views, corrected without it, determine; None if they determine none."""
+        """The step with the settings that these projections, corrected without it, determine; None if they determine
+        none.
+        """
 
 
 @runtime_checkable
 class BlurringStep(Protocol):
-    """A step that blurs the views: what looks for fine detail leaves it out."""
+    """A step that blurs the projections: corrections that look for fine detail run without it."""
 
     blurs: ClassVar[Literal[True]]
 
 
 class ViewMotion(Protocol):
-    """Where the sample was in the views of a scan.
+    """The position of the sample in the projections of a scan.
 
     Attributes:
         frames: int64 [view], the rows of the file that are used.
@@ -118,12 +123,12 @@ class ViewMotion(Protocol):
     def done(self) -> StepDone: ...
 
     def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of these rows of the file, as the sample was in them."""
+        """The geometry of these rows of the file, with the position of the sample in them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unmoved:
-    """The motion of a sample that stood in all these views.
+    """The motion of a sample that stayed in place in all these projections.
 
     Attributes:
         frames: int64 [view], rows of the file.
@@ -138,7 +143,7 @@ class Unmoved:
 
 @runtime_checkable
 class PlaceStep(PrepStep, Protocol):
-    """A step that finds where the sample was in each view, before views are corrected."""
+    """A step that finds the position of the sample in each projection, before projections are corrected."""
 
     def place(
         self,
@@ -148,16 +153,16 @@ class PlaceStep(PrepStep, Protocol):
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        """The views that are used, where the sample was in them, and what was done.
+        """The projections that are used, the position of the sample in them, and what was done.
 
         Args:
-            usable: the views that may be used.
+            usable: the projections that may be used.
             progress: takes how much is done, and of how much at most.
         """
 
 
 class GeometryLearnt(Protocol):
-    """What was estimated of the geometry of some views.
+    """What was estimated of the geometry of some projections.
 
     Attributes:
         axis: displacement of the rotation axis in the detector's middle row, in columns.
@@ -176,12 +181,13 @@ class GeometryLearnt(Protocol):
 
 @runtime_checkable
 class GeometryStep(PrepStep, Protocol):
-    """A step that learns the geometry from the views of a finished scan.
+    """A step that finds the geometry from the projections of a finished scan.
 
     Attributes:
         asked_by: the option that asks for it.
-        geometry: names of the terms that are to be estimated; "roll", "tilt" and "shifts" let rows show other slices.
-        may_lean: views may come out rolled or tilted.
+        geometry: names of the terms that are to be estimated; with "roll", "tilt" and "shifts" a row may show other
+            slices.
+        may_lean: projections may come out rolled or tilted.
     """
 
     asked_by: ClassVar[str]
@@ -193,7 +199,9 @@ class GeometryStep(PrepStep, Protocol):
     def may_lean(self) -> bool: ...
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
-        """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+        """Raise DataError for terms that need more projections, used or usable, or more binned columns than there
+        are.
+        """
 
     def learn(
         self,
@@ -203,26 +211,26 @@ class GeometryStep(PrepStep, Protocol):
         geometry_before: Callable[[ScanSelection, NDArray[np.int64]], Geometry],
         progress: Callable[[int, int], None],
     ) -> GeometryLearnt:
-        """The geometry of these frames, from views whose geometry is otherwise known.
+        """The geometry of these frames, from projections whose geometry is otherwise known.
 
         Raises:
-            DataError: too few views, or nothing in the beam.
+            DataError: too few projections, or nothing in the beam.
         """
 
 
 @runtime_checkable
 class ScanStep(PrepStep, Protocol):
-    """A step on all views of a scan."""
+    """A step on all projections of a scan."""
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
-        """Change line integrals, weights and views held out in place.
+        """Change line integrals, weights and held-out projections in place.
 
         Args:
             angles: [view] of the stage, radians.
             progress: takes how much is done, and of how much at most.
 
         Raises:
-            DataError: the views do not show what the step needs.
+            DataError: the projections do not show what the step needs.
         """

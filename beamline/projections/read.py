@@ -1,4 +1,6 @@
-"""Reading: pixels of a scan, binned while they are read, and the views that cannot be used; the filters of views."""
+"""Reading: pixels of a scan, binned while they are read; which projections cannot be used; and the filters of
+projections.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,8 @@ def read_binned(
     """Read frames [frame, row, col], averaged into bins; NaN is excluded from the averages.
 
     Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
-    columns that do not fill a bin go. Where a frame lies in more pieces of the file than are held unpacked, some rows
-    of all frames are read after one another, else all rows of some frames.
+    columns that do not fill a bin are dropped. If a frame is spread over more compressed chunks than are kept
+    unpacked, all frames are read for a few rows at a time, otherwise all rows of a few frames.
     """
     height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
     whole = binning == 1 and source.dtype.kind in "ui"
@@ -58,7 +60,9 @@ def read_binned(
 
 
 def _held_by_rows(source: ScanSource) -> bool:
-    """Whether a frame lies in pieces of several frames that are more than is held unpacked."""
+    """True if a frame shares its chunks of the file with other frames, and the chunks are more than are kept
+    unpacked.
+    """
     frame = source.shape[0] * source.shape[1] * source.dtype.itemsize * source.frames_per_view
     return source.frame_bytes > max(HELD, 2 * frame)
 
@@ -94,16 +98,16 @@ def tell_damaged(
     if lost.any():
         first = int(frames[lost].min())
         warn(
-            f"{count(int(lost.sum()), 'frame')} cannot be read: {spans(np.sort(frames[lost]).tolist())}, left out. "
-            f"{source.unreadable[first]}"
+            f"{count(int(lost.sum()), 'frame')} cannot be read and {'is' if lost.sum() == 1 else 'are'} "
+            f"left out: {spans(np.sort(frames[lost]).tolist())}. {source.unreadable[first]}"
         )
     damaged = np.isin(frames, sorted(source.damaged)) & ~lost
     used = selection.step(Preparation).uses_flags
     if damaged.any():
-        taken = "left out" if used else "used as they are (--flags ignore)"
+        taken = "left out" if used else "used anyway (--flags ignore)"
         warn(
-            f"{frames_text(np.sort(frames[damaged])).capitalize()}: another checksum than was written, "
-            f"{taken}. Look for an intact copy of {source.path}."
+            f"Look for an intact copy of {source.path}: {frames_text(np.sort(frames[damaged]))} "
+            f"{'differs' if damaged.sum() == 1 else 'differ'} from the stored checksum, {taken}."
         )
     return lost | damaged if used else lost
 
@@ -119,8 +123,8 @@ class ViewFilters:
 
     Attributes:
         filters: in their order.
-        done: what each step on views does, by name.
-        selection: rows that are wanted, and binning.
+        done: what each step on projections does, by name.
+        selection: the rows asked for, and binning.
     """
 
     filters: tuple[ViewFilter, ...]
@@ -138,7 +142,8 @@ class ViewFilters:
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
             raise ConfigError(
-                f"{filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
+                f"Omit --noise counts or the filter: {filters[-1].mixes} neighbouring pixels, and the "
+                "counts of mixed pixels have no known likelihood."
             )
         done = {name: each for name, (_, each) in outcomes.items()}
         return cls(filters, done, selection)
@@ -153,7 +158,7 @@ class ViewFilters:
         return slice(*((edge - first) // self.selection.binning for edge in (part.start, part.stop)))
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
-        """Apply all filters to the views, and return the requested rows."""
+        """Apply all filters to the projections, and return the requested rows."""
         if not self.filters or not views.view_ids.size:
             return views
         read, kept = self._widened(rows)
@@ -162,7 +167,7 @@ class ViewFilters:
         return replace(views, data=np.ascontiguousarray(views.data[:, kept]), masked=views.masked[kept])
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
-        """Detector rows to read, and which of them are wanted, in binned rows."""
+        """Detector rows to read, and which of them were asked for, in binned rows."""
         n, reach = self.selection.binning, sum(each.reach for each in self.filters)
         first, end = self.selection.detector_rows.start, self.selection.detector_rows.stop
         if rows is not None:
@@ -174,18 +179,18 @@ class ViewFilters:
 
 
 class NoViewError(DataError):
-    """None of the requested views can be used."""
+    """None of the requested projections can be used."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewReader:
-    """Reads the views of one scan that can be used, and says of the others why they cannot.
+    """Reads the projections of one scan that can be used, and reports why the others cannot.
 
     Attributes:
         selection: what is done with frames that differ from their checksums.
         filters: rows and binning.
         references: of the rows that are read, binned; None: the frames are line integrals.
-        named: views without light that were named.
+        named: projections without beam that were reported.
     """
 
     scan: ScanEvidence
@@ -201,8 +206,9 @@ class ViewReader:
         rows: slice | None,
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
-        frames; of some binned rows, of all for None."""
+        """Pixels [frame, row, col] of the frames that have a finite pixel and intensity and are not damaged, and
+        these frames; of some binned rows, None: all.
+        """
         source = self.scan.source
         data = read_binned(source, frames, self.filters.read(rows), self.selection.binning, progress)
         lost = tell_damaged(source, self.selection, frames, self.warn)
@@ -210,10 +216,10 @@ class ViewReader:
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             dark = frames[~alive]
-            if rows is None:  # in a band it says nothing of the views
+            if rows is None:  # a band of rows does not show whether a projection is usable
                 self.warn(
-                    f"{dark.size} of {source.table.views.size} views hold no finite pixel (first: frame "
-                    f"{dark[0]}): left out."
+                    f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
+                    f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
                 )
             data, frames = data[alive], frames[alive]
         lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references
@@ -227,39 +233,43 @@ class ViewReader:
         return data, frames
 
     def _warn_of_copies(self, data: NDArray[Any], frames: NDArray[np.int64]) -> None:
-        """Warn of views that equal the one before pixel by pixel: no camera takes the same counts twice."""
+        """Warn of projections that equal the one before pixel by pixel: no camera takes the same counts twice."""
         middle = data.shape[1] // 2
-        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))  # soon tells most of them apart
+        # the middle row quickly distinguishes most of them
+        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
-        if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
+        if copies and 2 * len(copies) < len(frames):  # if most are equal, the images were computed
             self.warn(
-                f"{count(len(copies), 'view')} of {self.scan.source.table.views.size} ({frames_text(copies)}) with "
-                "the pixels of the view before: the camera or its driver gave an image twice. Such angles are wrong "
-                "for what is shown: leave them out with --views or --flags judge, or repeat them."
+                "Omit these frames with --views or --flags judge, or repeat them: "
+                f"{count(len(copies), 'projection')} of {self.scan.source.table.views.size} "
+                f"({frames_text(copies)}) {'is' if len(copies) == 1 else 'are'} identical to the "
+                "projection before. The camera or its driver delivered an image twice, so the angle of "
+                "the copy is wrong."
             )
 
     def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
-        """Name the views without light among those asked for, once, and the gap that they leave."""
+        """Report the projections without beam among those asked for, once, and the gap that they leave."""
         unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self.scan.known_unlit, np.int64))
         if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
             return
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
         self.named.update(news.tolist())
         self.warn(
-            f"{count(news.size, 'view')} of {self.scan.source.table.views.size} ({frames_text(news)}) without "
-            "light: the shutter was closed, the beam was gone, or the file was never written there. Such views are "
-            f"left out{gap}."
+            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} "
+            f"({frames_text(news)}) had no beam: the shutter was closed, the beam was lost, or the file "
+            f"was never written there. {'It is' if news.size == 1 else 'They are'} left out{gap}."
         )
 
     def no_view(self) -> NoViewError:
-        """The error where none of the views can be used."""
+        """The error if none of the projections can be used."""
         beside_flats = (
             ""
             if self.references is None
-            else f" The brightest have {self.scan.brightest:.2g} of the flats' light. Where views were divided by "
-            "their flats already, say --quantity transmission, or line-integrals."
+            else f" The brightest have {self.scan.brightest:.2g} of the intensity of the flats. If the "
+            "projections were already divided by their flats, give --quantity transmission or "
+            "line-integrals."
         )
         return NoViewError(
-            f"{self.scan.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have "
-            f"no light, or differ from their checksums.{beside_flats}"
+            f"{self.scan.source.path}: none of the chosen projections can be used. Their pixels are "
+            f"unreadable, not finite, without beam, or differ from their checksums.{beside_flats}"
         )

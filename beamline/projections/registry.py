@@ -1,4 +1,6 @@
-"""The registry of steps: one line a step. A new correction takes its file and its line here; a plug-in none."""
+"""Registry of the correction steps, one line per step. A new correction needs its file and its line here; a plug-in
+needs no line.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,11 @@ def registered() -> tuple[type[PrepStep], ...]:
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
         names_of_options = {option.name for option in options_of(step).values()}
         if step.name != name or not isinstance(step(), ViewStep | PlaceStep | ScanStep):
-            raise ValueError(f"{step.__name__} is no ViewStep, PlaceStep or ScanStep of the entry point's name")
+            raise ValueError(f"{step.__name__} is not a ViewStep, PlaceStep or ScanStep with the entry point's name")
         if names_of_options & taken or not by_name.keys() >= set(step.follows):
             raise ValueError(
-                f"it has an option of another step ({names_of_options & taken}), or follows none of {sorted(by_name)}"
+                f"it has an option of another step ({names_of_options & taken}), or follows a step that "
+                f"is not one of {sorted(by_name)}"
             )
         taken.update(names_of_options)
         return step
@@ -55,7 +58,7 @@ def all_steps() -> tuple[type[PrepStep], ...]:
     """Every step, each after those that it follows."""
     by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
     order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
-    return tuple(by_name[name] for name in order if name in by_name)  # a step may follow one of a feature
+    return tuple(by_name[name] for name in order if name in by_name)  # a step may follow one that a feature provides
 
 
 def in_order(selection: Selection) -> list[PrepStep]:
@@ -64,7 +67,7 @@ def in_order(selection: Selection) -> list[PrepStep]:
 
 
 def geometry_steps(selection: Selection) -> list[GeometryStep]:
-    """The steps that can find the geometry from the views, with the settings of the selection."""
+    """The steps that can find the geometry from the projections, with the settings of the selection."""
     return [step for step in in_order(selection) if isinstance(step, GeometryStep)]
 
 
@@ -72,7 +75,7 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
     """All steps with these values of their options, keyed as in `key_of`.
 
     Raises:
-        ValueError: options of a step that do not go together.
+        ValueError: options of a step that exclude each other.
     """
     return tuple(
         step(**{field: values[key_of(option.name)] for field, option in options_of(step).items()})

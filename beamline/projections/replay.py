@@ -1,4 +1,4 @@
-"""Replay: the monitor's checks over the frames of a file, of any format, finished or growing."""
+"""Replay: runs the monitor's checks over the frames of a file, of any format, finished or growing."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class SkippedChecks:
-    """Number of views with light so far, and for how many of them each check was skipped.
+    """Number of exposed projections so far, and for how many of them each check was skipped.
 
     Attributes:
         views: their number.
-        alone: views that were not compared with earlier ones.
-        without_flats, cones, wider: views of a scan without flats, of a cone beam, of a sample wider than the field.
+        alone: projections that were not compared with earlier ones.
+        without_flats, cones, wider: projections of a scan without flats, of a cone beam, of a sample wider than the
+            field of view.
     """
 
     views: int = 0
@@ -38,7 +39,7 @@ class SkippedChecks:
     wider: int = 0
 
     def with_frame(self, context: ScanContext) -> SkippedChecks:
-        """The counts after the next frame; `context` is what the checks knew of it."""
+        """The counts after the next frame; `context` is what the checks knew about it."""
         if context.view is None or context.grid is None:
             return self
         return SkippedChecks(
@@ -50,17 +51,17 @@ class SkippedChecks:
         )
 
     def in_words(self) -> tuple[str, ...]:
-        """The skipped checks, the views and the reason, one text each. First views, which lack predecessors, count only
-        if all do.
+        """The skipped checks, the number of projections and the reason, one text each. First projections, which have
+        no predecessors, count only if all projections do.
         """
         alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
         reasons = (
             ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
-            ("gain, motion, floater, ghost, dips of beam", alone, "no four views before them at even steps of angle"),
+            ("gain, motion, floater, ghost, dips of beam", alone, "no four earlier projections at even angular steps"),
             ("opposite", self.cones, "cone beam"),
-            ("mass", self.wider, "sample wider than the field"),
+            ("mass", self.wider, "sample wider than the field of view"),
         )
-        return tuple(f"{checks} in {n} of {self.views} views ({why})" for checks, n, why in reasons if n)
+        return tuple(f"{checks} in {n} of {self.views} projections ({why})" for checks, n, why in reasons if n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +73,8 @@ class FrameVerdict:
         kind: of the frame.
         flags: what the checks found.
         n: frames in the file so far.
-        aside: which checks left out views so far.
-        failures: a sentence on each check that failed at this frame, and is off from here on.
+        aside: for how many projections each check was skipped so far.
+        failures: a sentence on each check that failed with an error at this frame and is off from here on.
     """
 
     row: int
@@ -90,7 +91,7 @@ class Kind:
 
     Attributes:
         frames: their numbers in the file, ascending.
-        worst: the flag with the largest score over its limit.
+        worst: the flag with the largest ratio of score to limit.
     """
 
     check: str
@@ -101,16 +102,16 @@ class Kind:
 
 @dataclass(frozen=True)
 class ScanVerdict:
-    """The verdict of the monitor on a whole scan.
+    """The result of the monitor for a whole scan.
 
     Attributes:
-        n_frames: that were looked at.
+        n_frames: that were checked.
         kinds: its flags by check and level, the worst level first.
         alarmed: numbers of the frames with an alarm, without those that were taken again.
-        retaken: numbers of the views that were taken again.
+        retaken: numbers of the projections that were taken again.
         references: what is wrong with darks and flats, a text for each group.
-        altered: what of the file is not as it was written; "" where all is.
-        aside: which checks could not look at which views, or failed.
+        altered: what in the file is not as it was written; "" if all is.
+        aside: for how many projections each check was skipped, or which checks failed with an error.
     """
 
     n_frames: int
@@ -128,7 +129,7 @@ class ScanVerdict:
 
     @property
     def clean(self) -> bool:
-        """Whether no frame has an alarm, and darks and flats have no fault."""
+        """True if no frame has an alarm, and darks and flats have no fault."""
         return not self.alarmed and not self.references
 
 
@@ -141,15 +142,15 @@ def replay(
 ) -> Iterator[FrameVerdict]:
     """Check every frame, in the order of the file.
 
-    Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
-    equal.
+    Frames of line integrals are checked as counts of a beam without noise; unknown exposures count as equal.
 
     Args:
-        follow: the clock to wait by for further frames, until the file is finished; None: the frames that are there.
+        follow: the clock to wait with for further frames, until the file is finished; None: check the frames that
+            are present.
         should_stop: asked before each frame.
 
     Raises:
-        DataError: a followed file that is not finished and grows no more.
+        DataError: a followed file that stopped growing before it was finished.
     """
     monitor, aside = start(context_of(source), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):

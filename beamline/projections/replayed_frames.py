@@ -1,4 +1,6 @@
-"""Frames of a file, finished or growing, as the monitor gets them from a camera; and what it knows of the scan."""
+"""Frames of a file, finished or growing, in the form in which the monitor gets them from a camera; and the facts of
+the scan that the checks need.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,11 @@ from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.views import spread
 
-BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
-SAMPLES = 4  # frames of a kind that tell where the detector saturates
-PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
-POLL = 0.1  # s between looks at a growing file
+BEAM = 50_000.0  # counts that represent a transmission of 1 if a file holds line integrals
+SAMPLES = 4  # frames of each kind in which the saturation level of the detector is searched for
+# fraction of the pixels at the largest count, from which on this count is the end of the detector's range
+PILED_UP = 1e-3
+POLL = 0.1  # s between two reads of a growing file
 
 
 def frames_of(
@@ -37,7 +40,7 @@ def frames_of(
 ) -> Iterator[tuple[Frame, int]]:
     """Every frame, in the order of the file, and how many the file has so far; arguments and errors: see `replay`.
 
-    A view that was taken again later has the kind that it had when it came.
+    A projection that was taken again later has the kind that it had when it arrived.
     """
     done = 0
     for n in growing(source, follow) if follow is not None else (source.refresh(),):
@@ -45,7 +48,7 @@ def frames_of(
         for frame in _frames(source, done):
             if should_stop():
                 return
-            if frame.index in again:  # what the monitor saw before it was taken again
+            if frame.index in again:  # as the monitor saw the frame before it was taken again
                 frame = replace(frame, kind=FrameKind.PROJECTION)
             yield frame, n
         done = n
@@ -54,7 +57,7 @@ def frames_of(
 def awaited(
     opened: Callable[[], ScanSource], path: Path, clock: Clock, patience: float = PATIENCE, poll: float = POLL
 ) -> ScanSource:
-    """The scan that begins at `path`, when its file can be read.
+    """The scan that begins at `path`, as soon as its file can be read.
 
     Raises:
         DataError: none begins within `patience` s.
@@ -70,14 +73,14 @@ def awaited(
 
 
 def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: float = POLL) -> Iterator[int]:
-    """Frames in a file at each look, until it is finished.
+    """Number of frames in a file at each read, until it is finished.
 
     Raises:
-        DataError: it is not finished and grows no more.
+        DataError: it stopped growing before it was finished.
     """
     writer, n, ended = WriterWatch(source.path, clock.now(), patience), 0, False
     while not ended:
-        ended = source.finished  # asked before the frames, so that none can slip in between
+        ended = source.finished  # asked before the number of frames, so that no frame can arrive in between
         before, n = n, source.refresh()
         yield n
         if not ended and (why := writer.lost(clock.now(), n > before, lambda: source.finished)):
@@ -87,9 +90,9 @@ def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: 
 
 
 def context_of(source: ScanSource) -> ScanContext:
-    """What the checks need to know of a file before its first frame.
+    """The facts about a file that the checks need before its first frame.
 
-    The period is known of our own fly scans only.
+    The period is known only of fly scans that this program took.
     """
     rows, cols = source.shape
     fly = source.plan.get("mode") == "fly"
@@ -105,7 +108,9 @@ def context_of(source: ScanSource) -> ScanContext:
 
 
 def _step(source: ScanSource) -> float:
-    """Radians from a view to the next, as the plan of our own scans has them, or as the file has its views."""
+    """Radians between two projections, from the plan of a scan that this program took, or else from the angles in
+    the file.
+    """
     planned = source.plan.get("angles_deg")
     if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
         return usual_step(np.radians(planned[:: stated_frames_per_view(source)]))
@@ -113,8 +118,9 @@ def _step(source: ScanSource) -> float:
 
 
 def _saturation(source: ScanSource) -> float:
-    """Saturation as the file states it; else the end of the pixels' type, or of fewer bits where pixels pile up
-    there. Inf where pixels are real numbers."""
+    """Saturation as the file states it; otherwise the end of the pixels' type, or of fewer bits if many pixels have
+    the largest count. Inf if pixels are real numbers.
+    """
     if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
         return np.inf
     stated = float(source.attributes.get("saturation", 0))
@@ -132,7 +138,8 @@ def _saturation(source: ScanSource) -> float:
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
     """Frames from `first` on: counts as they are, line integrals as counts of a beam. An angle that no stage reaches
-    becomes NaN. An unknown exposure becomes 1 s, so that views and flats agree."""
+    becomes NaN. An unknown exposure becomes 1 s, so that projections and flats agree.
+    """
     for frame in source.frames(first):
         pixels: NDArray[Any] = frame.counts
         if source.quantity == "line_integrals":
@@ -146,8 +153,9 @@ def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
 
 
 def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type that holds such pixels for compiled kernels, which know neither foreign orders of bytes nor floats of 16
-    or more than 64 bits."""
+    """The type that holds such pixels for compiled kernels, which support neither foreign byte orders nor floats of
+    16 or more than 64 bits.
+    """
     if dtype.kind == "f" and dtype.itemsize not in (4, 8):
         return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)
     return dtype.newbyteorder("=")

@@ -1,4 +1,4 @@
-"""Statistics of the counts of a scan as they are stored: by kind of frame, before any correction."""
+"""Statistics of the pixel values of a scan as stored, by kind of frame, before any correction."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.matter import absorbed_dose
 
-FRAMES = 64  # Frames of a kind that are looked at, spread evenly over all of them
+FRAMES = 64  # Frames of each kind that are examined, evenly spread.
 PERCENT = (0.1, 1.0, 50.0, 99.0, 99.9)
-_BINS = 2**16  # between the least and the greatest value of real numbers; integers have a bin each
+_BINS = 2**16  # between the least and the greatest value of real numbers; integers have one bin each
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class KindStatistics:
     """Statistics of the pixel values of one kind of frame.
 
     Attributes:
-        frames: that were looked at, of `of`.
-        minimum, maximum, mean, deviation: of all their pixels that are finite.
+        frames: that were examined, of `of`.
+        minimum, maximum, mean, deviation: of all their finite pixels.
         percentiles: at PERCENT, to a count, or to 1/65536 of the range of real numbers.
         saturated: share of pixels at the greatest number of the pixels' type; 0 of real numbers.
         not_finite: share of pixels.
@@ -118,11 +118,11 @@ def _of_kind(
 
 @dataclass(frozen=True)
 class LightAsked:
-    """What the user states about the light: photons per count, and the material for the dose.
+    """What the user states about the intensity: photons per count, and the material for the dose.
 
     Attributes:
-        photons_per_count: X-ray photons at the sample that make one count.
-        material: a name or formula to state the dose in; None: photons alone.
+        photons_per_count: X-ray photons at the sample per count.
+        material: a name or formula for which the dose is computed; None: photons only.
     """
 
     photons_per_count: float
@@ -135,15 +135,21 @@ class LightAsked:
             ConfigError: there are no darks and flats, or the scan does not state what a dose needs.
         """
         if not source.table.has(FrameKind.DARK, FrameKind.FLAT):
-            raise ConfigError(f"{source.path} has no darks and flats, which are needed to measure the light.")
+            raise ConfigError(
+                f"{source.path} has no darks and flats, which are needed to measure the intensity of the beam."
+            )
         if self.material is not None:
             _gray(self.material, source, 0.0)
 
 
 def _gray(material: str, source: ScanSource, photons: float) -> float:
-    """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse_impossible`."""
+    """Dose at the surface in Gy for this many photons per pixel. Raises ConfigError as
+    `LightAsked.refuse_impossible`.
+    """
     if source.cone is not None:
-        raise ConfigError(f"{source.path} is a cone-beam scan; --dose-in is for a parallel monochromatic beam.")
+        raise ConfigError(
+            f"Omit --dose-in: it is for a parallel monochromatic beam, and {source.path} is a cone-beam scan."
+        )
     if source.pixel_size_mm is None or source.energy_kev is None:
         missing = "pixel size" if source.pixel_size_mm is None else "energy"
         raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
@@ -156,12 +162,12 @@ def _gray(material: str, source: ScanSource, photons: float) -> float:
 
 @dataclass(frozen=True)
 class Light:
-    """Photons and dose of one view of a scan.
+    """Photons and dose of one projection of a scan.
 
     Attributes:
         views: of the scan.
-        photons: a pixel and view, in the open beam at the sample.
-        gray: absorbed at the surface of the sample by a view; None: not asked for.
+        photons: per pixel and projection, in the open beam at the sample.
+        gray: dose at the surface of the sample per projection; None: not asked for.
         material: that absorbs it, and the energy, in words.
     """
 
@@ -171,16 +177,18 @@ class Light:
     material: str = ""
 
     def in_words(self) -> list[str]:
-        """Light and dose of all views, as sentences."""
-        each = f"{self.photons:.4g} photons a pixel and view in the open beam"
-        out = [f"{each}, {self.photons * self.views:.4g} in {self.views} views"]
+        """Intensity and dose of all projections, as sentences."""
+        each = f"{self.photons:.4g} photons per pixel and projection in the open beam"
+        out = [f"{each}, {self.photons * self.views:.4g} in {self.views} projections"]
         if self.gray is not None:
-            out.append(f"{self.gray * self.views:.4g} Gy absorbed in {self.material}, at its surface, by all views")
+            out.append(
+                f"{self.gray * self.views:.4g} Gy absorbed in {self.material}, at its surface, in all projections"
+            )
         return out
 
 
 def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightAsked) -> Light:
-    """Light and dose of a view, from the statistics of flats and darks.
+    """Intensity and dose of a projection, from the statistics of flats and darks.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`.
@@ -190,7 +198,7 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
     seconds = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
     known = [each[np.isfinite(each)] for each in seconds]
-    if all(each.size for each in known):  # else of one exposure time
+    if all(each.size for each in known):  # otherwise one exposure time is assumed for all
         photons *= float(known[0].mean() / known[1].mean())
     photons *= source.frames_per_view
     views = source.table.views.size
@@ -226,5 +234,5 @@ def histograms(statistics: list[KindStatistics]) -> bytes:
         shares = np.add.reduceat(each.pixels, starts) / max(each.pixels.sum(), 1) / np.diff(edges)
         axes.stairs(shares, edges, label=f"{each.kind.name.lower()} ({each.frames} of {each.of} frames)")
     axes.set_yscale("log")
-    finish(axes, "value of a pixel, as stored", "share of pixels per unit")
+    finish(axes, "pixel value, as stored", "share of pixels per unit")
     return png(figure)

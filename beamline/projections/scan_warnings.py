@@ -1,4 +1,6 @@
-"""Warnings of a scan while it is prepared: odd units, joined views, another axis, matter beyond the field, repairs."""
+"""Warnings before a reconstruction: unusual units, a rotation axis that differs from that of the poses, a sample
+wider than the field of view, missing and repaired pixels.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ _SAME_AXIS = 0.05  # columns
 
 
 def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> None:
-    """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
+    """Warn of a pixel size, an energy or a distance that no instrument has, probably because of a wrong unit."""
     size_mm = selection.pixel_size_mm
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
@@ -40,24 +42,27 @@ def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> N
         warn(Note(str(turned)))
     if (cone := selection.cone or source.cone) is not None and cone[1] < _LEAST_MAGNIFICATION * cone[0]:
         warn(
-            f"The cone magnifies {cone[1] / cone[0]:.4g} times only: {cone[0]:g} mm from the source to the axis and "
-            f"{cone[1]:g} mm to the detector. Check --cone SOD:SDD: SDD goes from the source, not from the axis."
+            "Check --cone SOD:SDD. SDD is the distance from the source to the detector, not from the "
+            f"axis to the detector. With the present values, {cone[0]:g} mm from the source to the axis "
+            f"and {cone[1]:g} mm to the detector, the cone magnifies only {cone[1] / cone[0]:.4g} times."
         )
 
 
 def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_col: float, warn: Warn) -> None:
-    """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
+    """Warn if the poses of a volume are used with another rotation axis than the one they were found with."""
     if poses is None or (of_poses := poses.table.axis_col) is None or selection.axis_col is not None:
         return
     if abs(of_poses - axis_col) > _SAME_AXIS:
         warn(
-            f"The poses of {poses.table} go with the rotation axis of that volume, column {of_poses:.2f}; column "
-            f"{axis_col:.2f} is used. Give --axis {of_poses:.2f} to have both."
+            f"Give --axis {of_poses:.2f}, because the poses of {poses.table} were found with the rotation "
+            f"axis at column {of_poses:.2f}. This reconstruction uses column {axis_col:.2f}."
         )
 
 
 def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: PreparedProjections, warn: Warn) -> None:
-    """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
+    """Warn of a sample beyond the field of view. If no air corrects the intensity, also warn of its changes and of
+    the ring current.
+    """
     projections, geometry = prepared.projections, prepared.geometry
     edges = FieldEdges.of(projections.data, geometry, prepared.shares)
     unlevelled = not any(projections.air_columns)
@@ -75,36 +80,49 @@ def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: Pr
 
 
 def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
-    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP,
-    `wide`: the scan has offset views."""
-    fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
+    """The warning that the sample extends beyond the field of view.
+
+    Args:
+        sides: see `FieldEdges.beyond`.
+        continued: FBP extrapolates the projections.
+        wide: the scan has laterally offset projections.
+    """
+    fbp = (
+        "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other"
+        if continued
+        else "Iterative"
+    )
     advice = (
-        "Offset views (scan.offset_views, some 8 to 16 exposures more) or a full turn with the axis near an edge "
-        "(twice the views) show the rest. "
+        "To measure the rest of the sample, take offset projections (scan.offset_views, 8 to 16 more "
+        "exposures), or a 360° scan with the rotation axis near one edge of the detector (half "
+        "acquisition, twice the projections). "
     )
     return (
-        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. {'' if wide else advice}The "
-        "edge columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
+        f"{beyond_the_field(sides)} {fbp} methods reconstruct the full width of the sample. "
+        f"{'' if wide else advice}The edge columns are therefore not used as air reference. If they do "
+        "show air, and only the beam is weaker than in the flats, use --air columns."
     )
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
-    """A warning for `FieldEdges.passing`."""
-    words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
+    """The warning for a sample that is inside the field of view in some projections only, see `FieldEdges.passing`."""
+    words = " and ".join(
+        f"at the {side} edge in projections {first} to {last}" for side, (first, last) in ranges.items()
+    )
     return (
-        f"Matter leaves the field {words} of {n_views}, and all of it is inside in others: the sample, or a part of "
-        "it, stands beside the rotation axis. What lies farther from the axis than the edge is not reconstructed, and "
-        "the rim is uncertain. Centre the sample on the axis, or move the camera until the axis is near its edge and "
-        "take a full turn."
+        "Centre the sample on the rotation axis, or move the camera until the axis is near its edge and "
+        f"take a 360° scan: the sample leaves the field of view {words} of {n_views} and is inside it in "
+        "the others. The sample, or a part of it, is off the rotation axis. Material farther from the "
+        "axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
     )
 
 
 def report_defects(prepared: PreparedProjections, first_row: int, binning: int, warn: Warn) -> None:
-    """Name slices (of a cone, rows) that no ray measured; beside them what measured nothing, by frames, rows and
-    columns, bright spots that stay, and repaired pixels if more than one in a thousand.
+    """Report slices (of a cone beam: detector rows) that no ray measured, pixels without data, zingers that remain,
+    and repaired pixels if they are more than one in a thousand.
 
     Args:
-        first_row: of the detector, at which the (binned) rows begin.
+        first_row: row of the detector at which the (binned) rows begin.
     """
     what = "slice" if prepared.geometry.rows_show_slices else "row"
     projections, (lost, between) = prepared.projections, prepared.unmeasured_rows
@@ -117,31 +135,32 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         ends = np.unique(runs[:, 2:], axis=0) * binning
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
-            f"In {count(frames.size, 'view')} of {projections.view_ids.size} ({frames_text(frames)}) pixels "
-            f"of columns {cols} and rows {rows} measured nothing: zeros or values that are not finite at a border, as "
-            "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
-            "as a post or a clamp. These rays have no weight."
+            f"In {count(frames.size, 'projection')} of {projections.view_ids.size} "
+            f"({frames_text(frames)}), pixels of columns {cols} and rows {rows} contain no data and are "
+            "ignored. Either the images were shifted or rotated before (zeros or NaN at a border), or "
+            "something opaque other than the sample stood in the beam, such as a post or a clamp."
         )
     if n := projections.spots_left:
-        large = f"Bright spots larger than 3 x 3 pixels ({count(n, 'pixel')} brighter than the open beam) stay and make"
-        warn(Note(f"{large} streaks: shield the detector against scattered and direct X-rays."))
+        large = "Shield the detector against scattered and direct X-rays: bright spots larger than 3 x 3 pixels"
+        warn(Note(f"{large} ({count(n, 'pixel')} brighter than the open beam) are not removed and make streaks."))
     shares = (
-        (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
+        (unseen.mean(), Note, "of the detector got no beam or is saturated. Its rays count as missing data."),
         (
             (masked & ~unseen).mean(),
             Note,
-            "of the detector's pixels are dead or hot and were filled from their neighbours.",
+            "of the detector's pixels are dead or hot. They were replaced with values of neighbouring pixels.",
         ),
         (
             projections.replaced,
             Note,
-            "of the pixels were bright spots of single views (zingers), or not finite: filled from their neighbours.",
+            "of the pixels were zingers (bright spots in one projection only) or not finite. They were "
+            "replaced with values of neighbouring pixels.",
         ),
         (
             projections.floored,
             str,
-            "of the pixels let less light through than the floor; their attenuation is at least what the volume says, "
-            "unless the darks are too high.",
+            "of the pixels transmit less than the smallest transmission that is used (--floor). The true "
+            "attenuation there is at least what the volume shows, unless the darks are too high.",
         ),
     )
     for share, kind, text in shares:
@@ -150,7 +169,8 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     for some, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
         if some.size:
             warn(
-                f"No ray measured {count(some.size, what)} of {len(masked)} (from 0: {spans(some.tolist())}): in all "
-                "views these rows have no beam, zeros, no finite values, or dead pixels. "
-                f"They are {so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
+                f"No ray measured {count(some.size, what)} of {len(masked)} (counted from 0: "
+                f"{spans(some.tolist())}). In all projections these detector rows have no beam, zeros, no "
+                "finite values, or dead pixels. They are "
+                f"{so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
             )

@@ -1,4 +1,4 @@
-"""Selection: which part of a scan is used, with its views, rows, rotation axis and geometry."""
+"""Selection: which part of a scan is used, with its projections, rows, rotation axis and geometry."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ class Selection:
     """Which part of a scan to use, and the corrections that differ from their defaults.
 
     Attributes:
-        views: a view selection, see recon.base.views.parse_views.
-        rows: (first, end) detector rows; None is all.
+        views: a selection of projections, see recon.base.views.parse_views.
+        rows: (first, end) detector rows; None: all.
         binning: pixels averaged per side.
-        axis_col: rotation axis in columns of the full detector; None finds it.
-        sample_width: across the beam, where the sample is wider than the field, in mm (in px where the pixel size is
-            unknown); None takes the file's, or measures it.
-        pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
-        cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
-        central_row: row of the full detector that the central ray of a cone meets, also off it; None: the middle.
-        seed: of random view selections.
-        axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
-        steps: corrections that are to do something else than their defaults, see `beamline.projections.corrections`.
+        axis_col: rotation axis in columns of the full detector; None: it is searched for.
+        sample_width: across the beam, for a sample wider than the field of view, in mm (in px if the pixel size is
+            unknown); None: the file's value, or measured.
+        pixel_size_mm: at the sample (of a cone: on the detector); None: the file's value.
+        cone: mm from the source to the rotation axis and to the detector; None: the file's values, or a parallel
+            beam.
+        central_row: detector row at which the ray perpendicular to the axis meets the detector (cone beam), also
+            outside it; None: the middle row.
+        seed: of random selections of projections.
+        axis_rows: (first, end) detector rows from which the axis is found; None: those of `rows`.
+        steps: corrections whose settings differ from the defaults, see `beamline.projections.corrections`.
     """
 
     views: str = "all"
@@ -57,7 +59,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        for name in ("rows", "cone", "axis_rows"):  # a pair from a list or an array is the same pair
+        for name in ("rows", "cone", "axis_rows"):  # a pair from a list or an array must equal the same pair as a tuple
             if (pair := getattr(self, name)) is not None:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
@@ -82,8 +84,8 @@ class Selection:
         low, high = _PIXEL_SIZES_UM
         if size_mm is not None and not low <= size_mm * 1e3 <= high:
             raise ConfigError(
-                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one "
-                "with --pixel-size-um."
+                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um is impossible; expected {low:g} to "
+                f"{high:g} um. Give the right one with --pixel-size-um."
             )
         width = source.attributes.get("sample_diameter_mm") if size_mm is not None else None
         width = width if self.sample_width is None else self.sample_width
@@ -95,11 +97,12 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSelection(Selection):
-    """What is selected of one scan: where pixel size, cone and width of the sample are left open, those of its file.
+    """What is selected of one scan; pixel size, cone and width of the sample are the file's unless the selection
+    states them.
 
     Attributes:
         rows: those that are read, whole bins.
-        asked: what was asked for.
+        asked: the selection of the user.
         shape: (height, width) of the detector.
         path: of the file.
     """
@@ -130,24 +133,25 @@ class ScanSelection(Selection):
         return ((self.shape[0] - 1) / 2 - self.detector_rows.start - (self.binning - 1) / 2) / self.binning
 
     def geometry(self, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-        """Geometry of views at `angles` in the rows and with the binning; pitch 1 if it is unknown.
+        """Geometry of projections at `angles` in the rows and with the binning; pitch 1 if it is unknown.
 
         Raises:
-            ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel beam.
+            ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel
+                beam.
         """
         rows, pitch = self.detector_rows, self.pixel_size_mm
         full = (rows.stop - rows.start, self.shape[1])
         if self.cone is not None:
             if pitch is None:
                 raise ConfigError(
-                    f"{self.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
-                    "detector)."
+                    f"Give --pixel-size-um (on the detector): a cone beam needs it, and {self.path} does "
+                    "not state its pixel size."
                 )
-            # The central ray meets the same row of the detector, whatever rows are read.
+            # The central ray meets the same detector row, whatever rows are read.
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
                 if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
-                    raise ValueError(f"the source is {self.cone[1]:g} mm from a detector {width:.4g} mm wide")
+                    raise ValueError(f"the source is {self.cone[1]:g} mm from a detector that is {width:.4g} mm wide")
                 geometry = Geometry.cone(
                     angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
                 )  # fmt: skip
@@ -156,7 +160,8 @@ class ScanSelection(Selection):
             return geometry.binned(self.binning)
         if self.central_row is not None:
             raise ConfigError(
-                f"--central-row is for a cone beam; {self.path} is a parallel one. Leave it out, or give --cone."
+                f"Omit --central-row, or give --cone: --central-row is for a cone beam, and {self.path} "
+                "is a parallel-beam scan."
             )
         pitch = 1.0 if pitch is None else pitch
         return Geometry.parallel(angles, full, pixel_pitch=pitch, axis_col=axis_col).binned(self.binning)
@@ -165,13 +170,13 @@ class ScanSelection(Selection):
 def choose_views(
     source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
 ) -> NDArray[np.int64]:
-    """Rows in `frames` of the views that the selection names; at least two.
+    """Rows in `frames` of the projections that the selection names; at least two.
 
     Args:
-        period: radians after which views see the same rays, see `Geometry.period`.
+        period: radians after which projections measure the same rays, see `Geometry.period`.
 
     Raises:
-        ConfigError: the selection is not legal, or leaves fewer than two views.
+        ConfigError: the selection is wrong, or leaves fewer than two projections.
     """
     try:
         chosen = parse_views(selection.views, source.table.angles[frames], selection.seed, period=period)
@@ -179,8 +184,8 @@ def choose_views(
         raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:
         raise ConfigError(
-            f"--views {selection.views} leaves {chosen.size} of the {frames.size} views of {source.path}; a volume "
-            "needs at least 2."
+            f"--views {selection.views} leaves {chosen.size} of the {frames.size} projections of "
+            f"{source.path}; a volume needs at least 2."
         )
     return chosen
 
@@ -197,6 +202,7 @@ def unbinned(column: float, binning: int) -> float:
 
 
 def with_pivot(geometry: Geometry, pivot: float) -> Geometry:
-    """The geometry whose views roll and tilt about the row `pivot`."""
-    # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
+    """The geometry whose projections roll and tilt about the row `pivot`."""
+    # In a parallel beam z = 0 is the middle of the rows used, but these projections roll and tilt about the detector's
+    # middle.
     return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)

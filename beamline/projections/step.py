@@ -1,4 +1,4 @@
-"""Values of a step, which is a correction of views: its options, its name, the memory it takes, and what it did.
+"""A correction step: its options, its name, the memory it needs, and the record of what it did.
 
 A step is a frozen dataclass. A field made by `option` is an option of the commands, of a recipe and of Python alike.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class NamedStep(Protocol):
-    """What a selection knows of a step; its abilities are the protocols in `beamline.projections.protocols`.
+    """What a selection knows about a step; its abilities are the protocols in `beamline.projections.protocols`.
 
     Attributes:
         name: of the step in events, and its key in `PreparedProjections.done`.
@@ -33,11 +33,11 @@ class Option:
 
     Attributes:
         name: with its dashes.
-        help: for people.
+        help: for the user.
         default: as it would be typed; None: there is nothing to type.
-        parse: what is typed to the value of the field; its ValueError is bad usage.
-        choices: what may be typed; empty: anything that `parse` takes.
-        metavar: what stands for the value in help.
+        parse: converts the typed text to the value of the field; its ValueError is bad usage.
+        choices: what may be typed; empty: anything that `parse` accepts.
+        metavar: placeholder of the value in help.
         path: it names a file.
     """
 
@@ -51,7 +51,9 @@ class Option:
 
 
 def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
-    """A field of a step that the option `name` sets; `rest` as for `Option`. Field and option share the default."""
+    """A field of a step that the option `name` sets; `rest`: the other attributes of `Option`. Field and option
+    share the default.
+    """
     made = Option(name, help, default, **rest)
     return field(default=None if default is None else made.parse(default), metadata={"option": made})
 
@@ -70,7 +72,7 @@ def positive(text: str) -> float:
     """Check that the value is a finite number above 0; raises ValueError otherwise."""
     number = float(text)
     if not 0 < number < math.inf:
-        raise ValueError(f"{text} is not above 0")
+        raise ValueError(f"{text} must be above 0")
     return number
 
 
@@ -79,9 +81,9 @@ class StepDone:
     """What a step did.
 
     Attributes:
-        sentence: a sentence; empty where nothing was asked, or nothing found.
+        sentence: a sentence; empty if nothing was asked, or nothing found.
         parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
-        warned: a warning told it.
+        warned: the sentence was already given as a warning.
     """
 
     sentence: str = ""
@@ -91,10 +93,10 @@ class StepDone:
 
 @dataclass(frozen=True)
 class StepMemory:
-    """Peak memory of a step in bytes, beside raw pixels, line integrals and volume.
+    """Peak memory of a step in bytes, in addition to raw pixels, line integrals and volume.
 
     Attributes:
-        correcting: while views are corrected, a batch at a time.
+        correcting: while projections are corrected, a batch at a time.
         alone: before or after that.
     """
 

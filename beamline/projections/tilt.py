@@ -1,4 +1,4 @@
-"""The tilt of the rotation axis that corrected views show, and the warning where nobody stated it."""
+"""In-plane tilt of the rotation axis, measured in corrected projections, and the warning if nobody stated it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from recon.prep.tilt import TiltEstimate, find_tilt
 
 MATTERS = 0.5
 """Pixels over the rows from which a tilt doubles edges."""
-_BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # bands of rows, rows of each, and views that the warning is judged by
-_FEWEST_ROWS = 32  # half a pixel over fewer rows is no tilt of a stage
+_BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # bands of rows, rows of each, and projections that the warning is based on
+_FEWEST_ROWS = 32  # half a pixel over fewer rows is not a tilt of a stage
 _SURE = 3.0  # standard deviations from which a tilt is significant
-BandsDone = Callable[[int, int], None]  # (n, N): so many bands of rows are corrected, of so many
+BandsDone = Callable[[int, int], None]  # (n, N): n bands of rows of N are corrected
 
 
 def warn_of_tilt(correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone) -> None:
     """Warn if the corrected rows of a parallel beam show a significant tilt.
 
     Args:
-        frames: views that may be used.
+        frames: projections that may be used.
     """
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
     if rows < _FEWEST_ROWS:
@@ -36,12 +36,13 @@ def warn_of_tilt(correction: ScanCorrection, frames: NDArray[np.int64], warn: Wa
     try:
         shown = shown_tilt(correction, frames, (_BANDS, _BAND_ROWS), progress)
     except (ValueError, DataError):
-        return  # nothing is known, and nothing was asked
+        return  # the tilt could not be measured, and nobody asked for it
     if abs(shown.tilt) * rows > MATTERS and abs(shown.tilt) > _SURE * shown.uncertainty:
         warn(
-            f"The rotation axis seems to lean by {tilt_text(shown.tilt, shown.uncertainty)} in the detector's plane, "
-            f"{abs(shown.tilt) * rows:.1f} px over {rows} rows: edges double in the first and last slices. "
-            "Give --tilt auto, or --tilt 0 if it is straight."
+            "Give --tilt auto (or --tilt 0 if the axis is straight): the rotation axis seems to be "
+            f"tilted in the detector's plane by {tilt_text(shown.tilt, shown.uncertainty)}, "
+            f"{abs(shown.tilt) * rows:.1f} px over {rows} rows. This doubles edges in the first and last "
+            "slices."
         )
 
 
@@ -51,7 +52,7 @@ def shown_tilt(
     size: tuple[int, int],
     progress: BandsDone,
 ) -> TiltEstimate:
-    """The tilt measured in corrected views, from the bands of rows that can be corrected.
+    """The tilt measured in corrected projections, from the bands of rows that can be corrected.
 
     Args:
         size: number of bands, and rows of each.
@@ -69,7 +70,7 @@ def shown_tilt(
         try:
             band = correction.at_once(frames, slice(first, first + height))
         except DataError:
-            continue  # no light there
+            continue  # no beam in these rows
         if not means:
             ids = band.view_ids
         if np.array_equal(band.view_ids, ids):
@@ -77,7 +78,7 @@ def shown_tilt(
             heights.append(first + (height - 1) / 2)
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
-        raise ValueError(f"{len(means)} bands of rows; at least {FEWEST_BANDS} are needed")
+        raise ValueError(f"only {len(means)} bands of rows can be used; at least {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), correction.source.table.angles[ids])
 
 

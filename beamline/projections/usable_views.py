@@ -1,4 +1,4 @@
-"""Usable views of a scan, as values: the views that are left, and the weights of views and of parts of them."""
+"""Usable projections of a scan: which remain, and the weights of projections and of regions in them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Regions:
     Attributes:
         frames: int64 [region], rows of the file.
         boxes: int64 [region, 4], first row, row after the last, first column, column after the last.
-        shares: float32 [region], what the rays in it weigh.
-        resampling: of the views, whose pixels were seen elsewhere; None: of none.
+        shares: float32 [region], the weight of the rays in it.
+        resampling: of the projections, whose pixels move by it; None: no resampling.
     """
 
     frames: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -36,14 +36,14 @@ class Regions:
     resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
-        """Mark which rays of these views have reduced weight."""
+        """Mark which rays of these projections have reduced weight."""
         return bool(np.isin(self.frames, view_ids).any())
 
     def and_unmeasured(self, runs: I64, first_row: int, binning: int) -> Regions:
-        """These, and the runs of `Projections.unmeasured`, of rays that weigh nothing.
+        """These regions, and the runs of `Projections.unmeasured`, rays of weight 0.
 
         Args:
-            first_row: of the detector, at which the binned rows of the runs begin.
+            first_row: detector row at which the binned rows of the runs begin.
         """
         boxes = runs[:, [1, 1, 2, 3]] * binning + [first_row, first_row + binning, 0, 0]
         shares = np.concatenate((self.shares, np.zeros(len(runs), np.float32)))
@@ -51,9 +51,9 @@ class Regions:
         return replace(self, frames=frames, boxes=np.concatenate((self.boxes, boxes)), shares=shares)
 
     def weights(self, view_ids: I64, rows: slice, binning: int, shape: tuple[int, int]) -> NDArray[np.float32] | None:
-        """[view, row, col] weights of the rays of some views, in binned pixels `shape` of these detector rows.
+        """[view, row, col] weights of the rays of some projections, in binned pixels `shape` of these detector rows.
 
-        None where all are 1.
+        None if all are 1.
         """
         chosen = np.isin(self.frames, view_ids)
         if not chosen.any():
@@ -82,17 +82,17 @@ class Regions:
 
 @dataclass(frozen=True, eq=False)
 class UsableViews:
-    """The views of a scan that a reconstruction may use.
+    """The projections of a scan that a reconstruction may use.
 
     Attributes:
-        scan: the evidence that they were chosen by.
+        scan: the evidence on which the choice is based.
         frames: int64 [view], their rows in the file.
-        weights: float32 [frame of the file], of each row that is a view; None: one for all.
-        left_out: views with an alarm, which are not among them.
-        sentence: what was done, in a line; empty where no view is flagged.
-        flags: of all frames, which decide the other fields unless they are ignored; None: the file has none.
-        regions: parts of views that weigh less, in views that are used otherwise.
-        jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
+        weights: float32 [frame of the file], of each row that is a projection; None: 1 for all.
+        left_out: projections with an alarm, which are not among them.
+        sentence: what was done, in a line; empty if no projection is flagged.
+        flags: of all frames, from which the other fields follow unless they are ignored; None: the file has none.
+        regions: parts of projections with less weight, in projections that are used otherwise.
+        jumps: int64, rows after which the monitor saw the sample in another place; ascending.
     """
 
     scan: ScanEvidence
@@ -105,7 +105,7 @@ class UsableViews:
     jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def only(self, frames: NDArray[np.int64]) -> UsableViews:
-        """The usable views restricted to these frames."""
+        """The usable projections restricted to these frames."""
         return replace(self, frames=frames, left_out=self.left_out + self.frames.size - frames.size)
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
@@ -135,7 +135,7 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         return UsableViews(scan, rows, flags=flags)
     if not use_flags:
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
-        n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
+        n = f"{count(int(alarmed.sum()), 'projection')} with an alarm and {warned.sum()} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
         return UsableViews(scan, rows, sentence=sentence, flags=flags)
     treated = flag_policy(flags, views, scan.source.shape)
@@ -144,22 +144,24 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
     gap = gap_sentence(scan, rows, good)
-    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all equally."
+    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all projections equally."
     regions = regions_of(treated)
     return UsableViews(scan, good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
 def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
-    """ " leave 12° without a view" if the remaining views have such a gap that the views before did not have; else
+    """ " leave 12° without a projection" if the remaining projections have a gap that was not there before; otherwise
     empty.
     """
     period = np.pi if scan.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(scan.table.angles[some], period) for some in (before, after))
-    return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
+    return f" leave {np.degrees(wide):.3g}° without a projection" if wide >= WIDE * narrow else ""
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
-    """Radians between neighbouring views that are furthest apart; views a `period` apart see the same."""
+    """Radians between the neighbouring projections that are furthest apart; projections a `period` apart measure the
+    same rays.
+    """
     sorted_angles = np.sort(np.mod(angles[np.isfinite(angles)], period))
     return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 

@@ -1,4 +1,4 @@
-"""The views of a scan: which may be used, and their geometry as stated and with what corrections find out."""
+"""The projections of a scan: which may be used, and their geometry as stated and as corrections change it."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from recon.base.geometry import Geometry
 
 
 def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
-    """The geometry of the selected views, as scan and options state it, before any frame is read.
+    """The geometry of the selected projections, as scan and options state it, before any frame is read.
 
-    An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
+    An axis that is to be found is assumed in the middle; projections without an angle or a pose are left out.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -54,13 +54,13 @@ def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
 
 @dataclass(eq=False)
 class ViewGeometry:
-    """The geometry of views: stated angles, and what the steps find and change.
+    """The geometry of projections: stated angles, and what the steps find and change.
 
     Attributes:
         stated_axis: the column of the rotation axis before calibration.
-        moved: where the sample was in the views, by the name of the step that found it.
+        moved: where the sample was in the projections, by the name of the step that found it.
         width: what was done about the width of rays.
-        learnt: what was learnt of the geometry, by the name of the step.
+        learnt: what was calibrated, by the name of the step.
     """
 
     scan: ScanEvidence
@@ -82,7 +82,7 @@ class ViewGeometry:
         return {**{name: motion.done for name, motion in self.moved.items()}, Width.name: self.width, **calibrated}
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
-        """Let each step find the sample position; returns the `usable` views that remain usable."""
+        """Let each step find the sample position; returns the `usable` projections that remain usable."""
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
             motion = step.place(self.scan.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
@@ -92,7 +92,7 @@ class ViewGeometry:
         return usable
 
     def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
-        """Calibrate the geometry from these views, if that is requested."""
+        """Calibrate the geometry from these projections, if that is requested."""
         for step in geometry_steps(self.selection):
             if step.geometry:
                 phases.enter("calibration", "steps")
@@ -100,7 +100,7 @@ class ViewGeometry:
                 self.learnt[step.name] = learnt
 
     def uncalibrated(self, part: ScanSelection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views without calibration."""
+        """The geometry of projections without calibration."""
         source = self.scan.source
         geometry = part.geometry(self.stated_axis, source.table.angles[view_ids])
         if (aside := source.table.aside) is not None:
@@ -111,27 +111,29 @@ class ViewGeometry:
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views."""
+        """The geometry of projections."""
         geometry = self.uncalibrated(self.selection, view_ids)
         for learnt in self.learnt.values():
             geometry = learnt.corrected(geometry, view_ids)
         return geometry
 
 
-_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
+_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules that do not apply if vectors state the pose of each projection
 
 
 def evidence_request(source: ScanSource, selection: Selection) -> EvidenceRequest:
-    """What a reconstruction of `selection` asks of the evidence; the monitor looks at the frames where that asks."""
+    """What a reconstruction of `selection` requests from the evidence; the monitor checks the frames if that is
+    requested.
+    """
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
     return EvidenceRequest(asked.accepted, selection.cone, judged)
 
 
 def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:
-    """The usable views of a finished scan, by the flags of the monitor.
+    """The usable projections of a finished scan, according to the flags of the monitor.
 
-    Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
+    Faults of the file that do not prevent a reconstruction become warnings, and so does the effect of the flags.
 
     Raises:
         DataError: it cannot be reconstructed; with every reason, and what to do about each.
@@ -157,7 +159,9 @@ def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> U
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raise DataError for the errors among the findings, with a remedy for each; numbers that wrapped explain all."""
+    """Raise DataError for the errors among the findings, with a remedy for each; numbers that overflowed explain all
+    other errors.
+    """
     errors = [finding for finding in findings if finding.severity == "error"]
     wrapped = [finding for finding in errors if finding.rule == WRAPPED]
     reasons = [finding.message for finding in wrapped or errors]

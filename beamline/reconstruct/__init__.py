@@ -1,1 +1,1 @@
-"""Reconstruct: a finished or a growing scan file becomes a volume file with its report."""
+"""Reconstruct: from a finished or growing scan file to a volume file with its report."""

@@ -1,4 +1,4 @@
-"""Budget: of the methods that a choice tries, those whose forecast ends in time."""
+"""Budget: selects the methods that `auto` may try within a time limit."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def in_budget(
         chosen = _without_slow(method, kept)
     if (late := expected - (end - now())) > 0:
         warn(
-            f"{duration_text(budget)} are too short for this scan: the quickest method, {kept[0].name}, runs all "
-            f"the same and ends about {duration_text(late)} late."
+            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which is "
+            f"used now, ends about {duration_text(late)} late."
         )
     names = [each.name for each in kept]
     out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]

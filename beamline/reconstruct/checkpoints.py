@@ -1,4 +1,4 @@
-"""Checkpoints of a fit: keeps its state with its origin, and checks the origin before a fit resumes."""
+"""Checkpoints of a fit: saves its state with its origin, and checks the origin before the fit is resumed."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ class CheckpointOptions:
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
-                f"--resume {self.resume} has {reached.step} steps already, more than the {steps} requested: give at "
-                f"least {reached.step} with --steps, or start anew without --resume."
+                f"--resume {self.resume} has already {reached.step} steps, more than the {steps} requested. Use "
+                f"--steps {reached.step} or more, or start again without --resume."
             )
         if steps != kept.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
@@ -149,7 +149,10 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
         if not (np.isfinite(reached.unit) and reached.unit > 0):
             raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
     except ValueError as error:
-        raise DataError(f"The checkpoint {path} is damaged: {error}. Resume from another, or start anew.") from error
+        raise DataError(
+            f"The checkpoint {path} is damaged: {error}. Resume from another checkpoint, or start again without "
+            "--resume."
+        ) from error
     return kept, reached
 
 
@@ -159,6 +162,6 @@ def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Valu
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} belongs to another {of}: {listed}. Give the options that it was made with, or start anew without "
-            "--resume. Nothing was touched."
+            f"{path} was written for another {of}, so it cannot be resumed: {listed}. Use the same options as then, or "
+            "start again without --resume. No file was changed."
         )

@@ -1,4 +1,4 @@
-"""Estimate of a reconstruction before it begins: memory, time, and bytes on disk."""
+"""Estimates memory, time and disk space of a reconstruction before it starts."""
 
 from __future__ import annotations
 
@@ -50,16 +50,17 @@ class Estimate(Need):
     free: int
 
     def lines(self) -> list[str]:
-        in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
+        in_slabs = f"in {count(self.slabs, 'slab')}; a volume in one piece would need {size(self.at_once)}"
         if self.done:
-            in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
+            in_slabs = f"in {count(self.slabs, 'slab')} remaining; {self.done} of {self.shape[0]} slices are done"
         how = in_slabs if self.scratch else "all at once"
         *several, z, y, x = self.shape
         what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
         return [
-            f"{what}{z} x {y} x {x} voxels by {self.method}, from {self.views} views",
+            f"{what}{z} x {y} x {x} voxels with {self.method}, from {self.views} projections",
             f"{'memory':<10}{size(self.memory or 0)} of {size(self.allowed)}, {how}",
-            f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
+            f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} for temporary files; "
+            f"{size(self.free)} free",
             f"{'time':<10}{self._time()}",
         ]
 

@@ -1,4 +1,4 @@
-"""Followed views: which frames of a growing file are views, their geometry, and how far the fit has come with them."""
+"""Projections of a growing file: which frames they are, their geometry, and how many of them the fit has used."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ class Cursor:
     """Progress of the fit in a growing file.
 
     Attributes:
-        frames: in the file at the last look.
-        taken: of them, those that were corrected, or are not views.
-        part: of the file, whose views were corrected last.
-        batches: line integrals of the views that are corrected for good: what the volume grows from.
-        newest: the view after them, provisional: it is in the fit already, and is corrected again with the next one.
+        frames: number of frames in the file when it was last read.
+        taken: number of these frames that were corrected, or that are not projections.
+        part: the part of the file whose projections were corrected last.
+        batches: line integrals of the projections with their final correction, from which the volume grows.
+        newest: the projection after them. The fit uses it already, but it is corrected again together with the next
+            one.
     """
 
     frames: int = 0
@@ -65,56 +66,56 @@ class Cursor:
 
     @property
     def view_ids(self) -> NDArray[np.int64]:
-        """Rows of the file of the views in `batches`."""
+        """Rows in the file of the projections in `batches`."""
         return np.concatenate([batch.view_ids for batch in self.batches])
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedViews:
-    """The selected views of a scan file that is still growing."""
+    """The selected projections of a scan file that is still growing."""
 
     source: ScanSource
     selection: ScanSelection
 
     @property
     def n(self) -> int:
-        """Number of views in the file, flagged ones included."""
+        """Number of projections in the file, including flagged ones."""
         return self.source.table.views.size
 
     def usable(self) -> UsableViews:
-        """The views in the file that may be used."""
+        """The projections in the file that may be used."""
         return usable_views(ScanEvidence(self.source), self.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which of these frames the selection uses, by their index among all views so far, which later views do not
-        change.
+        """Those of these frames that the selection uses. It selects by the index among all projections so far, which
+        does not change when later ones arrive.
         """
         taken = self.source.table.of_kind(FrameKind.PROJECTION, FrameKind.INVALID)
         chosen = parse_views(self.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
-        """The geometry of views with the width of their rays, and what was done about that."""
+        """The geometry of these projections with the width of their rays, and what the step for it did."""
         geometry = self.selection.geometry(axis_col, self.source.table.angles[view_ids])
         return self.selection.step(Width).rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[view] radians for the fit: mid-exposure, middle row. The fit ignores motion."""
+        """Angles for the fit [view] in radians, at mid-exposure and for the middle row. The fit ignores motion."""
         geometry, _ = self.geometry(axis_col, view_ids)
         return np.asarray(geometry.angles + geometry.skew * (geometry.detector_shape[0] - 1) / 2)
 
 
-_FIRST_VIEWS = 12  # fewer views do not determine an axis
+_FIRST_VIEWS = 12  # fewer projections do not determine an axis
 _UNKNOWN = (
-    "These views do not show the rotation axis yet: that of a sample wider than the field is known after half a turn. "
-    "Until then slices are about the middle of the detector, and no volume begins. --axis COLUMN gives the axis now; "
-    "optics.axis_col in the configuration states it in the files of later scans."
+    "If you know the rotation axis, use --axis COLUMN, or optics.axis_col in the configuration of later scans. "
+    "The projections do not show the axis yet, because the sample is wider than the field of view; after 180° it can "
+    "be found. Until then the slices use the middle of the detector as axis, and the volume does not start."
 )
 
 
 class AxisSearch:
-    """Repeats the search for the rotation axis each time the views have grown by half, at a quarter of a turn, at half
-    a turn, and at the end.
+    """Repeats the search for the rotation axis each time the number of projections has grown by half, at 90°, at 180°,
+    and at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.

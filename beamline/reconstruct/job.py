@@ -1,4 +1,4 @@
-"""Job: views from a source, and the volume that is made of them: at once or in slabs."""
+"""Job: prepares the projections of a source and reconstructs the volume, in one piece or in slabs."""
 
 from __future__ import annotations
 
@@ -49,21 +49,24 @@ from recon.warm_up import warm_up
 def progress_events(
     sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
 ) -> Callable[[Progress], None]:
-    """A listener that forwards progress as events, with `per_s` (steps) and `eta_s`; None if unknown.
-    `seconds`: time of the fit, if no number of steps is planned. `waiting`: views that it has not learnt yet.
+    """A listener that forwards progress as events, with `per_s` (steps) and `eta_s` (None if not known).
+
+    Args:
+        seconds: time limit of the fit, if no number of steps is planned.
+        waiting: gives the number of projections that the fit has not used yet.
     """
     first: Progress | None = None
     step = 0
 
     def on_progress(progress: Progress) -> None:
         nonlocal first, step
-        if first is None or progress.step < step:  # a followed scan's fit may begin anew
+        if first is None or progress.step < step:  # the fit of a followed scan may start again
             first = progress
         step = progress.step
         made, spent = progress.step - first.step, progress.seconds - first.seconds
         rate = made / spent if made > 0 and spent > 0 else None
         eta = None
-        if progress.steps:  # of this part of the work alone
+        if progress.steps:  # of this part of the work only
             eta = seconds_left(made, progress.steps - first.step, spent)
         elif seconds is not None and not progress.unit:
             eta = max(0.0, seconds - spent)
@@ -84,7 +87,7 @@ def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
 
 
 def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
-    """Report what each correction did to the views; an empty text is not reported."""
+    """Report what each correction did to the projections; empty texts are left out."""
     for state, message in messages.items():
         if message:
             sink(StateEntered(state, message, time=clock.now()))
@@ -95,8 +98,9 @@ class Channels:
     """Events, warnings, clock and stop requests of one reconstruction.
 
     Attributes:
-        stop_scope: opens what asks for an early end, with the volume so far.
-        started, worked: when the call began, by the clock, and in seconds of this process's work.
+        stop_scope: context in which the work can be stopped with the volume reached so far.
+        started: time at which the call started, by `clock`.
+        worked: CPU time in s that this process had used by then.
     """
 
     sink: Sink
@@ -110,16 +114,16 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A reconstruction: its views from a source of views, and how the volume is computed from them.
+    """A reconstruction: the prepared projections, and how the volume is computed from them.
 
     Attributes:
-        options: with the rows that show the region, and the seconds that are left for the method.
-        facts: reads the facts of the scan, once the volume is there.
-        stopping: opens what ends the work with the volume so far.
-        stop: asks for that; of an open scope.
-        slabs: in which the volume is made; none: at once.
-        final_fit: ends a fit that has grown with the views; None: the options' method makes the volume.
-        leaves: whether there is time for so many seconds before the report.
+        options: the options, with the rows that show the region and the time that remains for the method.
+        facts: reads the facts of the scan, after the volume is done.
+        stopping: context in which the work can be stopped with the volume reached so far.
+        stop: the stop request of the open context.
+        slabs: the slabs in which the volume is reconstructed; empty: in one piece.
+        final_fit: end of a fit that has grown with the projections; None: the method of the options is used.
+        leaves: tells whether this number of seconds is left before the report.
     """
 
     options: ReconOptions
@@ -162,9 +166,9 @@ def refused(options: ReconOptions, by: str = "") -> Iterator[None]:
 
 
 def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock: Clock) -> None:
-    """Compile the kernels in this process, once per machine, and report it; cluster workers compile their own.
+    """Compile the kernels in this process (only once per computer) and report it. Cluster workers compile their own.
 
-    The time must count neither in the run nor in the estimated time left.
+    The time for this counts neither as time of the run nor in the estimated remaining time.
     """
     method, compiled = options.method, compilation_events(sink, clock)
     methods = method.alternatives if options.budget is not None else (method,)
@@ -176,7 +180,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
 def runner_of(
     options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
 ) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
-    """`run_on` with seed and device of the options; errors of the method name the scan file."""
+    """`run_on` with the seed and device of the options. Errors of the method name the scan file."""
 
     def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
         with refused(options, f" by {method.name}"):
@@ -186,7 +190,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs, or at once; returns the volume, 0 where no ray measured it, and the views as used."""
+    """Reconstruct in slabs or in one piece. Returns the volume (0 where no ray passed) and the projections used."""
     made, used = _volume_of(job, decided)
     lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), made.volume, used.geometry
     if lost.size and geometry.is_cone:
@@ -213,24 +217,24 @@ def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPr
         return replace(made, outside=None), without_outside(prepared, made)
     made = _by_slabs(job, decided)
     if not job.options.method.weighs and prepared.view_weights is not None:
-        # For the record: FBP takes all rays alike, and so do its figures.
+        # Only recorded, because FBP and its figures of merit treat all rays equally.
         made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
         prepared = replace(prepared, view_weights=None)
     return made, prepared
 
 
 def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstruction:
-    """The result with how it ended, and what was chosen, without what only a next run, or a comparison, needs."""
+    """The result with its ending and the reason for the method, without data that only a resumed fit would need."""
     chosen = chosen or (result.chosen and f"{result.method}: {result.chosen}")
     return replace(result, chosen=chosen, ending=ending, checkpoint=None, at=None)
 
 
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
-    """The volume with the standard deviation of each voxel; if that was stopped, without it and with a warning."""
+    """The volume with the standard deviation of each voxel. If this is stopped, the volume without it and a warning."""
     if made.ending.early:
-        job.channels.warn("There are no error bars, because the reconstruction was stopped.")
+        job.channels.warn("No error bars were computed, because the reconstruction was stopped.")
         return made
-    job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
+    job.say("The volume is done; its error bars are computed next. Press Ctrl-C to leave them out.", "error_bars")
     method = job.options.method_for(job.prepared.geometry)
     method = {each.name: each for each in method.alternatives}.get(made.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
@@ -242,10 +246,10 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
             deviation = deviation_by_slabs(*given, job.slabs, decided.made, control, job.say)
         else:
             deviation = deviation_of(*given, decided.made, control)
-    except ValueError as error:  # hours may be in the volume
+    except ValueError as error:  # do not discard a volume that may have taken hours
         deviation, why = None, str(error)
     if deviation is None:
-        job.channels.warn(f"There are no error bars: {why}. The volume is complete.")
+        job.channels.warn(f"No error bars were computed: {why}. The volume is complete.")
         return made
     factors = method_on_voxels(method, decided.made).error_bars
     assert factors is not None
@@ -254,15 +258,15 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
 
 
 def _at_once(job: Job, decided: Decisions) -> Reconstruction:
-    """Run a method on the whole volume; save checkpoints and continue from one if asked to."""
+    """Run a method on the whole volume. Saves checkpoints, and continues from one, if the options ask for it."""
     options, prepared, checkpoints, method = job.options, job.prepared, job.options.checkpoints, job.method
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
-        assert isinstance(method, Fit)  # other methods were refused
+        assert isinstance(method, Fit)  # for other methods the options raised an error
         settings, others = method.provenance
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.channels.warn)
-    lost = ""  # why the last checkpoint was left out
+    lost = ""  # why the last checkpoint could not be written
 
     def keep(state: Mapping[str, NDArray[Any]]) -> None:
         nonlocal lost
@@ -286,7 +290,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
 
 def _of_preset(job: Job, result: Reconstruction) -> str:
-    """Steps and Gaussians that a preset chose; without one, a warning if a fit could not have the number asked for."""
+    """Steps and Gaussians of a preset, in words. Without a preset: warn if a fit started with too few Gaussians."""
     method, started_from = job.method, result.started_from
     if not isinstance(method, Fit):
         return ""
@@ -295,7 +299,8 @@ def _of_preset(job: Job, result: Reconstruction) -> str:
     asked = method.gaussians
     if isinstance(asked, int) and job.options.checkpoints.resume is None and started_from < asked:
         job.channels.warn(
-            f"The fit started from {started_from} Gaussians, not from {asked}: the sample is too small for more."
+            f"The fit started with {started_from} Gaussians instead of {asked}, because the sample is too small for "
+            "more."
         )
     return ""
 
@@ -303,7 +308,7 @@ def _of_preset(job: Job, result: Reconstruction) -> str:
 def _is_early(job: Job, result: Reconstruction) -> bool:
     """Whether a stop ended the method before its last step."""
     method = job.method
-    # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
+    # Voxel refinement, and the factors of several volumes, come after the last step and can also be stopped.
     if isinstance(method, Series) or (isinstance(method, Fit) and method.finish_sweeps > 0):
         return job.stop.stopped
     return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))

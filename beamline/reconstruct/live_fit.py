@@ -1,4 +1,4 @@
-"""The live fit: a machine of four states that turns the frames of a growing scan into a volume.
+"""Live fit: reconstructs a volume from the frames of a running scan. A state machine with four states.
 
 ```
 WAITS_FOR_REFERENCES --darks and flats can be used--> WAITS_FOR_AXIS --its column is known--> FEEDS --finish--> ENDED
@@ -45,20 +45,26 @@ from recon.splatting.stream import StreamingFit
 from recon.splatting.time_limit import FinalFit
 
 _NONE, _ONE_VIEW = np.empty(0, np.int64), np.zeros(1)  # rows of the file; rad
-BATCH_VIEWS = 32  # views corrected before the fit goes on
-_LEAST_VIEWS = 16  # of a volume after a stop
-_BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
-_AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
-
-# Why all views are corrected again.
-_OUTDATED = (
-    "Flats or darks came after views, air columns changed, or new views lie between earlier ones, with which bright "
-    "spots are found: all views are corrected again"
+BATCH_VIEWS = 32  # projections that are corrected before the fit continues
+_LEAST_VIEWS = 16  # projections needed for a volume after a stop
+_BEHIND = (
+    0.5  # steps per projection; below this, FBP matches the projections better (tests/bench/test_live_accuracy.py)
 )
-_NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
-_SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
-_OFFSET = "The volume takes the offset views of its scan, too: all views are corrected again, with these"
-_SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
+_AXIS_MOVES = 1.0  # px; a larger change of the axis restarts the fit
+
+# Reasons to correct all projections again.
+_OUTDATED = (
+    "Correcting all projections again, for one of these reasons: new flats or darks arrived, the air columns changed, "
+    "or new angles lie between earlier ones (neighbours in angle are used to find zingers)"
+)
+_NEXT_PART = (
+    "Correcting all projections again, each with the flats of its own part, because the next part of the run starts"
+)
+_SEVERAL_PARTS = "Correcting all projections again at the end, because the run has several parts"
+_OFFSET = "Correcting all projections again, now together with the laterally offset projections"
+_SHADED = (
+    "Correcting all projections again without an object that is in the beam in all projections, but not in the flats"
+)
 
 
 class ScanFollower:
@@ -141,7 +147,10 @@ class ScanFollower:
         blockers = findings_of(self._scan, BEFORE_VIEWS)
         if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
             if not self._references_follow:
-                message = "No darks or no flats before the views: the volume begins when the scan has ended"
+                message = (
+                    "No live volume during this scan, because no darks or no flats were taken before the projections. "
+                    "The reconstruction starts after the scan"
+                )
                 self._sink(StateEntered("waiting", message, time=self._clock.now()))
             self._references_follow = True
             return False
@@ -216,7 +225,8 @@ class ScanFollower:
         while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
                 self._warn(
-                    f"Stopped: the volume is reconstructed from the first {self.n_views_taken} of {self.views.n} views."
+                    f"Stopped: the volume is reconstructed from the first {self.n_views_taken} of {self.views.n} "
+                    "projections."
                 )
                 return
             self.take_new_frames(ended=True)
@@ -256,7 +266,10 @@ class ScanFollower:
         if shaded:
             why = _SHADED
         if gone:
-            why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
+            why = (
+                f"The fit continues without {count(gone, 'projection')} that it had used and that the monitor flagged "
+                "later or the scan took again"
+            )
         self._sink(StateEntered("correcting", why, time=self._clock.now()))
         self._cursor = replace(self._cursor, batches=())  # not both in memory
         self._correction = self._correction.renewed(every := np.union1d(frames, wide))
@@ -288,9 +301,9 @@ class ScanFollower:
             return
         self._said_behind = True
         message = (
-            f"The fit does not keep up: {count(progress.step, 'step')} for {progress.n_views} views, "
-            f"{self.waiting} wait. FBP is shown where it predicts views better, and the last round takes the steps "
-            "that are missing"
+            f"Nothing to do: the live fit is slower than the scan ({count(progress.step, 'fitting step')} for "
+            f"{progress.n_views} projections so far; {count(self.waiting, 'projection')} waiting). FBP is shown "
+            "whenever it matches held-out projections better. After the scan, the final fit makes up the missing steps"
         )
         self._sink(StateEntered("behind", message, time=self._clock.now()))
 
@@ -328,8 +341,8 @@ class ScanFollower:
         self._settle_newest()  # the scan was stopped: no other view comes
         if usable.jumps.size:
             self._warn(
-                f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
-                "`beamline recon` on the finished file leaves out the views of the shorter side."
+                f"The sample jumped at {frames_text(usable.jumps)}. The live volume does not correct for it. After the "
+                "scan, run `beamline recon` on the file: it uses the longer part of the scan, before or after the jump."
             )
         wide = self.source.table.offset_views
         parts = self.source.table.part_starts.size
@@ -349,8 +362,8 @@ class ScanFollower:
                 last = self._clock.now()
 
         message = (
-            f"The last round of the fit: {self._fit.last_steps} steps over all {count(self._fit.n_views, 'view')}, "
-            f"then sweeps on voxels; {seconds:g} s at most. A stop takes the volume as it is by then"
+            f"Final fit: {self._fit.last_steps} steps over all {count(self._fit.n_views, 'projection')}, then "
+            f"refinement of the voxel volume; at most {seconds:g} s. Ctrl-C keeps the volume reached so far"
         )
         self._sink(StateEntered("finishing", message, time=last))
         return FinalFit(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)

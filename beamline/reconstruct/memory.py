@@ -1,4 +1,4 @@
-"""The memory of a reconstruction, at once and in slabs, what is refused because of it, and workers elsewhere."""
+"""The memory that a reconstruction needs, in one piece and in slabs, errors if it is too much, and remote workers."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from recon.voxels.direct import Fbp
 
 SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
 
-_COPIES = 4  # float32 copies of a view while it is corrected
-_ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
+_COPIES = 4  # float32 copies of a projection while it is corrected
+_ROWS = 16  # number of slices that FBP makes together; the height of slabs is a multiple of it
 _NO_STEPS = StepMemory()
-_ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
+_ASIDE = 64_000_000  # bytes for figures of merit, or for a step that runs alone, that are not counted
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class ReconMemory:
     """Memory of a reconstruction in bytes.
 
     Attributes:
-        geometry: of the views, binned, of all scans.
-        raw: of the pixels as they are read.
-        steps: bytes that the steps of the correction take.
-        largest_step: name of the one that takes the most alone.
-        bars: error bars are made, too.
-        radius: mm from the rotation axis to the end of a sample wider than the field; None: it ends within.
-        taller: the sample goes on above or below the field of a cone.
-        weights: bytes of the weights of rays that stay in memory beside line integrals.
+        geometry: geometry of the binned projections of all scans.
+        raw: memory of the pixels as they are read.
+        steps: memory of the correction steps.
+        largest_step: name of the step that needs the most memory alone.
+        bars: True if error bars are computed, too.
+        radius: radius of a sample wider than the field of view in mm; None: the sample is inside.
+        taller: True if the sample extends above or below the field of view of a cone beam.
+        weights: memory of the ray weights that stay in memory together with the line integrals.
     """
 
     method: Method
@@ -80,16 +80,16 @@ class ReconMemory:
 
     @property
     def _alone(self) -> int:
-        """A step that is alone in memory, beyond the program's own."""
+        """Memory of a step that runs alone, if it is more than the program itself needs."""
         return self.steps.alone if self.steps.alone > _ASIDE else 0
 
     @property
     def view(self) -> int:
-        """Memory while one view is corrected."""
+        """Memory while one projection is corrected."""
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """Memory of a slab of `height` slices, with its views and weights; figures of merit need less."""
+        """Memory of a slab of `height` slices, with its projections and weights; figures of merit need less."""
         halo = self.method.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
@@ -98,7 +98,7 @@ class ReconMemory:
         return self.weights + rays + work
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
-        """The method, or its error bars beside its volume."""
+        """Memory of the method, or of its error bars together with its volume."""
         work = method.memory(geometry, grid, self.weighted)
         if not self.bars:
             return work
@@ -107,7 +107,7 @@ class ReconMemory:
 
     @property
     def figures(self) -> int:
-        """Memory of the figures of merit for a volume on disk, without that of the program; FBP needs less."""
+        """Memory of the figures of merit for a volume on disk, without that of the program itself; FBP needs less."""
         most = judge_memory(self.geometry, fitted=self.method.fitted)
         return most if most > _ASIDE else 0
 
@@ -119,16 +119,16 @@ class ReconMemory:
     @property
     def parts(self) -> dict[str, int]:
         """Bytes of each part that must fit alone, by its name in an error."""
-        views = f"{self.geometry.n_views} views of {self.geometry.detector_shape[1]} columns"
+        views = f"{self.geometry.n_views} projections of {self.geometry.detector_shape[1]} columns"
         return {
             f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
-            "the correction of a view": self.view + self.steps.correcting,
+            "the correction of a projection": self.view + self.steps.correcting,
             f"the step {self.largest_step}": self._alone,
-            "the measurement of the volume": self.figures,
+            "the check of the volume": self.figures,
         }
 
     def height(self, memory: int) -> int:
-        """Slices of the largest slabs of equal height that fit the memory, which must be at least `least`."""
+        """Height of the largest slabs of equal height that fit into the memory, which must be at least `least`."""
         for parts in range(1, self.rows // _ROWS + 2):
             height = math.ceil(self.rows / parts / _ROWS) * _ROWS
             if self.slab(height) <= memory:
@@ -142,11 +142,11 @@ class ReconMemory:
 
 
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
-    """Memory for reconstructing the chosen views of a scan, before any frame is read.
+    """Memory for reconstructing the selected projections of a scan, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
-        DataError: the poses do not.
+        DataError: the poses do not fit the scan.
     """
     selection, method = options.selection.of(source), options.method
     geometry = stated_geometry(source, selection)
@@ -165,7 +165,7 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
 
 
 def memory_of(options: ReconOptions) -> int:
-    """Memory in bytes allowed for this process, and for each worker on this machine or Slurm job."""
+    """Memory in bytes allowed for this process, and for each worker on this computer or Slurm job."""
     if options.memory is not None:
         return options.memory
     free = free_memory()
@@ -178,9 +178,9 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
-            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes in time are not made in slabs: "
-            f"give {rows}--bin. Nothing was written."
+            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels need "
+            f"{size(needs.at_once)} of memory, but {size(memory)} is allowed. Use {rows}--bin, because volumes in time "
+            "cannot be made in slabs. Nothing was written."
         )
     poses = stated_poses(source, options.selection)
     whole = {
@@ -192,8 +192,8 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
     for option, given in whole.items():
         if given:
             raise ConfigError(
-                f"{option} needs the whole scan in memory: {source.path} takes {size(needs.at_once)}, {size(memory)} "
-                f"may be used. Leave it out, or give --bin {2 * options.selection.binning} or --rows."
+                f"{option} needs the whole scan in memory: {source.path} needs {size(needs.at_once)}, but "
+                f"{size(memory)} is allowed. Leave it out, or use --bin {2 * options.selection.binning} or --rows."
             )
 
 
@@ -203,9 +203,9 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
     raise DataError(
-        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} takes {size(needs.least)} of memory, "
-        f"{size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if there is as much, "
-        f"or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} needs {size(needs.least)} of memory, but "
+        f"{size(memory)} is allowed. Use --memory {math.ceil(needs.least / 1e6)}M if the computer has that much, or "
+        f"--bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
     )
 
 

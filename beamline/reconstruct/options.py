@@ -1,4 +1,4 @@
-"""Options of a reconstruction: scan, selection, method, and where its results go."""
+"""Options of a reconstruction: scan, selection, method, and the files for the results."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from recon.voxels.fbp import Filter
 
 
 def report_beside(output: Path) -> Path:
-    """The report of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
+    """Path of the report: report.html next to the recon.h5 of a run, otherwise the name of the output with .html."""
     return output.with_name(REPORT) if output.stem == "recon" else output.with_suffix(".html")
 
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Paths of the results. `report` is None if none is wanted; `replace` overwrites older results. If `written` is
-    False, the folder of `output` serves as scratch only."""
+    """Paths of the results. report: None if no report is wanted. replace: overwrite older results. written: if False,
+    no volume is written, and the folder of `output` is only used for temporary files."""
 
     output: Path
     report: Path | None
@@ -44,7 +44,7 @@ class OutputPaths:
 
     @property
     def partial(self) -> Path:
-        """The file of a volume made in slabs, until it is finished."""
+        """The file with the finished slabs of a volume, until all slabs are finished."""
         return self.output.with_name(f"{self.output.stem}.partial.h5")
 
     @property
@@ -56,8 +56,8 @@ class OutputPaths:
         """Raise DataError if slabs of an earlier call exist."""
         if os.path.lexists(self.partial):
             raise DataError(
-                f"{self.partial} exists: it has the slabs of an interrupted call. Continue it with --resume "
-                f"{self.partial}, or move it away. Nothing was touched."
+                f"{self.partial} has the finished slabs of an earlier call that was interrupted. Continue with "
+                f"--resume {self.partial}, or move the file away. Nothing was changed."
             )
 
     def refuse_existing(self) -> None:
@@ -83,8 +83,9 @@ class OutputPaths:
         if n_bytes + meanwhile > free:
             work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
             raise DataError(
-                f"The volume takes {size(n_bytes)}{work}, the disk of {self.output} has {size(free)} free. Free some "
-                "space, name an output elsewhere with -o, or give --bin. Nothing was written."
+                f"Not enough disk space: the volume needs {size(n_bytes)}{work}, but the disk of {self.output} has "
+                f"{size(free)} free. Free some space, name an output on another disk with -o, or use --bin. Nothing "
+                "was written."
             )
 
 
@@ -93,11 +94,11 @@ class FollowTiming:
     """Intervals for following a scan, in s.
 
     Attributes:
-        poll: between looks at the file while there is nothing to fit.
-        slice: of fitting between looks at the file.
-        snapshot: between intermediate volumes.
-        picture: between slices by FBP, at least; drawing them takes at most half of the time.
-        patience: without a new frame, before a file without the lock of its writer counts as one that died.
+        poll: time between two readings of the file if there is nothing to fit.
+        slice: time of fitting between two readings of the file.
+        snapshot: time between two intermediate volumes.
+        picture: least time between two pictures of FBP slices; drawing takes at most half of the time.
+        patience: a scan counts as dead if its file has no lock and no new frame came for this time.
     """
 
     poll: float = 0.1
@@ -112,20 +113,21 @@ class ReconOptions:
     """The options of a reconstruction; the help of `beamline recon` explains them further.
 
     Attributes:
-        method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
-        budget: s from line integrals to volume; methods of a choice that would take longer are left out.
-        quality: a preset instead of the fit's steps, Gaussians.
-        filter: of the FBP that the volume is compared with.
-        truth: FILE or FILE:first:end to compare with.
-        unfinished: take the present frames of a scan that still runs or died.
-        follow: settings for a scan that is still running; None for one that has ended.
+        method: the method with its settings. `R2.seconds` limits the whole call, or the time after the end of the scan
+            if the scan is followed.
+        budget: time limit in s from line integrals to volume; `auto` does not try methods that would take longer.
+        quality: a preset for the number of steps and Gaussians.
+        filter: filter of the FBP that the volume is compared with.
+        truth: ground truth for the comparison, as FILE or FILE:first:end.
+        unfinished: use the existing frames of a scan that is still running or died.
+        follow: settings for a scan that is still running; None for a finished scan.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
-        cluster: whose workers reconstruct slabs, as `--cluster` names them; None: this process does.
-        region: the box of the volume to make; None: all of it.
-        partial: volume whose missing slabs are reconstructed; None begins anew.
-        uncertainty: make the standard deviation of each voxel, too, see `recon.error_bars`.
-        command: that repeats this, for the record.
-        recipe: its options that hold for any scan, as YAML, for the record.
+        cluster: workers that reconstruct slabs, in the form of `--cluster`; None: this process does it.
+        region: the box of the volume to reconstruct; None: the whole volume.
+        partial: partial volume whose missing slabs are reconstructed; None: start from the beginning.
+        uncertainty: also compute the standard deviation of each voxel, see `recon.error_bars`.
+        command: the command line of this call, which the file states.
+        recipe: the options that apply to any scan, as YAML, which the file states.
     """
 
     source: SourceOptions
@@ -157,15 +159,15 @@ class ReconOptions:
         if not in_slabs:
             return volume * self.target.written * (1 + self.uncertainty), 0
         compared = self.target.report is not None and self.method.fitted
-        slabs = self.partial is None  # else they are there
+        slabs = self.partial is None  # otherwise their file exists already
         bars = self.uncertainty
         if not self.target.written:
             return 0, (slabs + compared + bars) * volume
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:
-        """The same options with the rows that show the region, which is found first if it is the one around the sample;
-        unchanged if the whole volume is wanted.
+        """The options with the detector rows that show the region; unchanged if the whole volume is wanted. If the
+        region is the one around the sample, it is found first.
 
         Raises:
             ConfigError, DataError: see `region.selection_around` and `region.box_around_sample`.
@@ -180,22 +182,22 @@ class ReconOptions:
 
     @property
     def partial_path(self) -> Path:
-        """Where finished slabs are stored while others are made."""
+        """The file in which finished slabs are stored while the others are reconstructed."""
         return self.target.partial if self.partial is None else self.partial
 
     def method_for(self, geometry: Geometry) -> Method:
-        """The method for these views, with the steps and Gaussians of the preset, if there is one."""
+        """The method for these projections, with the steps and Gaussians of the preset if there is one."""
         if self.quality is None:
             return self.method
         return self.method.with_quality(self.quality, default_count(geometry, geometry.sample_pitch))
 
     @property
     def streaming(self) -> Fit:
-        """The method for a scan that is followed while it runs; `streams` must hold."""
+        """The method for a scan that is followed while it runs; only allowed if `streams` is True."""
         assert isinstance(self.method, Fit)
         return self.method
 
     @property
     def streams(self) -> bool:
-        """Whether the volume of the method grows with the views; another one waits for the end of the scan."""
+        """Whether the volume of the method can grow during a scan; other methods wait for the end of the scan."""
         return isinstance(self.method, Fit)

@@ -47,25 +47,27 @@ from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
-MOST_SECONDS = 1800.0  # of the last round
-_HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
+MOST_SECONDS = 1800.0  # time limit of the final fit
+_HELD_OUT_ONE_IN = 10  # every tenth projection is held out for --early-stop
 
 
 @contextmanager
 def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """Follow a running scan to its last view, with a fit that grows; yields the job that makes its volume.
+    """Follow a running scan to its last projection with a growing fit; yields the job that makes its volume.
 
-    Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`; where the block fails
-    the newest ones stay, else the picture.
+    Intermediate volumes are in `<output>.snapshot.h5`, their pictures in `<output>.live.png`. If the block fails, the
+    newest of both stay; otherwise only the picture stays.
 
     Raises:
-        DataError: no scan, or one that stopped growing without being finished.
-        KeyboardInterrupt: a stop before there was a volume.
+        DataError: the file is not a scan, or it stopped growing without being finished.
+        KeyboardInterrupt: stopped before there was a volume.
     """
     timing, sink, clock = options.follow, channels.sink, channels.clock
     assert timing is not None
     with suppress(NotReadyError):
-        options.source.open(follow=True).close()  # what is no scan is refused before anything is compiled
+        options.source.open(
+            follow=True
+        ).close()  # raises an error for a file that is not a scan, before anything is compiled
     _compile(options, channels, timing)
     with channels.stop_scope() as should_stop:
         with _open(options, channels, timing) as source:
@@ -75,17 +77,19 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 follower.draw_slices()
             else:
                 n = follower.n_views_taken
-                channels.warn(f"Stopped while the scan was running: the volume shows the first {count(n, 'view')}.")
+                channels.warn(
+                    f"Stopped during the scan: the volume is reconstructed from the first {count(n, 'projection')}."
+                )
             prepared = follower.prepared()
 
         def facts() -> ScanFacts:
-            # Opened again: HDF5 may still have the texts of the end as they were when it first read them.
+            # Open it again, because HDF5 may still have the old texts, from before the scan ended.
             picture = options.target.live_picture.name if follower.snapshots.drawn else ""
             with _open(options, channels, timing) as source:
                 return replace(facts_of(source), live_picture=picture)
 
-        phases = Phases(sink, clock)  # waiting for views does not count as work
-        phases.enter("last round")
+        phases = Phases(sink, clock)  # a new one, because waiting for projections does not count as work
+        phases.enter("final fit")
         final_fit = follower.final_fit(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
         yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
@@ -93,14 +97,19 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
 
 def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
-    """Wait for the end of a scan whose method needs all views; the options for the finished scan.
+    """Wait for the end of a scan whose method needs all projections; returns the options for the finished scan.
 
     Raises:
-        DataError: the scan died. KeyboardInterrupt: a stop before its end; nothing was written.
+        DataError: the scan died.
+        KeyboardInterrupt: stopped before the end of the scan; nothing was written.
     """
     with channels.stop_scope() as should_stop, _open(options, channels, timing) as source:
         channels.sink(
-            StateEntered("waiting", f"{options.method.name} begins when the scan has ended", time=channels.clock.now())
+            StateEntered(
+                "waiting",
+                f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended",
+                time=channels.clock.now(),
+            )
         )
         for _ in growing(source, channels.clock, timing.patience, timing.poll):
             if should_stop():
@@ -109,18 +118,26 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
 
 
 def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
-    """Compile what the fit needs, once on a machine, before the first view. Sweeps on voxels follow the last one.
+    """Compile the kernels of the fit (only once on a computer) before the first projection. Those of the voxel
+    refinement are compiled after the last projection.
 
-    The state `ready` then says where the volume can be watched.
+    The event `ready` then says where the volume can be watched.
     """
     sink, clock = channels.sink, channels.clock
     compiled = compilation_events(sink, clock)
-    sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
+    sink(
+        StateEntered(
+            "warming_up",
+            "Loading the compiled code of the fit (if none is included for this computer, it is compiled now: 1 to 2 "
+            "minutes)",
+            time=clock.now(),
+        )
+    )
     warm_up(R2(finish=0), on_kernel=compiled)
     picture = options.target.live_picture
     message = (
-        f"The live volume is ready for views. To watch it grow, open {picture}: slices from the eighth "
-        f"view on, and the volume, drawn anew about every {timing.snapshot:g} s"
+        f"The live reconstruction is ready. To watch it, open {picture}: it shows slices from the eighth projection "
+        f"on, later the volume, updated about every {timing.snapshot:g} s"
     )
     sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
@@ -135,26 +152,30 @@ def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> Sc
 
 
 def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:
-    """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
+    """Read projections and fit, in turns. Returns True when the scan has ended, and False after a stop with enough
+    projections for a volume.
 
     Raises:
-        DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
+        DataError: the scan died.
+        KeyboardInterrupt: stopped before there were enough projections.
     """
     last_snapshot = clock.now()
     writer = WriterWatch(follower.source.path, last_snapshot, timing.patience)
     while True:
-        ended = follower.source.finished  # asked before the frames, so that none is missed
+        ended = follower.source.finished  # read before the frames, so that no frame is missed
         grew = follower.take_new_frames(ended)
         if ended:
             return True
         if should_stop() and not follower.source.finished:
             if not follower.has_volume:
-                raise KeyboardInterrupt("stopped before there were enough views for a volume; nothing was written")
+                raise KeyboardInterrupt(
+                    "stopped before there were enough projections for a volume; nothing was written"
+                )
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
-                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
-                f"and with --unfinished the {follower.views.n} views that are there are used."
+                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} To use the "
+                f"{count(follower.views.n, 'projection')} in the file, replace --follow by --unfinished."
             )
         follower.measure_law()
         follower.draw_slices(timing.picture)
@@ -167,10 +188,10 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
 
 @contextmanager
 def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan whose views are all recorded, with compiled kernels; slabs are kept if the block fails.
+    """The job of a finished scan, with compiled kernels. Finished slabs are kept if the block fails.
 
     Raises:
-        ConfigError, DataError: the views, the memory or the disk do not suffice.
+        ConfigError, DataError: there are too few projections, or too little memory or disk space.
     """
     sink, clock, warn, phases = channels.sink, channels.clock, channels.warn, channels.phases
     phases.enter("opening the scan")
@@ -185,7 +206,7 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     if few := partly_seen_warning(prepared.geometry):
         warn(few)
     region = None if box is None else locate(box, options.selection, prepared.geometry)
-    # A direct method and a slab have no volume so far: a signal interrupts them.
+    # A signal interrupts a direct method and a slab, because they have no intermediate volume.
     stopping = channels.stop_scope if options.method.fitted and not plan.slabs else never_stopped
     with keeping(options.partial_path) if plan.slabs else nullcontext():
         phases.enter("compiling kernels")
@@ -211,10 +232,10 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 def _for_method(
     options: ReconOptions, prepared: PreparedProjections, plan: ReconPlan, channels: Channels
 ) -> PreparedProjections:
-    """The views as the method takes them, some held out if it may end early, once the disk has been checked.
+    """The projections as the method needs them, some of them held out if it may end early. Also checks the disk space.
 
     Raises:
-        ConfigError, DataError: the views do not suffice, or the disk does not.
+        ConfigError, DataError: there are too few projections, or too little disk space.
     """
     with refused(options, f" by {options.method.name}"):
         prepared = prepared.wanted(options.method.views_wanted(prepared.geometry))
@@ -222,19 +243,21 @@ def _for_method(
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
-            "The volume fits into memory and is reconstructed without --cluster; a smaller --memory would make slabs."
+            "--cluster was not used, because the volume fits into memory. With a smaller --memory it is made in slabs."
         )
     if options.method.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
-        message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
+        message = (
+            f"{prepared.n_projections - n} of {prepared.n_projections} projections are held out to decide when to stop"
+        )
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
-    options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # these are there
+    options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
     return prepared
 
 
 def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Channels) -> None:
-    """Report the requested corrections of the views, then send the event `recon_started`."""
+    """Report the corrections that were applied, then send the event `recon_started`."""
     sink, clock = channels.sink, channels.clock
     corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
@@ -249,18 +272,19 @@ def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Ch
 def reconstruct_file(
     options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped
 ) -> ReconRecord:
-    """Reconstruct a finished or a running scan. Returns the record of the volume, as in the event `done`.
+    """Reconstruct a finished or running scan. Returns the record of the volume, as in the event `done`.
 
-    A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`. One by a direct
-    method is interrupted like all else, with nothing written; one in slabs keeps those that are finished.
+    If the reconstruction is stopped within `stop_scope`, the volume reached so far is written and marked `ended_early`.
+    A direct method is interrupted instead, and writes nothing; a reconstruction in slabs keeps the finished slabs.
 
-    Of a scan that runs, intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`,
-    each replacing the last in one step; a failure leaves the newest ones, success the picture.
+    While a scan is running, intermediate volumes are in `<output>.snapshot.h5`, and their pictures in
+    `<output>.live.png`. Each replaces the one before in one step. After a failure the newest of both stay; after
+    success only the picture stays.
 
     Raises:
-        ConfigError, DataError: with nothing written. Also for a scan that stopped growing without being finished.
-        ScanStopped: interrupted, with slabs to go on from.
-        KeyboardInterrupt: a stop of a scan that runs, before there was a volume.
+        ConfigError, DataError: nothing was written. Also for a scan that stopped growing without being finished.
+        ScanStopped: interrupted; the finished slabs can be continued.
+        KeyboardInterrupt: stopped before a running scan had a volume.
     """
     channels = Channels(
         sink, clock, Warnings(sink, clock), Phases(sink, clock), stop_scope, clock.now(), time.process_time()
@@ -270,7 +294,7 @@ def reconstruct_file(
         options = _when_it_has_ended(options, channels, options.follow)
     views_of = finished_views if options.follow is None else growing_views
     with views_of(options, channels) as job:
-        if truth_given is not None:  # before the work
+        if truth_given is not None:  # checked before the work starts
             fit_truth(truth_given, Grid.matching(job.prepared.geometry), options.selection.binning)
         decided = Decisions(options.seed)
         with job.stopping() as stopped, warnings_told(channels.warn):

@@ -1,4 +1,4 @@
-"""Plan: memory, disk and slabs of a reconstruction, and what is refused because of them.
+"""Plans a reconstruction: memory, disk and slabs, and errors if they do not suffice.
 
 A run follows the plan that its dry run states.
 """
@@ -54,7 +54,7 @@ from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import sample_radius
 from recon.voxels.field_edges import taller_than_field
 
-_BATCH = 0.25  # of the memory: views during correction
+_BATCH = 0.25  # fraction of the memory for projections during correction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +62,10 @@ class ReconPlan(Need):
     """How a reconstruction uses memory and disk.
 
     Attributes:
-        needs: of the views, as far as they are known.
+        needs: memory needs, as far as they are known.
         allowed: bytes of memory that may be used.
-        slabs: in which the volume is made; none: at once.
-        missing: those that a partial volume lacks; all without one.
+        slabs: the slabs in which the volume is reconstructed; empty: in one piece.
+        missing: slabs that a partial volume does not have yet; without one, all slabs.
     """
 
     needs: ReconMemory
@@ -83,11 +83,12 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
     """The plan before any frame is read.
 
     Args:
-        needs: as `recon_memory_of` says.
+        needs: result of `recon_memory_of`.
 
     Raises:
         ConfigError: an option needs more memory than there is.
-        DataError: the smallest slab does not fit, a cone does not fit at once, or slabs of an earlier call are there.
+        DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
+            an earlier call.
     """
     allowed, at_once = memory_of(options), needs.at_once
     _refuse_views(source, options, needs.geometry)
@@ -99,8 +100,8 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         options.target.refuse_partial()
     if options.method.volumes == 1 and options.selection.of(source).cone is not None:
         raise DataError(
-            f"{source.path}: {options.method.name} would take {size(at_once)}, {size(allowed)} of memory may be used, "
-            "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
+            f"{source.path}: {options.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
+            "allowed, and a cone-beam volume cannot be made in slabs. Use more --memory, --bin 2, or fewer --rows."
         )
     refuse_whole(source, options, needs, allowed)
     turned = options.selection.step(TiltAndLens).of(source, options.selection.of(source)) is not None
@@ -128,20 +129,20 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
     more = "the sample goes on beyond the field" if needs.radius is not None or needs.taller else ""
-    more = more or "some pixels measured nothing, so that rays have weights" * bool(needs.weights)
+    more = more or "some pixels have no data, so each ray needs a weight" * bool(needs.weights)
     if geometry.is_cone and more and needs.at_once > plan.allowed:
         raise DataError(
-            f"{source.path}: {more}, and the volume takes {size(needs.at_once)} of memory by {needs.method.name}, "
-            f"{size(plan.allowed)} may be used. A cone is not made in slabs. Give more --memory, or --bin 2, or fewer "
-            "--rows. Nothing was written."
+            f"{source.path}: not enough memory. {more}, and the {needs.method.name} volume needs "
+            f"{size(needs.at_once)}, but {size(plan.allowed)} is allowed. A cone-beam volume cannot be made in slabs. "
+            "Use more --memory, --bin 2, or fewer --rows. Nothing was written."
         )
     if plan.slabs or (more and method.volumes == 1 and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
-            f"{source.path}: the rotation axis was found at column {prepared.axis_col:.2f}, off the middle, and the "
-            f"volume that a full turn sees takes {size(needs.at_once)} of memory, {size(plan.allowed)} may be used. "
-            f"Give --axis {prepared.axis_col:.2f}, so that it is made in slabs. Nothing was written."
+            f"{source.path}: not enough memory. The rotation axis (column {prepared.axis_col:.2f}) is off the detector "
+            f"middle, so the volume of the 360° scan needs {size(needs.at_once)}, but {size(plan.allowed)} is allowed. "
+            f"Add --axis {prepared.axis_col:.2f}: the volume is then reconstructed in slabs. Nothing was written."
         )
     return _plan(options, needs, plan.allowed)
 
@@ -156,8 +157,9 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
             refuse_whole(source, options, needs, plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
-            f"{source.path}: its views are rolled or tilted, and a volume in slabs needs slices aligned with rows. "
-            "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
+            f"{source.path}: use more --memory, --bin 2, or fewer --rows. The whole scan must be in memory, because "
+            "its projections are rolled or tilted, and a volume in slabs needs slices that are aligned with the "
+            "detector rows."
         )
 
 
@@ -191,7 +193,7 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
         raise DataError(f"{partial} is of {slabs[-1].own.stop} slices, this volume has {slices}.")
     if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
         raise DataError(
-            f"The slabs of {partial} take {size(wanted)} of memory, {size(allowed)} may be used. Give --memory "
+            f"The slabs of {partial} need {size(wanted)} of memory, but {size(allowed)} is allowed. Use --memory "
             f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
         )
     return _plan(options, needs, allowed, slabs, missing)
@@ -230,8 +232,9 @@ def prepare_within(
     options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
         sentence = (
-            f"All at once would take {size(needs.at_once)}, but {size(plan.allowed)} of memory may be used: working in "
-            f"slabs, with {size(needs.line_integrals + needs.volume)} of scratch files on the output's disk."
+            f"Working in slabs, because the whole volume would need {size(needs.at_once)} of memory and "
+            f"{size(plan.allowed)} is allowed. Temporary files on the disk of the output take "
+            f"{size(needs.line_integrals + needs.volume)}."
         )
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
@@ -255,7 +258,10 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
-    warn(f"The file has no times of the views. They are assumed evenly spaced, {period} s apart, in the file's order.")
+    warn(
+        f"The file states no times. The projections are assumed to be evenly spaced in time, {period} s apart, in the "
+        "order of the file."
+    )
     return np.asarray(view_ids * float(period), np.float64)
 
 
@@ -298,13 +304,13 @@ def _refuse_several_volumes(options: ReconOptions) -> None:
         target = options.target
         if target.written and target.output.suffix.lower() not in SUFFIXES:
             raise ConfigError(
-                f"-o {target.output}: several volumes can only be written to HDF5; give a name that ends in .h5."
+                f"-o {target.output}: several volumes can only be written to HDF5. Use a name that ends in .h5."
             )
         of_one = ("region", "truth", "uncertainty", "cluster", "partial")
         if wrong := [name for name in of_one if getattr(options, name)]:
             raise ConfigError(
-                f"{' and '.join(wrong)}: for a method of one volume, and {options.method.name} makes several. Leave it "
-                "out, or choose another method. Nothing was computed."
+                f"{' and '.join(wrong)}: this works only with methods that make one volume, but {options.method.name} "
+                "makes several. Leave it out, or choose another method. Nothing was computed."
             )
 
 
@@ -315,8 +321,8 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(
-            "--follow uses views as they are recorded, and fits for --seconds after the end: leave out --views, except "
-            "every:K, and --steps."
+            "Leave out --steps, and --views unless it is every:K: --follow uses the projections in the order in which "
+            "they are recorded, and fits for --seconds after the end of the scan."
         )
     try:
         parse_views(views, [0.0])
@@ -329,14 +335,14 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
     be unpacked in the memory."""
     if not (source.finished or options.unfinished):
         raise DataError(
-            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {len(source.table)} "
-            "frames recorded so far. Nothing was written."
+            f"{source.path} is not finished. {next_step(source.path)} To use the {len(source.table)} frames recorded "
+            "so far, add --unfinished. Nothing was written."
         )
     if source.unpack_bytes > (allowed := memory_of(options)):
         raise DataError(
-            f"{source.path} is stored in chunks of which one takes {size(source.unpack_bytes)} of memory to unpack; "
-            f"{size(allowed)} may be used. Give --memory {math.ceil(source.unpack_bytes / 1e6)}M if there is as much, "
-            "or copy the file with one frame in each chunk. Nothing was read."
+            f"{source.path} is stored in chunks, and unpacking one needs {size(source.unpack_bytes)} of memory, but "
+            f"{size(allowed)} is allowed. Use --memory {math.ceil(source.unpack_bytes / 1e6)}M if there is as much, or "
+            "copy the file with one frame in each chunk. Nothing was read."
         )
 
 

@@ -1,4 +1,4 @@
-"""Delivery: a volume becomes a file, and then a report with its figures of merit."""
+"""Writes the result of a reconstruction: the volume file, then the report with its figures of merit."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def write_result(
         DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
     phases, ordinary = context.phases, prepared.centred
-    phases.enter("measuring the volume")
+    phases.enter("checking the volume")
     checked = check_volume(made, ordinary, truth, target, context, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
     context = replace(context, warnings=remarks)
@@ -90,7 +90,7 @@ def write_result(
         try:
             state_time = _report(made, ordinary, truth, checked, volumes, target, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
-            said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
+            said = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
             sink(Warned(said, time=clock.now()))
             record = replace(record, report=None, warnings=(*record.warnings, said))
     phases.end()
@@ -264,8 +264,9 @@ def partly_seen_warning(geometry: Geometry) -> str:
     if not some.size:
         return ""
     return (
-        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen over less of the half turn than "
-        "the others, since views stand at different heights: there the volume is streaked, and too thin by FBP."
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than the "
+        "others, because the projections are at different heights. The volume has streaks there, and FBP is not dense "
+        "enough."
     )
 
 

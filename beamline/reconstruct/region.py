@@ -1,4 +1,4 @@
-"""Region: a box of the volume at full resolution, from the rows that show it, and the box around the sample."""
+"""Region: reconstructs a box of the volume from the detector rows that show it, and finds the box around the sample."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Region:
         spans = [(int(first), int(end)) for first, end in re.findall(r"(?:^|,)(\d+):(\d+)(?=,|$)", text)]
         if len(spans) != 3 or text.count(",") != 2 or any(first >= end for first, end in spans):
             raise ValueError(
-                f"{text!r} is not Z0:Z1,Y0:Y1,X0:X1 with whole numbers, first < end, e.g. 40:80,100:300,0:90"
+                f"{text!r} is not Z0:Z1,Y0:Y1,X0:X1 with whole numbers and first < end, for example 40:80,100:300,0:90"
             )
         z, y, x = spans
         return cls(z, y, x)
@@ -97,7 +97,9 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     """
     part = selection.of(source)
     if part.cone is not None:
-        raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
+        raise ConfigError(
+            f"--roi works only with a parallel beam, but {source.path} is a cone-beam scan. Use --rows instead."
+        )
     poses = stated_poses(source, part)
     moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
     given = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
@@ -105,8 +107,8 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
         given.append("--poses along the axis, or with roll, tilt or vectors")
     if given:
         raise ConfigError(
-            f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Give --rows "
-            "instead of --roi, or leave that out. Nothing was read."
+            f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Use --rows "
+            "instead of --roi, or leave out the other option. Nothing was read."
         )
     rows, side, (first, end) = part.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side
@@ -135,8 +137,8 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
     if not geometry.rows_show_slices:
         raise DataError(
-            "The views are shifted along the axis, rolled or tilted, but --roi needs slices aligned with rows. Give "
-            "--rows."
+            "The views are shifted along the axis, rolled or tilted, but --roi needs slices that are aligned with "
+            "rows. Use --rows instead."
         )
     _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
@@ -186,7 +188,9 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     """
     part = selection.of(source)
     if part.cone is not None:
-        raise ConfigError(f"--roi auto is for a parallel beam; {source.path} is a cone. Give --rows instead.")
+        raise ConfigError(
+            f"--roi auto works only with a parallel beam, but {source.path} is a cone-beam scan. Use --rows instead."
+        )
     rows, side = part.detector_rows, selection.binning
     height, width = (rows.stop - rows.start) // side, source.shape[1] // side
     coarse = max(1, min(width // _COLUMNS, height))
@@ -201,27 +205,29 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     # Edges of matter do not show the air, from which matter in any row would rise.
     if cut := FieldEdges.of(data, geometry).beyond():
         where = " and the ".join(cut)
-        return _uncut(height, across, f"the sample goes on beyond the field at the {where}, where it shows no edge")
+        return _uncut(
+            height, across, f"the sample extends beyond the field of view at the {where}, so it has no edge there"
+        )
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
     least = _least(smooth)
     matter = np.asarray(smooth > least)  # [view, row, col]
     there = np.flatnonzero(matter.any(axis=2).mean(axis=0) >= _SEEN)
     if not there.size:
         raise DataError(
-            f"{source.path}: --roi auto finds no matter above the noise in {len(data)} views. Give the box, "
-            "or leave it out. Nothing was written."
+            f"{source.path}: --roi auto finds no sample above the noise in {len(data)} projections. Give the box as "
+            "numbers, or leave out --roi. Nothing was written."
         )
     hull = _hull(matter[:, there], geometry, grid, coarse)
     if not hull.any():
-        return _uncut(height, across, "the views do not agree where the sample is")
+        return _uncut(height, across, "the projections do not agree about the position of the sample")
     z = _widened(_extent(there, coarse), height, coarse)
     y, x = (_widened(_extent(np.flatnonzero(hull.any(axis=axis)), coarse), across, coarse) for axis in (1, 0))
     region = Region(z, y, x, requested=False)
     share = np.prod([end - first for first, end in (z, y, x)]) / (height * across**2)
     return replace(
         region,
-        reason=f"The sample lies in voxels {region} [z, y, x] of {height} x {across} x {across}, with a margin: "
-        f"{share:.0%} of the volume is made. Line integrals below {least:.2g} were taken for air.",
+        reason=f"The sample, with a margin, is in the voxels {region} [z, y, x] of {height} x {across} x {across}. "
+        f"Only this part ({share:.0%}) of the volume is reconstructed. Line integrals below {least:.2g} count as air.",
     )
 
 

@@ -1,4 +1,4 @@
-"""The content of the report on a reconstruction: scan, settings, figures of merit, pictures."""
+"""The content of the report of a reconstruction: scan, settings, figures of merit, pictures."""
 
 from __future__ import annotations
 
@@ -79,22 +79,21 @@ def _summary(
     name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
-    best = best if best in own else "seconds"  # a region by FBP is compared with nothing
+    best = best if best in own else "seconds"  # an FBP region has no figure of quality
     shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
     if made.series is not None:
         seconds = made.series.seconds
         what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
-        f"{what} {shape} voxels from {geometry.n_views} of "
-        f"{prepared.n_projections} views in {made.seconds:.1f} s; "
-        f"{METRICS[best].label} {formatted(best, own[best])}"
+        f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in {made.seconds:.1f} "
+        f"s; {METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and made.method != BASELINE:
-        summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
+        summary += f" (FBP of the same projections: {formatted(best, metrics[BASELINE][best])})"
     if context.region is not None:
-        summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
+        summary += f". Only the region {context.region.region} [z, y, x] is written and shown in pictures of slices"
     if made.chosen:
-        summary += f". Chosen: {made.chosen}"
+        summary += f". Reason for the method: {made.chosen}"
     return summary + "."
 
 
@@ -104,51 +103,56 @@ def _footnotes(
     metrics: Mapping[str, Mapping[str, float]],
     unexplained: Unexplained | None,
 ) -> list[str]:
-    """What the figures of merit mean, as far as there are any."""
-    of_several = "what the volumes, in each view as it shows them, leave of all views. It falls with noise."
-    of_one = "|A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
+    """The meaning of the figures of merit that this report shows."""
+    of_several = (
+        "difference of all projections and the volumes at their times, relative to them; smaller with less noise."
+    )
+    of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
     footnotes = (
-        (True, f"Data residual: {of_one if made.series is None else of_several}"),
+        (True, f"Residual: {of_one if made.series is None else of_several}"),
         (
             True,
-            "Time of the whole command: from its start until volume and page are written, with reading and measuring.",
+            "Time of the whole command: from its start until volume and report are written, with reading and checks.",
         ),
         (
             any("cnr" in values for values in metrics.values()),
-            "SNR, CNR: between the dense and the empty part (k-means of two classes) of "
-            f"{'the truth' if truth else 'FBP of these views'}, without voxels near the other part; the same of all "
-            "volumes. A smoother volume has more of both, though it may show less: look for cracks and pores in the "
-            "pictures.",
+            "SNR, CNR: computed between the dense and the empty part (two classes by k-means) of "
+            f"{'the ground truth' if truth else 'FBP of these projections'}, without voxels near the boundary. All "
+            "volumes use the same two parts. A smoother volume has higher values, although it may show less: look for "
+            "cracks and pores in the pictures.",
         ),
         (
             any("air" in values for values in metrics.values()),
-            "Level of air: the mean of the voxels that views show to be empty, within the field of all views, over the "
-            "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter.",
+            "Air level: mean of the voxels that the projections show to be empty, divided by the standard deviation of "
+            "FBP there. If the air of FBP is below zero, weakly absorbing material of the other volume is too low by "
+            "the same amount.",
         ),
         (
             views_grew(made),
-            "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
-            "the scan.",
+            "Time of reconstruction of R²-Gaussian: from the first reading of the growing file to the volume, so it "
+            "includes the scan.",
         ),
         (
             bool(made.ending.resumed_from),
-            f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before.",
+            f"Time of reconstruction of {label_of(made.method)}: only the time since the fit was resumed.",
         ),
         (
             unexplained is not None,
-            f"Matter that leaves structure: voxels at which the back-projected residual of {slices} slices exceeds "
-            f"four standard deviations of its noise; above {UNEXPLAINED_LIMIT:g} a fit hides something. It compares "
-            "fits of the same views: views that are displaced have more noise, so less exceeds it.",
+            f"Unexplained structure in the residual: fraction of the sample voxels in {slices} slices at which the "
+            f"back-projected residual exceeds four standard deviations of its noise. Above {UNEXPLAINED_LIMIT:g} the "
+            "volume hides something. Compare only fits of the same projections: shifted projections have more noise, "
+            "so that fewer voxels exceed it.",
         ),
         (
             "stray" in metrics[made.method],
-            "Mass where views show nothing: share of the volume's mass in voxels whose rays meet no matter in two "
-            "views at least. Sparse views leave blobs and streaks there.",
+            "Mass in empty regions: fraction of the mass of the volume in voxels that at least two projections show to "
+            "be empty. With few projections there are blobs and streaks in such regions.",
         ),
         (
             truth is not None,
-            "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions.",
+            "PSNR: the peak is the largest value of the ground truth. SSIM 3D: mean over the slices of three "
+            "directions.",
         ),
     )
     return [text for concerns, text in footnotes if concerns]
@@ -157,53 +161,53 @@ def _footnotes(
 def _further(
     made: Reconstruction, prepared: PreparedProjections, stray: StrayMass | None, context: ReportContext
 ) -> Iterator[Picture]:
-    """Stray mass, darks, flats and flagged frames, as far as there are any."""
+    """Pictures of stray mass, darks, flats and flagged frames, if there are any."""
     facts = context.facts
     if stray is not None and stray.share > 0:
         yield Picture(
             "Stray mass",
-            "The highest density above each other, of voxels that the views show to be empty. All of it is an "
+            "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
             "artefact: less is better.",
             pictures.stray_mass(stray.map, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
             "Darks and flats",
-            "As the camera gave them. Smooth flats are better: what stands in them and moves, or is missing in the "
-            "views, makes rings. Their ratio, where there are two groups, is better the nearer it is to one "
-            "everywhere.",
+            "As the camera recorded them. Smooth flats are better: dust that moves, or that the projections do not "
+            "show, makes rings. If there are two groups of flats, their ratio should be near one everywhere.",
             reference_sheet(facts.references, facts.shape),
         )
     if facts.flagged:
         yield Picture(
             "Flagged frames",
-            "The worst of the frames that the monitor flagged, as the camera gave them, with the place of the flag if "
-            "it has one. Red: an alarm, the view is left out; orange: a warning, it weighs half.",
+            "The worst of the frames that the monitor flagged, as the camera recorded them, with the flagged region if "
+            "there is one. Red: alarm, the projection is not used. Orange: warning, it has half the weight.",
             contact_sheet(facts.flagged),
         )
 
 
 def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
-    """Slices of all volumes, and in what these differ from the first."""
+    """Pictures of slices of all volumes, and of their differences from the first volume."""
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
-    shown = {"Truth": truth} if truth is not None else {}
+    shown = {"Ground truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     yield Picture(
         "Slices",
         "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
-        "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
+        "viewers. All have the same grey window, from air to the densest class of material; small metal parts are "
+        "white.",
         pictures.orthogonal_slices(shown, unit, kind),
     )
     yield Picture(
         "Sharpest edge, and values",
-        "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
-        "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
+        "Values along a line through the sharpest edge: a steeper edge is sharper; dips and overshoots next to it are "
+        "artefacts. Histogram: narrower peaks are better, unless the sample has values between them.",
         pictures.profile_and_values(shown, unit, kind),
     )
     if len(shown) > 1:
         yield Picture(
             "Differences",
-            f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
+            f"The first slice of each volume minus that of {next(iter(shown))}. Red: higher, blue: lower. "
             + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
             pictures.differences(shown, unit, kind),
         )
@@ -222,13 +226,14 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
             sheet.add(series.labels[k], volume.swapaxes(0, 1) if turned else volume)
         yield Picture(
             title,
-            f"{len(some)} of {n} times in one grey window: what differs has changed or moved.",
+            f"{len(some)} of {n} times, all with the same grey window: differences are changes or motion of the "
+            "sample.",
             sheet.png(sheet.labels()),
         )
 
 
 def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None) -> Iterator[Picture]:
-    """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
+    """Pictures of missing angles, error bars, the residual, and the course of the reconstruction."""
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(made.volume, unseen, unit))
@@ -236,16 +241,16 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
         yield Picture(
             "Error bars",
             "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
-            "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
+            "within one standard deviation of the volume. Fine texture that the method smoothed away may be outside.",
             pictures.error_bars(made.volume, made.deviation, unit, kind),
         )
     if unexplained is not None:
         at = len(unexplained.significance) // 2
         yield Picture(
-            "What the volume leaves in the views",
-            "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
-            "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
-            "much, red: too little.",
+            "Residual in the projections",
+            "Filtered back-projection of the residual, divided by its noise. It should be even noise, seldom beyond "
+            "4. An edge, crack or pore that is visible here is in the projections, but not in the volume. Blue: the "
+            "volume is too dense, red: not dense enough.",
             pictures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
         )
     if made.history:
@@ -257,25 +262,25 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
 
 
 def _views(prepared: PreparedProjections) -> Iterator[Picture]:
-    """A corrected view, a sinogram, the search of the axis, and the poses."""
+    """Pictures of a corrected projection, a sinogram, the search for the axis, and the poses."""
     data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
     yield Picture(
         "Projection",
-        f"One corrected view: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air is better the "
-        "nearer to 0 and the more even it is.",
+        f"One corrected projection: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air should "
+        "be even and near 0.",
         pictures.projection(data, geometry, 0, unit),
     )
     yield Picture(
         "Sinogram",
-        "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
-        "that breaks off is a view that does not fit.",
+        "The middle detector row of all projections used. Vertical stripes become rings in the volume. If a curve is "
+        "interrupted, a projection does not fit the others.",
         pictures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
     )
     if axis is not None:
         yield Picture(
             "Rotation axis",
-            f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 where "
-            "they agree, about 1 where they have nothing in common. Columns are those of the binned detector.",
+            f"Mismatch of the projections for each candidate of the rotation axis ({axis.method}): 0 if they agree, "
+            "about 1 if they have nothing in common. Columns are those of the binned detector.",
             pictures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
@@ -283,19 +288,19 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
         moved = geometry.shifts * geometry.sample_pitch
         yield Picture(
             "Poses of the views",
-            "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
+            "Shift at the sample, roll and tilt of each projection, against the angle of the stage. They show runout, "
             "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
             pictures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
         )
 
 
 def _of_wedges(unseen: Sequence[Wedge]) -> str:
-    """Size and direction of the wedges, and what they do to the volume."""
+    """Size and direction of the missing wedges, and their effect on the volume."""
     directions = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
     size = math.degrees(sum(wedge.size for wedge in unseen))
     return (
-        f"{size:.0f}° of rays are in no view, those at {directions} from x towards y (orange): edges along them are "
-        "blurred, and small things are drawn out across them."
+        f"No projection has rays in {size:.0f}° of directions: {directions} from x towards y (orange). Edges along "
+        "these directions are blurred, and small objects are elongated across them."
     )
 
 

@@ -1,4 +1,4 @@
-"""Run a method on prepared views, as every command does that makes a volume; its time and its error bars."""
+"""Runs a method on prepared projections, within its time limit, and computes its error bars."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ def run_on(
     device: str = "cpu",
     reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
 ) -> Reconstruction:
-    """Run a method on these views, and the held-out views if it uses any, until it ends or is stopped.
+    """Run a method on these projections (and the held-out ones if it uses them) until it ends or is stopped.
 
     Raises:
-        ValueError: the method does not take these views.
+        ValueError: the method cannot use these projections.
     """
     data, geometry, use = views_for(method, prepared)
     return reconstruct(data, geometry, method, grid=grid, seed=seed, device=device, use=use, control=control)
 
 
 def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geometry, DataUse]:
-    """Line integrals [view, row, col], geometry and use of the views in the form that the method expects."""
+    """Line integrals [view, row, col], geometry, and use of the projections, in the form that the method expects."""
     prepared = prepared.wanted(method.views_wanted(prepared.geometry))
     data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
     if "held_out" in method.takes:
@@ -64,13 +64,13 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
 
 
 def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -> F32 | None:
-    """Weights of the rays for a method; on disk, rays that weigh nothing were filled, as a direct method does it."""
+    """Weights of the rays for a method. In data on disk, rays of weight 0 were filled, as a direct method does it."""
     return prepared.ray_weights(held_out) if method.weighs or not prepared.on_disk else None
 
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
-    """Subtract from the views, in place, what the sample outside the volume adds, so that the volume, and FBP beside
-    it, are judged by the rest; views stay if nothing is known to lie outside.
+    """Subtract the part of the sample outside the volume from the projections, in place, so that the volume and FBP are
+    compared with the rest. Does nothing if nothing is known outside.
     """
     if made.outside is None:
         return prepared
@@ -82,11 +82,11 @@ def without_outside(prepared: PreparedProjections, made: Reconstruction) -> Prep
     return replace(prepared, held_out=held, inside=True)
 
 
-_AT_ONCE = 32  # views that are projected together
-_REPORT = 5.0  # s, its pictures
-_BYTES = 1e8  # of a volume, written and read back in a second
-_BUSIEST = 4.0  # largest slow-down of this by other programs
-_MEASURING = 0.05  # of the seconds: looks at the volume, which are left out where these are over
+_AT_ONCE = 32  # projections that are computed together
+_REPORT = 5.0  # s for the pictures of the report
+_BYTES = 1e8  # bytes of a volume that are written and read back in a second
+_BUSIEST = 4.0  # largest factor by which other programs may slow this down
+_MEASURING = 0.05  # fraction of the time limit for checks of the volume; they are left out if it is reached
 
 
 def fit_within(
@@ -98,13 +98,14 @@ def fit_within(
     clock: Clock,
     warn: Warn,
 ) -> tuple[Method, Stop]:
-    """The fit with the seconds of its budget minus those of measuring, report and writing; and when these begin.
+    """The fit with its time limit (that of the call minus the time for checks, report and writing), and the stop
+    request for the checks.
 
-    If they are too few, `warn` gets a sentence before the fit.
+    If too little time is left, `warn` gets a sentence before the fit.
 
     Args:
-        limit: seconds of the call.
-        started: when the call began, by the clock and in seconds of this process's work.
+        limit: time limit of the call in s.
+        started: time at which the call started, by the clock, and the CPU time in s used by then.
     """
     grid, pages = Grid.matching(prepared.geometry), target.report is not None
     spent = clock.now() - started[0]
@@ -114,10 +115,9 @@ def fit_within(
     remaining = limit - spent - measuring - after
     if remaining <= 0:
         warn(
-            f"{duration_text(limit)} do not suffice for this scan: reading and correcting it took "
-            f"{duration_text(spent)}, measuring the volume, the report and writing take about "
-            f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method, "
-            "which makes one step."
+            f"{duration_text(limit)} is not enough for this scan: reading and correction took {duration_text(spent)}, "
+            f"and checks, report and writing need about {duration_text(measuring + after)}. Nothing is left for the "
+            f"{by_name(method.name).label} method, which makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
@@ -139,13 +139,14 @@ def refuse_impossible(options: ReconOptions) -> None:
     """Raise ConfigError before any work if error bars cannot be computed or written."""
     if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
-            f"--uncertainty is calibrated for {', '.join(names_where(lambda each: each.error_bars))}, and not for "
-            f"{options.method.name}: leave it out, or choose another method."
+            f"--uncertainty does not work with {options.method.name}, only with "
+            f"{', '.join(names_where(lambda each: each.error_bars))}. Leave it out, or choose another method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(
-            f"--uncertainty writes a second volume into the same file: give -o "
-            f"{options.target.output.with_suffix('.h5')}, and export each of the two with --dataset."
+            "--uncertainty writes two volumes into one file, which needs HDF5: use -o "
+            f"{options.target.output.with_suffix('.h5')}. You can then export each of the two with `beamline export "
+            "--dataset`."
         )
 
 
@@ -153,13 +154,13 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
     """Raise ConfigError before any work if these views do not allow error bars."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
-            f"--uncertainty splits the views into two halves: at least {LEAST_VIEWS} views are needed, got "
-            f"{geometry.n_views}. Leave it out, or take more views."
+            f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
+            f"are {geometry.n_views}. Leave it out, or use more projections."
         )
     if isinstance(method, Fit) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty refits on voxels, and {method.name} with --finish 0 has no steps on voxels. Leave one of "
-            "them out."
+            f"--uncertainty needs the voxel refinement of {method.name}, but --finish 0 switches it off. Leave out one "
+            "of the two."
         )
 
 

@@ -1,4 +1,4 @@
-"""Facts of a scan for a report, and the context of a reconstruction."""
+"""Facts about a scan for the report, and the context of a reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slabs of a volume, one after the other, into a partial volume, which a later call may go on with."""
+"""Reconstructs a volume slab by slab into a partial volume, which a later call can continue."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ class _SlabJob:
             partial = create_partial(path, record, self.slabs, made_from, kept)
             partial.add(n, slab.volume.data)
             return partial, list(numbers[at + 1 :])
-        raise DataError("The views are zero everywhere: there is no sample in the beam.")
+        raise DataError("There is no sample in the beam: the projections are zero everywhere.")
 
     def made(
         self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool
@@ -173,7 +173,7 @@ class _SlabJob:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
             if first or not method.needs_matter:
                 raise
-            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed by fista-tv instead: {error}"
+            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with fista-tv instead: {error}"
             return by(FistaTv(), part, box, control), remark
 
 
@@ -212,8 +212,8 @@ def keeping(path: Path) -> Iterator[None]:
         if not path.is_file():
             raise
         raise ScanStopped(
-            f"The reconstruction was stopped; {path} has the finished slabs. The same call with --resume "
-            f"{path} makes the others."
+            f"The reconstruction was stopped. {path} has the finished slabs. To make the others, add --resume {path} "
+            "to the same command."
         ) from error
     remove(path)
 

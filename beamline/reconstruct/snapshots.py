@@ -1,4 +1,4 @@
-"""Snapshots of a growing volume, and slices of its views: a file and a picture, each replacing the last in one step."""
+"""Snapshots of the live volume and slices of its projections: a file and a picture, each replaced in one step."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class Snapshots:
         output = options.target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
         self.picture_path = options.target.live_picture
-        self.drawn = False  # the picture is of this scan
-        self._slices: tuple[PictureRow, ...] = ()  # of the picture, as drawn last: by FBP, and of the volume
+        self.drawn = False  # True if the picture is of this scan
+        self._slices: tuple[PictureRow, ...] = ()  # last drawn rows of the picture: FBP slices, and the volume
         self._grown: tuple[PictureRow, ...] = ()
-        self._at: Sequence[float] | None = None  # z, y and x of the slices by FBP
-        self._unseen: Wedge | None = None  # of the views of these slices
+        self._at: Sequence[float] | None = None  # z, y and x of the FBP slices
+        self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
@@ -59,7 +59,7 @@ class Snapshots:
             volume=shown.volume,
             length_unit=self._unit,
             raw_file=str(self._source.path.resolve()),
-            title=f"Snapshot from {fit.n_views} views",
+            title=f"Snapshot from {fit.n_views} projections",
             sample=self._sample,
             time=self._clock.now(),
             parameters={
@@ -77,7 +77,7 @@ class Snapshots:
             self._grown = self._rows(fit, record.volume, f"{method}, {_why(errors)}")
             self._write_picture()
         except DataError as error:
-            # Windows does not replace a file that a viewer holds open: the next snapshot will.
+            # Windows does not replace a file that a viewer has open; the next snapshot will replace it.
             self._warn(f"A snapshot could not be written: {error}")
             return
         now = self._clock.now()
@@ -85,7 +85,7 @@ class Snapshots:
         self._sink(SnapshotWritten(*written, method, errors or None, time=now))
 
     def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str, unseen: Wedge | None) -> None:
-        """Write the picture with these slices by FBP above the last drawn slices of the volume, if there are any."""
+        """Write the picture: these FBP slices, and below them the last drawn slices of the volume if there are any."""
         self._at, self._unseen = slices.at, unseen
         panels = slice_panels(slices.images, slices.at, slices.pixel, self._unit, unseen)
         self._slices = (PictureRow(heading, panels),)
@@ -98,19 +98,19 @@ class Snapshots:
 
     def remove(self) -> None:
         """Remove the snapshot after the final volume is written. The live picture stays."""
-        with suppress(PermissionError):  # Windows removes no file that a viewer holds open
+        with suppress(PermissionError):  # Windows does not remove a file that a viewer has open
             self.path.unlink(missing_ok=True)
 
     def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
-        """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
+        """Method of the volume that is shown, and the errors of both methods in held-out projections if compared."""
         fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
         return Fbp.name if shown.direct else fit, errors
 
     def _rows(self, fit: StreamingFit, volume: Volume, shown: str) -> tuple[PictureRow, ...]:
         heading = (
-            f"{fit.n_views} views so far by {shown}; {fit.progress().n_gaussians} Gaussians, "
-            f"{self._clock.now() - self._begin:.0f} s after the first look"
+            f"{fit.n_views} projections so far, {shown}; {fit.progress().n_gaussians} Gaussians, "
+            f"{self._clock.now() - self._begin:.0f} s after the start"
         )
         return volume_rows(volume, *fit.newest_view(), heading, self._unit, (self._at, self._unseen))
 
@@ -120,31 +120,31 @@ class Snapshots:
 
 
 def _why(errors: Mapping[str, float]) -> str:
-    """Why a method's volume is shown, for people."""
+    """Why the volume of a method is shown, in words."""
     if not errors:
         return "the only one so far"
     each = ", ".join(f"{name} {error:.3f}" for name, error in errors.items())
-    return f"which predicts views held out better (error of the volume along them: {each})"
+    return f"because it matches the held-out projections better (errors: {each})"
 
 
-_FEWEST, _BEFORE_AXIS = 8, 32  # views; of them, those that are corrected before the axis is known
+_FEWEST, _BEFORE_AXIS = 8, 32  # projections needed for the first slices; projections used before the axis is known
 
 
 class LiveSlices:
-    """Draws the slices when there are new views and enough time has passed; drawing takes at most half of the time."""
+    """Draws slices when there are new projections and enough time has passed; uses at most half of the time."""
 
     def __init__(self, views: FollowedViews, snapshots: Snapshots, clock: Clock) -> None:
         self._views, self._snapshots, self._clock = views, snapshots, clock
         self._newest, self._next = -1, -math.inf  # the last view drawn; the time from which they are drawn again
 
     def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
-        """Draw slices of corrected views about the axis (a column of the file; None: the middle of the detector).
+        """Draw slices of corrected projections around the axis (a column of the file; None: the detector middle).
 
-        Views of a cone, or that lean or climb, have no slices.
+        There are no slices for a cone beam, or if the projections have a roll, a tilt or shifts.
 
         Args:
-            pause: s until they are drawn again, at least; None: they are drawn now.
-            of: number of views so far; 0 where `parts` holds all of them.
+            pause: least time in s until slices are drawn again; None: draw now.
+            of: number of projections so far; 0 if `parts` has all of them.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
         if n < _FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
@@ -156,28 +156,29 @@ class LiveSlices:
             slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
             count = f"{n} of {of}" if of > n else str(n)
             place = (
-                "the middle, not known yet: crescents are no fault of the scan (optics.axis_col or --axis states it)"
+                "the detector middle, because it is not known yet: crescents are expected (set optics.axis_col or "
+                "--axis)"
                 if axis_col is None
                 else f"column {col:.1f}"
             )
             unseen = max(unseen_wedges(geometry), key=lambda wedge: wedge.size, default=None)
-            heading = f"FBP of {count} views so far{_coverage(unseen, geometry.angles)}, axis at {place}"
+            heading = f"FBP of the first {count} projections{_coverage(unseen, geometry.angles)}, axis at {place}"
             self._snapshots.write_slices(slices, n, heading, unseen)
         end = self._clock.now()
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
     def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float | None) -> None:
-        """Draw slices before the axis is known, from some of the views, corrected only for this."""
+        """Draw slices before the axis is known, from some projections that are corrected only for this."""
         views = self._views.chosen(self._views.usable().frames)
         early = pause is not None and self._clock.now() < self._next
         if views.size < _FEWEST or early or int(views[-1]) == self._newest:
             return
-        with suppress(DataError):  # views without light, say: the scan goes on, and so does the fit
+        with suppress(DataError):  # for example projections without beam; the scan and the fit continue
             self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
 
 
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
-    """The addition to a heading if the views leave a wedge out."""
+    """The addition to a heading if the projections do not cover all angles."""
     if unseen is None:
         return ""
     order = "sequential: " if one_way(angles) else ""

@@ -1,4 +1,4 @@
-"""Truths: the true volume of a sample on the grid of a reconstruction, and volume files measured by it."""
+"""Ground truth: the true volume on the grid of a reconstruction, and the comparison of volume files with it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def read_truth(spec: str) -> NDArray[np.float32]:
         raise DataError(f"--truth {path} is an array of shape {data.shape}; expected a volume [z, y, x].")
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
     if not 0 <= first < end <= data.shape[0]:
-        raise ConfigError(f"--truth {spec}: slices {first}:{end} do not lie in 0:{data.shape[0]}.")
+        raise ConfigError(f"--truth {spec}: slices {first}:{end} are outside 0:{data.shape[0]}.")
     return np.asarray(data[first:end], dtype=np.float32)
 
 
@@ -66,13 +66,14 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
             coarser = [n for n in range(2, max(shape) + 1) if tuple(s // n for s in shape) == truth.shape]
             advice = f"Give --bin {coarser[0] * binning}" if coarser else "Choose its slices with FILE:first:end"
             raise ConfigError(
-                f"--truth has shape {truth.shape}, the volume {shape} [z, y, x] with --bin {binning}. {advice}."
+                f"--truth has the shape {truth.shape}, but the volume has {shape} [z, y, x] with --bin {binning}. "
+                f"{advice}."
             )
         z, y, x = shape
         n = binning
         truth = truth[: z * n, : y * n, : x * n].reshape(z, n, y, n, x, n).mean(axis=(1, 3, 5), dtype=np.float32)
     if not np.isfinite(truth).all() or np.ptp(truth) == 0:
-        raise ConfigError("--truth is constant, or not finite everywhere; there is nothing to compare with.")
+        raise ConfigError("--truth cannot be used for a comparison, because it is constant or has no finite value.")
     return Volume(truth, grid)
 
 
@@ -96,7 +97,7 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
         if masks is not None:
             labels, _ = whole_volume(masks)
             if not np.isin(labels, (0, 1, 2)).all():
-                raise ValueError(f"{masks} has other labels than 0 (not used), 1 (dense) and 2 (empty)")
+                raise ValueError(f"{masks} has labels other than 0 (not used), 1 (dense) and 2 (empty)")
             regions = np.array([-1, 1, 0], np.int8)[labels.astype(np.intp)]
             values["snr"], values["cnr"] = metrics.snr_cnr(volume, regions)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Checks a volume before its delivery: its judgement, FBP beside it, and warnings of what it may hide or invent."""
+"""Checks of a finished volume: residual, comparison with FBP, and warnings about features it may hide or invent."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from recon.voxels.field_edges import FieldEdges
 from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, lost_matter
 from recon.voxels.odd_views import LIMIT, OddView
 
-_NAMED = 5  # odd views, at most
-_COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
-_FBP_WORK = 2.5  # projections of all views that take as long
+_NAMED = 5  # most odd projections that the warning names
+_COMPARED = ("fbp", "fista-tv")  # methods that show cracks well: fbp sharp edges, fista-tv low noise
+_FBP_WORK = 2.5  # time of FBP, in units of the time of one forward projection of all views
 
 
 @dataclass(frozen=True, eq=False)
 class CheckedVolume:
-    """A volume with what its views and FBP say of it.
+    """A volume with the results of its checks.
 
     Attributes:
-        judgement: by its views and the truth.
-        volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
-        metrics: figures of merit of each, by method.
-        warnings: those of the context first.
-        hiding_warning: the one that the volume may hide structure; empty without one.
-        skipped_text: a sentence on the checks left out and the reason; empty if none was.
+        judgement: comparison of the volume with its projections and with the ground truth.
+        volumes: the volume by method; before it FBP of the same projections, if the volume is compared with FBP.
+        metrics: figures of merit of each volume, by method.
+        warnings: all warnings, those of the context first.
+        hiding_warning: the warning that the volume may hide structure; empty if there is none.
+        skipped_text: a sentence about the checks that were left out, with the reason; empty if none was.
     """
 
     judgement: Judgement
@@ -60,9 +60,10 @@ def check_volume(
     sink: Sink,
     clock: Clock,
 ) -> CheckedVolume:
-    """Compare a volume with its views and with FBP, and send each warning to `sink`.
+    """Compare a volume with its projections and with FBP, and send each warning to `sink`.
 
-    Checks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
+    Checks are left out, with a remark, if they would take longer than the time limit in `context` allows, or if the
+    reconstruction was stopped.
     """
     volumes, warnings = {made.method: made.volume}, list(context.warnings)
 
@@ -71,7 +72,7 @@ def check_volume(
             sink(event_of_sentence(sentence, clock.now()))
             warnings.append(sentence)
 
-    if made.series is not None:  # each view shows a volume of its own time
+    if made.series is not None:  # each projection shows the volume at its own time
         figures = {"residual": made.series.residual, "seconds": made.seconds}
         return CheckedVolume(Judgement(figures), volumes, {made.method: figures}, warnings)
     tell(_sample_radius(made, prepared), _unused_levels(made))
@@ -104,17 +105,17 @@ def check_volume(
     if fitted and BASELINE in volumes:
         tell(_lost_matter(made, prepared, volumes[BASELINE]))
     if skipped:
-        why = "the reconstruction was stopped" if made.ending.early else "the seconds asked for were nearly over"
-        text = f"Left out, as {why}: {', '.join(skipped)}."
+        why = "the reconstruction was stopped" if made.ending.early else "the time limit was nearly reached"
+        text = f"These checks were left out, because {why}: {', '.join(skipped)}."
         sink(StateEntered("left_out", text, time=clock.now()))
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
 
 def _aspects(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Aspect:
-    """What the volume can be judged by: without residuals where views show more than the volume.
+    """The checks that this volume allows. No residual is computed if the projections show more than the volume.
 
-    That is, more than a region, or than a field that does not hold all of the sample, where what lies beside it was not
-    taken off. A direct volume leaves the blur of its filter in the views.
+    They show more if the volume is only a region, or if the sample is larger than the field of view and the part
+    outside was not subtracted. The residual of a direct method contains the blur of its filter.
     """
     geometry, fitted = prepared.geometry, by_name(made.method).fitted
     if context.region is not None and made.volume.grid.shape != Grid.matching(geometry).shape:
@@ -129,75 +130,78 @@ def _aspects(made: Reconstruction, prepared: PreparedProjections, context: Repor
 
 
 def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:
-    """How far a sample wider than the field reaches beside it, and what that leaves open."""
+    """A note on the width of a sample larger than the field of view, and on the uncertainty that follows from it."""
     if SAMPLE not in made.settings:
         return ""
     radius, low, high, density = (made.settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
     unit, reach = prepared.length_unit, prepared.geometry.reach
     known, sure = "as given", ""
     if density == 1:
-        known = "assumed: there are too few views to measure it"
+        known = "assumed, because there are too few projections to measure it"
     elif low < high:
-        known = f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
-        advice = "; offset views (scan.offset_views) reduce that" if prepared.geometry.is_centred.all() else ""
+        known = f"{low:.4g} to {high:.4g} {unit} fit the projections nearly as well"
+        advice = "; offset projections (scan.offset_views) reduce this" if prepared.geometry.is_centred.all() else ""
         sure = f" Densities near the axis are uncertain by {density:.1%} or more{advice}."
     return Note(
-        f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / reach:.2f} times as far as the "
-        f"field ({known}). The whole sample was reconstructed; only the part within the field is written.{sure}"
+        f"The sample is wider than the field of view: its radius about the rotation axis is {radius:.4g} {unit}, "
+        f"{radius / reach:.2f} times that of the field ({known}). The whole sample was reconstructed, but only the "
+        f"part in the field of view is written.{sure}"
     )
 
 
 def not_begun_warning(made: Reconstruction, judgement: Judgement) -> str:
-    """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a
-    volume of one density."""
+    """The warning that a volume does not show the sample yet; empty if the residual is smaller than that of a uniform
+    volume."""
     left, uniform = judgement.along_rows or (0.0, 0.0)
     if left < uniform or uniform == 0:
         return ""
     last = made.history[-1] if made.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
-        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the differences "
-        f"along the rows of the views, where a volume of one density leaves {uniform:.3g}. The method ended in "
-        f"{made.seconds:.3g} s{steps}: give it more seconds, steps or iterations."
+        f"Allow more time, steps or iterations: the {label_of(made.method)} volume does not show the sample yet. Its "
+        f"residual, {left:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} (both as a fraction of the "
+        f"variation along detector rows). The method ended after {made.seconds:.3g} s{steps}."
     )
 
 
 def _structure(made: Reconstruction, judgement: Judgement) -> str:
-    """The warning of structure in the residual of the views."""
+    """The warning about structure in the residual."""
     if judgement.unexplained is None or (share := judgement.unexplained.share) <= UNEXPLAINED_LIMIT:
         return ""
     others = " and ".join(name for name in _COMPARED if name != made.method)
     return (
-        f"{share:.1%} of the matter leaves structure in the residual of the views (at most {UNEXPLAINED_LIMIT:.1%} "
-        f"is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look at 'What the volume "
-        f"leaves in the views' in the report, and compare with --method {others}."
+        f"The {label_of(made.method)} volume may hide cracks, pores or edges: {share:.1%} of the sample voxels leave "
+        f"structure above the noise in the residual (normally at most {UNEXPLAINED_LIMIT:.1%}). Look at 'Residual in "
+        f"the projections' in the report, and compare with --method {others}."
     )
 
 
 def _stray_mass(made: Reconstruction, judgement: Judgement) -> str:
-    """The warning of mass where views show none."""
+    """The warning about mass in regions that the projections show to be empty."""
     if judgement.stray is None or (share := judgement.stray.share) <= STRAY_LIMIT:
         return ""
     return (
-        f"{share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
-        f"(at most {STRAY_LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
+        f"Do not trust faint features before you have looked at 'Stray mass' in the report: {share:.1%} of the mass of "
+        f"the {label_of(made.method)} volume lies in voxels that the projections show to be empty (normally at most "
+        f"{STRAY_LIMIT:.0%})."
     )
 
 
 def _needles(made: Reconstruction, prepared: PreparedProjections) -> str:
-    """The warning of Gaussians of a model that are needle-shaped."""
+    """The warning about needle-shaped Gaussians."""
     model = made.gaussians
     share = needles(model, prepared.geometry).share if model is not None and model.n else 0.0
     if share <= NEEDLES_LIMIT:
         return ""
     return (
-        f"{share:.0%} of the mass of the model is in Gaussians thinner than a pixel and ten times as long (at "
-        f"most {NEEDLES_LIMIT:.0%} is usual). They follow the noise of few views: compare with --method fista-tv."
+        f"Compare with --method fista-tv: {share:.0%} of the mass is in needle-shaped Gaussians, thinner than a pixel "
+        f"and ten times as long (normally at most {NEEDLES_LIMIT:.0%}). With few projections, such Gaussians fit the "
+        "noise."
     )
 
 
 def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, context: ReportContext) -> str:
-    """The warning of views that do not fit, which names the worst by frames and pixels of the file; empty without."""
+    """The warning about projections that do not fit the volume, with frames and pixels of the worst; empty if none."""
     if not odd:
         return ""
     frames, binning = prepared.projections.view_ids, context.selection.binning
@@ -210,14 +214,14 @@ def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, con
     ]
     more = f"; and {len(odd) - _NAMED} more" if len(odd) > _NAMED else ""
     return (
-        f"{count(len(odd), 'view')} with a part that is not in the volume, by more than {LIMIT:g} times "
-        f"what is usual there: {'; '.join(places)}{more}. Something was in the beam, or the sample was elsewhere: look "
-        "at these frames."
+        "Look at these frames, because something crossed the beam or the sample moved: "
+        f"{count(len(odd), 'projection')} with a part that is not in the volume (more than {LIMIT:g} times the usual "
+        f"deviation): {'; '.join(places)}{more}."
     )
 
 
 def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPaths, context: ReportContext) -> Volume:
-    """FBP of the same views."""
+    """FBP of the same projections."""
     context.phases.enter("FBP for comparison", "slices")
     grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
     out = scratch_array(target.output.parent, grid.shape) if on_disk else None
@@ -228,10 +232,10 @@ def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPath
 def _beside_each_other(
     made: Reconstruction, volumes: Mapping[str, Volume], judgement: Judgement, truth: Volume | None, seed: int
 ) -> dict[str, dict[str, float]]:
-    """Figures of merit that compare volumes: SNR and CNR in regions of one reference, level of air.
+    """Figures of merit that compare volumes: SNR and CNR in regions of one reference, and the air level.
 
-    The reference is the truth, else FBP of the views, else none. Air, if the views show any, is relative to the noise
-    of FBP there.
+    The reference is the ground truth, otherwise FBP of the projections; without both, SNR and CNR are not computed. The
+    air level is in units of the FBP noise in air, and is given if the projections show air.
     """
     direct_one = None if by_name(made.method).fitted else made.volume
     reference = truth or volumes.get(BASELINE) or direct_one
@@ -240,34 +244,35 @@ def _beside_each_other(
         figures |= contrast(reference, volumes, seed)
     if (stray := judgement.stray) is not None and BASELINE in volumes:
         _, noise = stray.level(volumes[BASELINE])
-        for name, each in volumes.items() if noise > 0 else ():  # neither NaN
+        for name, each in volumes.items() if noise > 0 else ():  # which excludes NaN
             figures[name]["air"] = stray.level(each)[0] / noise
     return figures
 
 
 def _lost_matter(made: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
-    """The warning that weakly absorbing matter is missing that FBP shows."""
-    lit, seen = prepared.measured, None  # [z] whether the slice's row of the detector got beam
+    """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
+    lit, seen = prepared.measured, None  # seen [z]: the detector row of the slice was in the beam
     if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):
         seen = np.asarray(lit.any(axis=1))
     if (lost := lost_matter(made.volume.data, fbp.data, seen)) is None:
         return ""
     z, y, x = (f"{first}:{end}" for first, end in lost.region)
     return (
-        f"The {label_of(made.method)} volume keeps {lost.kept:.0%} of the mass that FBP shows above its own air "
-        f"in a region of {z},{y},{x} [z, y, x]. Weak matter was lost, as where air is below zero. See --air in "
-        "docs/corrections.md, give --allow-negative, or use --method fbp."
+        f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(made.method)} volume "
+        f"has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This happens, for "
+        "example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the air (--air, see "
+        "docs/corrections.md)."
     )
 
 
 def _unused_levels(made: Reconstruction) -> str:
-    """That the volume was not pulled to the levels that were given."""
+    """The warning that the levels of --levels were not used."""
     levels = made.settings.get("levels")
     if levels is None or not np.size(levels) or "levels_of_materials" in made.settings:
         return ""
     stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
     return (
-        f"The levels {stated} were not used, because views held out are not predicted better with them: the volume is "
-        "that of total variation. Levels are densities in the unit of the volume, without the air's; leave them out to "
-        "have them found."
+        f"The levels {stated} were not used, because held-out projections are not predicted better with them. The "
+        "volume is the FISTA-TV volume. Levels are densities in the unit of the volume, without that of air. Leave out "
+        "--levels to have the levels determined from the scan."
     )

@@ -1,4 +1,4 @@
-"""Figures: their panels and images, with labelled axes, units and a stated grey window, as PNG bytes."""
+"""Figures as PNG bytes: panels and images with labelled axes, units and a stated grey window."""
 
 from __future__ import annotations
 

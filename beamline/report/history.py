@@ -1,4 +1,4 @@
-"""The history of a fit as arrays, its residual curve, and the pictures of these."""
+"""The history of a fit as arrays, with its residual curve and pictures."""
 
 from __future__ import annotations
 

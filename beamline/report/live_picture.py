@@ -1,4 +1,4 @@
-"""The picture of a growing volume: slices and the newest view in rows of panels, drawn fast enough for each look."""
+"""The picture of a growing volume: slices and the newest projection, drawn fast enough for each update."""
 
 from __future__ import annotations
 

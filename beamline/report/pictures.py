@@ -1,4 +1,4 @@
-"""Pictures of a report: views, slices of volumes and what speaks for or against them, as PNG bytes."""
+"""Pictures of a report, as PNG bytes: projections, slices, and what shows the quality of the volume."""
 
 from __future__ import annotations
 

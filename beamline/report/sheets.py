@@ -1,4 +1,4 @@
-"""Sheets of images in one grey window: a slice of many volumes, flagged frames with their reasons, darks and flats."""
+"""Sheets of images with the same grey window: one slice of many volumes, flagged frames, darks and flats."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Scan: one scan from preflight to the closed file."""
+"""Scan: runs one scan, from the checks before it to the closed file."""

@@ -1,4 +1,4 @@
-"""Acquisition: the blocks of a timeline become frames in file order, and the instrument is always left safe."""
+"""Acquisition: takes the frames of a timeline in file order, and always leaves the instrument in a safe state."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Acquisition:
             devices_work = True
             raise
         except (BeamlineError, DeviceError) as ended_by:
-            devices_work = isinstance(ended_by, DataError)  # the disk failed
+            devices_work = isinstance(ended_by, DataError)  # then the disk failed, not a device
             self._warn_discrepancies()
             raise
         finally:
@@ -111,13 +111,13 @@ class Acquisition:
     def _blocks(self) -> Iterator[Frame]:
         place, filter_ = self._timeline.plan.filter, self._devices.filter
         if filter_ is not None and place is not None and not self._stop.stopping:
-            self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
+            self._sink(StateEntered(self._supervision.states.state, f"Moving the filter to {place}"))
             filter_.put(place)
         energy, monochromator = self._timeline.plan.energy, self._devices.monochromator
         if monochromator is not None and energy is not None and not self._stop.stopping:
-            self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
+            self._sink(StateEntered(self._supervision.states.state, f"Moving the monochromator to {energy:.7g} keV"))
             monochromator.move_to(energy)
-        enough = False  # the views
+        enough = False  # the projections
         for block in self._timeline.blocks:
             self._stop.refuse_abort()
             if not block.n_to_take:
@@ -127,7 +127,7 @@ class Acquisition:
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            # Offset views may be taken already, where they were chosen after a pass.
+            # Offset projections may have been taken already, if they were chosen after a pass.
             if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
                 continue
             if block.kind is FrameKind.OFFSET_VIEW:
@@ -140,11 +140,11 @@ class Acquisition:
                 yield from self._retake(block)
 
     def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Generator[Frame, None, bool]:
-        """The views in passes, and what is chosen after each; whether they are enough. What nobody chose is left to the
-        plan.
+        """Take the projections in passes, with a decision after each; True if they are enough. What nobody chose is
+        left to the plan.
 
-        A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
-        Where that pass had ended, it does not end anew, and the choice comes next.
+        A resumed scan begins with the rest of the pass in which it was interrupted, and with projections that earlier
+        passes lack. If that pass had ended, its end is not reported again, and the decision comes next.
         """
         plan, blocks = self._timeline.plan, [block for block in self._timeline.blocks if block.n_to_take]
         offset = [block for block in blocks if block.kind is FrameKind.OFFSET_VIEW]
@@ -152,7 +152,7 @@ class Acquisition:
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         blocks = [*([unfinished] if unfinished.n_to_take else []), *(offset if choice is Choice.OFFSET else [])]
-        if not self._done:  # no references came first, and the choice may
+        if not self._done:  # no darks or flats were taken first, and the decision may come first
             self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
             self._supervision.states.enter(_state_of(views))
         while True:
@@ -198,8 +198,11 @@ class Acquisition:
         self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
     def _retake(self, views: Block) -> Iterator[Frame]:
-        """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
-        which is then not missing. A repeated view without a frame is not a further failure."""
+        """Take the projections again that supervision wants repeated.
+
+        Each names the frame that it replaces, or has a missing trigger, which is then no longer missing. A repeated
+        projection without a frame is not an additional failure.
+        """
         retakes = self._supervision.retakes(missing_views(self._done))
         if not retakes:
             return
@@ -220,19 +223,21 @@ class Acquisition:
             replaces = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
-            self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
+            self._sink(Warned(f"Frames {spans(rows)}: repeated, but again without a frame."))
 
     def _offset(self, block: Block) -> Iterator[Frame]:
-        """Offset views, at angles of the first views. Nothing replaces anything."""
+        """Take offset projections, at angles of the first projections. They replace nothing."""
         views = self._timeline.views
-        beyond = float(max(middle_of_exposure(views), key=abs))  # every pass goes the same way; one pulse has none
-        first = block.first_trigger - views.first_trigger  # in files offset views are views, too
+        # every pass has the same direction; a single pulse has none
+        beyond = float(max(middle_of_exposure(views), key=abs))
+        first = block.first_trigger - views.first_trigger  # in files, offset projections are projections, too
         for frame in self._block(BlockTally(block)):
             invalid = frame.kind is FrameKind.INVALID
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs this block: references of a kind that it has none of, where it took views.
+        """True if a stopped scan still needs this block: darks or flats of a kind that it does not have, although it
+        took projections.
 
         A stop during the block itself ends it, because each block is considered once.
         """
@@ -243,18 +248,19 @@ class Acquisition:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
         if not (seconds := self._timeline.plan.warm_up):
             return
-        self._sink(StateEntered(self._supervision.states.state, f"The scintillator warms up for {seconds:g} s"))
+        self._sink(StateEntered(self._supervision.states.state, f"Warming up the scintillator for {seconds:g} s"))
         deadline = self._clock.now() + seconds
         while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
             self._clock.sleep(min(SLICE, left))
 
     def wait_while_paused(self, reopen: bool = True) -> None:
-        """Wait with a closed shutter while a pause is requested; a stop ends it.
+        """Wait with a closed shutter while a pause is requested; a stop ends the wait.
 
-        A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.
+        The request to move a manual shutter follows the report of the state. In a pause that ends automatically the
+        shutter stays open.
 
         Args:
-            reopen: the shutter opens after it, as frames follow at once.
+            reopen: open the shutter afterwards, because frames follow at once.
         """
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
         reason = pause.reason
@@ -263,7 +269,7 @@ class Acquisition:
         shutter = self._devices.shutter
         if not shutter.by_hand:
             shutter.close()
-        self._supervision.wait_in_pause()  # earlier input does not count
+        self._supervision.wait_in_pause()  # ignore earlier input
         states.enter(State.PAUSED, f"Paused{'' if shutter.by_hand else ' with a closed shutter'}: {reason}")
         while pause.reason and not self._stop.stopping:
             if shutter.by_hand and not pause.ends_by_itself:
@@ -273,7 +279,7 @@ class Acquisition:
         if not self._stop.stopping:
             if reopen:
                 set_shutter_and_sample(self._devices, block, self._warm_up)
-            states.enter(_state_of(block), "The scan goes on")
+            states.enter(_state_of(block), "The scan continues")
 
     def _raise_outcome(self) -> None:
         blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
@@ -287,13 +293,14 @@ class Acquisition:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before the first frame: {self._stop.reason}.")
             raise ScanStopped(
-                f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file is complete as far as "
-                f"it goes.{discrepancies(self._done)}"
+                f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file contains "
+                f"everything that was taken until then.{discrepancies(self._done)}"
             )
         if text := discrepancies(self._done):
             raise LedgerError(
-                f"{text.strip()} Every other frame is in the file with the angle of its trigger. Repeat these views, "
-                "or reconstruct without them; a longer period_s leaves the camera more time.",
+                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat "
+                "these projections, or reconstruct without them. A longer period_s gives the camera more "
+                "time.",
                 self.missing,
             )
 
@@ -304,7 +311,7 @@ class Acquisition:
 
 
 def _state_of(block: Block) -> State:
-    """The state in which a block begins, and goes on after a pause."""
+    """The state of the scan when a block begins, and when it continues after a pause."""
     if block.kind not in REFERENCES:
         return State.TAXI if block.trains else State.ACQUIRING
     return State.DARKS if block.kind is FrameKind.DARK else State.FLATS

@@ -1,4 +1,6 @@
-"""Backlog: how many frames may wait for the disk, what pauses a scan before memory or disk is full, time left."""
+"""Backlog: how many frames may wait for the disk, when a scan pauses before memory or disk is full, and the time
+left.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the recorder's threads
 EVENT_INTERVAL = 0.1  # real s between `frame` events
-RATE_FRAMES = 20  # the rate is that of the last so many frames
+RATE_FRAMES = 20  # number of last frames from which the rate is computed
 
 
 def room(timeline: Timeline) -> int:
@@ -42,12 +44,12 @@ def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[
     n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
     if memory is None or n == 0:
         return ""
-    frames = f"Memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
+    frames = f"Memory for {count(n, 'frame')} ({size(n * timeline.frame_bytes)})"
     try:
         memory.prepare(n, shape)
     except MemoryError:
-        return f"{frames}, cannot be had before they come"
-    return f"{frames}, is ready"
+        return f"{frames} cannot be reserved before the scan"
+    return f"{frames} is reserved"
 
 
 def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> None:
@@ -62,31 +64,34 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> N
     if left and free < min(reserve, left) + CLOSING:
         pause.hold(
             Cause.SPACE,
-            f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
-            f"{size(again)} the scan goes on by itself",
+            f"Free some space on the scan's disk: {size(free)} are free, and {size(left)} are still to be "
+            f"written. The scan continues automatically when {size(again)} are free",
         )
     elif not left or free >= again:
         pause.release(Cause.SPACE)
 
 
 def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
-    """Pause a fly scan before the queue is full, until few frames wait to be written.
+    """Pause a fly scan before the queue is full, until only few frames wait to be written.
 
     Args:
-        most: frames that may wait.
-        waiting: frames that do.
-        checking, writing: busy s of the recorder's threads; the disk is behind if writing took longer.
+        most: limit for the number of waiting frames.
+        waiting: number of waiting frames.
+        checking, writing: busy s of the recorder's threads; the disk is too slow if writing took longer.
     """
     if 4 * waiting >= 3 * most:
         what, advice = (
-            ("the disk is behind", "a longer period_s or a faster disk")
+            ("The disk is too slow", "a longer period_s or a faster disk")
             if writing > checking
-            else ("the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it")
+            else (
+                "The processor is too slow",
+                "a longer period_s, a scan without live reconstruction, or fewer other programs",
+            )
         )
         pause.hold(
             Cause.BACKLOG,
-            f"{what}, {waiting} of at most {most} frames wait in memory. The scan goes on by "
-            f"itself when most of them are written; {advice} spares the pauses",
+            f"{what}: {waiting} of at most {most} frames wait in memory. The scan pauses, and continues "
+            f"automatically when most of them are written. To avoid such pauses, use {advice}",
         )
     elif 4 * waiting <= most:
         pause.release(Cause.BACKLOG)
@@ -97,7 +102,8 @@ class FrameProgress:
 
     def __init__(self, timeline: Timeline) -> None:
         self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
-        # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
+        # The time for moves is spread over the frames, so that the time left always decreases, also after a wait for
+        # the operator.
         periods = np.concatenate([np.full(block.n_to_take, block.period) for block in timeline.blocks])
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
@@ -116,7 +122,7 @@ class FrameProgress:
         self.total -= left - done
 
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
-        """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
+        """Record the n-th frame; None if the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
         if now - self._last_event < EVENT_INTERVAL and n < self.total:

@@ -1,11 +1,12 @@
-"""Braking: assigns triggers to the frames that came after a stage was told to stop within a train.
+"""Braking: assigns triggers to the frames that were taken while the stage was braking after a stop within a pulse
+train.
 
 Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
 frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
-begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
-the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
-Frames that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that
-wait for their trigger.
+begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then the
+number of exposures must be the number of triggers up to that place, and the intervals between them must grow. Frames
+that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that wait
+for their trigger.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, enter, start_kno
 from beamline.scan.tally import Exposed
 from drivers.base.protocols import CameraFrame, TriggerTrain
 
-EARLY, LATE = 0.02, 0.5  # s: braking begins at most so long before, and so long after, the stop was sent
-MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
-FEW = 4  # triggers; fewer exposures show nothing
+EARLY, LATE = 0.02, 0.5  # s: braking begins at most this long before, and this long after, the stop was sent
+MOST = 0.75  # share of the triggers that must have a frame at their times; by chance 0.4 do
+FEW = 4  # triggers; with fewer exposures nothing can be concluded
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
-BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not have passed it
+BESIDE = 0.02  # intervals: a stage that stands this close to a trigger may or may not have passed it
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def _matched(ledger: Ledger) -> int:
 
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
-    """Whether the intervals between exposures grow from the last steady one on."""
+    """True if the intervals between exposures grow from the last steady one on."""
     steady = [
         DeliveredFrame(ledger.exposed, ledger.phase),
         *(frame for frame in frames if frame.time < braking.stop_sent),
@@ -109,15 +110,15 @@ def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFra
 
 @dataclass
 class FlownTrain:
-    """A pulse train under way.
+    """A pulse train that is being flown.
 
     Attributes:
         first: its first trigger within the block.
-        seconds: that its move takes.
+        seconds: duration of its move.
         stop_sent: time at which the stage was told to stop during the pass.
-        paused: for a pause, after which the triggers that come after the last frame stored are exposed anew.
-        braking: for a stop, once the stage stands.
-        waiting: frames whose trigger those that follow show.
+        paused: for a pause: the triggers after the last stored frame are exposed again afterwards.
+        braking: for a stop, as soon as the stage has stopped.
+        waiting: frames whose trigger is known only from those that follow.
     """
 
     ledger: Ledger

@@ -1,4 +1,4 @@
-"""Control: states of a scan in their allowed order, and verbs to a running one from another terminal.
+"""Control: the states of a scan and their allowed order, and commands to a running scan from another terminal.
 
 docs/states.md draws the states and explains the verbs in each. A verb is an empty file of that name in the folder
 `control` of the run, which only its owner can enter. The scan removes the file and obeys. This works on every system
@@ -43,7 +43,7 @@ class State(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether this state is final."""
+        """True if this state is final."""
         return not NEXT[self]
 
 
@@ -99,13 +99,14 @@ class Verb(StrEnum):
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, choose: Callable[[Choice], None] = lambda choice: None
 ) -> Iterator[None]:
-    """A context in which the scan of this folder obeys commands, by files in a folder that only its owner can enter.
+    """A context in which the scan of this folder obeys commands, which are files in a folder that only its owner can
+    enter.
 
     Args:
-        choose: takes what the operator has chosen to be measured next.
+        choose: takes the operator's choice of what is measured next.
 
     Raises:
-        DataError: the disk does not take the folder for them.
+        DataError: the folder for the commands cannot be created.
     """
     place, over = folder / CONTROL, threading.Event()
     actions: Mapping[Verb | Choice, Callable[[], None]] = {
@@ -172,8 +173,9 @@ class Asked:
                 return None
             if _taken(request):
                 raise ConfigError(
-                    f"the scan in {self.part} does not answer: it has died, or its disk hangs. Nothing was changed. If "
-                    "it has died, look at the instrument, and run `beamline recover` on its file."
+                    f"the scan in {self.part} does not answer: its process was killed, or its disk hangs. "
+                    "Nothing was changed. If it was killed, check the instrument, and run `beamline "
+                    "recover` on its file."
                 )
         state = state_of(self.part)
         return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None
@@ -183,10 +185,11 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
-        verb: what the scan is to do; or a choice of what it measures next, which it takes only while it asks.
+        verb: what the scan is to do; or a choice of what it measures next, which it accepts only while it waits for a
+            decision.
 
     Raises:
-        ConfigError: no scan runs there, or it does not ask.
+        ConfigError: no scan runs there, or it is not waiting for a decision.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
@@ -195,8 +198,8 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
         raise ConfigError(f"no scan is running in {run}. Nothing was changed.")
     if isinstance(verb, Choice) and (state := state_of(part)) is not State.ASKING:
         raise ConfigError(
-            f"the scan in {run} does not ask what to measure next: it is {state}. It asks after each pass of views, "
-            "where scan.decide is ask. Nothing was changed."
+            f"the scan in {run} is not waiting for a decision on what to measure next: it is {state}. "
+            "With scan.decide: ask, it waits after each pass of projections. Nothing was changed."
         )
     try:
         request.touch()
@@ -209,7 +212,9 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
 
 
 def tell(run: Path, verb: Verb | Choice) -> State:
-    """Send a command to a running scan, and wait until it is done; returns the state. Raises as `ask` and `Asked`."""
+    """Send a command to a running scan, and wait until it is done; returns the state. Raises the errors of `ask` and
+    `Asked`.
+    """
     asked = ask(run, verb)
     while (state := asked.state()) is None:
         time.sleep(POLL)
@@ -217,13 +222,13 @@ def tell(run: Path, verb: Verb | Choice) -> State:
 
 
 def state_of(part: Path) -> State:
-    """The state of the scan in this folder, by its record; `failed` where its process has died."""
+    """The state of the scan in this folder, from its record; `failed` if its process was killed."""
     record, states = read_record(part), {DIED: State.FAILED, **{state.value: state for state in State}}
     return State.IDLE if record is None else states.get(record.state, State.IDLE)
 
 
 def _done(state: State, verb: Verb | Choice) -> bool:
-    """Whether a scan in this state has obeyed the verb."""
+    """True if a scan in this state has obeyed the verb."""
     if state is State.FINISHING or state.ended:
         return True
     if verb in (Verb.PAUSE, Verb.RESUME):

@@ -1,4 +1,4 @@
-"""Energies: a series of scans of one sample, one for each energy, in one folder; it can go on later.
+"""Energies: a series of scans of one sample, one per energy, in one folder; the series can be continued later.
 
 Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
 """
@@ -52,7 +52,7 @@ class SeriesRun:
 
 
 def is_series(folder: Path) -> bool:
-    """Whether a folder contains a series of energies."""
+    """True if a folder contains a series of energies."""
     if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
         return False
     return load(folder / CONFIG, environment={}).scan.energies is not None
@@ -62,21 +62,23 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
 
     Args:
-        warn: takes a sentence on energies whose scan lacks frames, or is not there.
+        warn: takes a sentence on energies whose scan is incomplete or does not exist.
 
     Raises:
-        DataError: none has one.
+        DataError: no energy has a scan.
     """
     runs = _runs(folder, load(folder / CONFIG, environment={}))
     files = [scan_file(run) for run in runs if run is not None]
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
     if files and len(whole) < len(runs):
         warn(
-            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan, and {len(files)} are used. "
-            f"`beamline scan --resume {folder}` takes the rest."
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with "
+            f"frames are used. `beamline scan --resume {folder}` takes the rest."
         )
     if not files:
-        raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
+        raise DataError(
+            f"{folder} has no scan yet: `beamline scan --resume {folder}` takes the scans. Nothing was written."
+        )
     return files
 
 
@@ -99,13 +101,13 @@ def run_energies(
 
     Args:
         place: the folder in which the series gets its own; None: the configured one.
-        stop: ends the scan that runs, and with it the series. `sinks`, `ask`: as of `run_scan`, for all scans.
+        stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
         commands: of the reconstruction of each scan.
-        series: the folder of a series that goes on: scans that lack nothing stay, one that ended early goes on.
+        series: the folder of a series that is continued: complete scans stay, one that ended early is continued.
 
     Raises:
-        ConfigError: a limit is violated at one of the energies; nothing has moved. What `run_scan` raises: the scans
-            before it are complete, and a warning names the folder that can go on.
+        ConfigError: a limit is exceeded at one of the energies; nothing has moved. What `run_scan` raises: the scans
+            before it are complete, and a warning names the folder with which the series can be continued.
     """
     each, send = at_energies(config), fan_out(*sinks)
     with ExitStack() as held:
@@ -153,7 +155,7 @@ def _new_folder(config: Config, place: Path) -> Path:
 def _runs(series: Path, config: Config) -> list[Path | None]:
     """The newest run folder of each energy of a series; None: there is none."""
     if not is_series(series):
-        raise ConfigError(f"{series} is not the folder of a series of energies. Nothing was changed.")
+        raise ConfigError(f"{series} is not the folder of an energy series. Nothing was changed.")
     run_of_energy = dict[float | None, Path]()
     for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
         run_of_energy[load(run / CONFIG, environment={}).scan.energy] = run
@@ -161,7 +163,7 @@ def _runs(series: Path, config: Config) -> list[Path | None]:
 
 
 def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
-    """What there is to do: nothing (its scan file), the rest of a run, or a scan anew (None)."""
+    """What is left to do for an energy: nothing (its scan file), the rest of a run, or a new scan (None)."""
     if run is None:
         return None
     try:
@@ -169,9 +171,11 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
     except NoFrame:
         return None
     except (NotJoined, NothingMissing):
-        recover_run(run)  # which ends the record of one that died in its last fit
+        recover_run(run)  # sets the final state in the record of a run whose process was killed in its last fit
     except DataError as error:
-        raise DataError(f"{error} If {run} cannot be recovered, move it away: --resume then takes it anew.") from None
+        raise DataError(
+            f"{error} If {run} cannot be recovered, move it to another place: --resume then takes this scan again."
+        ) from None
     return scan_file(run)
 
 
@@ -180,9 +184,9 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 
 
 def _after_failure(folder: Path, n: int, of: int, sinks: Sequence[Sink]) -> None:
-    """Say how the series can go on; remove its folder where no scan has one in it."""
+    """Report how the series can be continued; remove its folder if it contains no scan."""
     if any(path.is_dir() for path in folder.iterdir()):
-        _tell(Warned(f"The series ended at energy {n} of {of}: `beamline scan --resume {folder}` goes on."), sinks)
+        _tell(Warned(f"The series ended at energy {n} of {of}. `beamline scan --resume {folder}` continues it."), sinks)
         return
     (folder / CONFIG).unlink()
     folder.rmdir()

@@ -1,4 +1,6 @@
-"""Exposures: a block of frames taken from camera and stage, flying, stepping or standing, each with its true angle."""
+"""Exposures: takes a block of frames with camera and stage (fly scan, step scan, or stage at rest), each with its
+true angle.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +28,12 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
 SLICE = 0.5  # s: the longest wait for a frame between two checks of the stop request
-PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
-PATIENCE_PERIODS = 10  # so many trigger periods
+PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera counts as silent; lower limit
+PATIENCE_PERIODS = 10  # the same in trigger periods
 RAMP_TOLERANCE = 0.1  # share of the time that acceleration adds before the first pulse
 SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera counts as silent
-STANDS_WITHIN = 10.0  # s that a stage which somebody else moves may take to stand, before it is sent to a view again
+# s within which a stage that somebody else moves must stop, before it is sent to a projection again
+STANDS_WITHIN = 10.0
 
 
 class Exposures:
@@ -61,9 +64,9 @@ class Exposures:
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
     def take(self, taken: BlockTally, first_row: int) -> Iterator[Frame]:
-        """Record the block's frames, numbered from `first_row`; `taken` lists what is missing.
+        """Record the block's frames, numbered from `first_row`; `taken` collects what is missing.
 
-        A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
+        A stop during the block ends it early. A block that begins after the stop is taken completely.
 
         Raises:
             ScanAborted: an abort was requested; the stage may still be moving.
@@ -93,7 +96,7 @@ class Exposures:
 
     def _fly(self, taken: BlockTally) -> Iterator[Exposed]:
         block, ahead, i = taken.block, passes(taken.block), 0
-        # It begins within a pass only after a pause.
+        # The block begins within a pass only after a pause.
         while (i := self._after_pause(i, taken)) < block.n and not self._stop.stopping:
             flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
             train, done = flown.train, i - flown.first
@@ -105,8 +108,10 @@ class Exposures:
             i += yield from self._pass(taken, rest, i, (begin, flown.end))
 
     def _after_pause(self, i: int, taken: BlockTally) -> int:
-        """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a
-        lost beam it is the first trigger that may lack beam; it and later ones are repeated."""
+        """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame.
+
+        After a loss of the beam it is the first trigger that may lack beam; it and later ones are repeated.
+        """
         block = taken.block
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
@@ -123,8 +128,10 @@ class Exposures:
     def _pass(
         self, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
     ) -> Generator[Exposed, None, int]:
-        """Fly once over a train whose first trigger within the block is `first`; the stage stands at the first of the
-        ends. Returns how many of its triggers are done with: all, or those up to the last frame before a pause."""
+        """Fly once over a train whose first trigger within the block is `first`; the stage is at the first of the ends.
+
+        Returns how many of its triggers are done: all, or those up to the last frame before a pause.
+        """
         block, (start, end) = taken.block, ends
         self._camera.arm(train.n)
         self._stage.arm(train)
@@ -141,7 +148,7 @@ class Exposures:
             except (BeamlineError, DeviceError):
                 yield from flight.enter(last=True)
                 raise
-            if not flight.paused:  # otherwise the triggers of waiting frames come again
+            if not flight.paused:  # otherwise the triggers of waiting frames are repeated
                 yield from flight.enter(last=True)
             cut_short = self._stop.stopping or flight.paused
         finally:
@@ -150,26 +157,28 @@ class Exposures:
         self._camera.disarm()
         if flight.ledger.last < 0 and not cut_short and train.n >= SILENT_EXPOSURES:
             raise InstrumentError(
-                f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
-                f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
-                "and the stage's trigger output. What was taken before is in the file."
+                "Check the trigger cable, its polarity and the stage's trigger output. "
+                f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned "
+                f"from {math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Earlier frames are in the "
+                "file."
             )
         return flight.ledger.last + 1 if flight.paused else train.n
 
     def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
-        """When the pulses should come: taxi at constant acceleration, then constant speed.
+        """When the pulses should come: run-up at constant acceleration, then constant speed.
 
-        The stage may have begun at any time between `before` and `after`, and its acceleration is only nearly constant.
+        The stage may have started at any time between `before` and `after`, and its acceleration is only nearly
+        constant.
         """
         ramp = block.speed / (2 * self._stage.limits.acceleration)
         first = (before + after) / 2 + block.taxi / block.speed + ramp
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: FlownTrain) -> Iterator[Exposed]:
-        """Frames while the stage turns; after a stop, all frames until the stage stands. After a pause only the frames
-        exposed before the stop was sent: they equal those of a scan without a pause.
+        """Frames while the stage turns; after a stop, all frames until the stage has stopped.
 
-        Waits for frames, not for the stage, so that a camera without frames is noticed at once.
+        After a pause only the frames exposed before the stop was sent: they equal those of a scan without a pause. The
+        method waits for frames, not for the stage, so that a camera without frames is noticed at once.
         """
         tail = block.exposure + self._camera.timing.readout
         patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
@@ -193,8 +202,8 @@ class Exposures:
                 if self._clock.now() >= flight.last_due + tail:
                     break  # no trigger is still to come: what is missing is named with the rest of the pass
                 raise InstrumentError(
-                    f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "
-                    "cable and the camera. What was taken before is in the file."
+                    f"Check the trigger cable and the camera. {self._camera.name}: no frame for "
+                    f"{wait:.3g} s while the stage turned. Earlier frames are in the file."
                 )
         if flight.paused:
             return
@@ -204,7 +213,7 @@ class Exposures:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
     def _brake(self, flight: FlownTrain) -> None:
-        """Slow down within a train, wait until the stage stands, and ask where."""
+        """Stop the stage within a train, wait until it has stopped, and read its position."""
         train, limits = flight.train, self._stage.limits
         flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
         stand(self._stage, self._clock, self._stop)
@@ -214,8 +223,10 @@ class Exposures:
             flight.braking = Braking(flight.stop_sent, stood, counts / abs(train.interval))
 
     def _one_by_one(self, taken: BlockTally) -> Iterator[Exposed]:
-        """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each
-        frame its trigger, where the stage was, and whether that was its angle."""
+        """Take frames with software triggers: at each angle of a step scan, or at rest for darks and flats.
+
+        Yields each frame with its trigger, the position of the stage, and True if this was the right angle.
+        """
         block = taken.block
         self._camera.arm(block.n)
         period = max(block.period, self._camera.timing.min_period)
@@ -240,7 +251,7 @@ class Exposures:
             if not self._rest(triggered + period - self._clock.now(), owed):
                 break
             self._camera.software_trigger()
-            triggered = self._clock.now()  # after the call: the time of the exposure within it is not known
+            triggered = self._clock.now()  # after the call, because the time of the exposure within it is not known
             frame = self._next_frame(patience, until_stop=False)
             if frame is not None:
                 silent, wrong = 0, ""
@@ -251,7 +262,7 @@ class Exposures:
                     tried[i] += 1
                     stands_at = math.nan
                     if len(taken.astray) == tried[i] == 1:
-                        self._sink(Warned(f"View {i}: {wrong}"))
+                        self._sink(Warned(f"Projection {i}: {wrong}"))
                     if tried[i] == TRIES:
                         taken.miss([i])
                         tried[i] = 0
@@ -263,8 +274,8 @@ class Exposures:
             silent += 1
             if silent == SILENT_EXPOSURES:
                 raise InstrumentError(
-                    f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
-                    "Check the camera. What was taken before is in the file."
+                    f"Check the camera. {self._camera.name}: {silent} triggers in a row gave no frame "
+                    f"within {patience:.3g} s each. Earlier frames are in the file."
                 )
             self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()
@@ -275,7 +286,9 @@ class Exposures:
             self._clock.sleep(POLL)
 
     def _rest(self, seconds: float, owed: bool) -> bool:
-        """Wait for some seconds; False if a stop cut the wait short, which it does not in a block that is owed."""
+        """Wait for some seconds; False if a stop ended the wait early. A stop does not end it in a block that is still
+        needed.
+        """
         deadline = self._clock.now() + seconds
         while seconds > SLICE:
             self._stop.refuse_abort()
@@ -293,7 +306,7 @@ class Exposures:
     def _next_frame(self, timeout: float, until_stop: bool) -> CameraFrame | None:
         """The next frame, or None after `timeout` s (with `until_stop`, also at a request to stop or pause).
 
-        A first error of the camera is a warning (frames lost from its ring buffer become missing ones); a second is
+        A first error of the camera is a warning (frames lost from its ring buffer become missing ones); a second one is
         raised.
         """
         deadline = self._clock.now() + timeout
@@ -314,5 +327,5 @@ class Exposures:
 
     @property
     def _interrupted(self) -> bool:
-        """Whether a stop or a pause is requested."""
+        """True if a stop or a pause is requested."""
         return self._stop.stopping or bool(self._supervision.pause.reason)

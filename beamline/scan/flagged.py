@@ -1,4 +1,6 @@
-"""Flagged frames: which frames of a scan have flags, what these do to it, and which views are taken again."""
+"""Flagged frames: which frames of a scan have flags, what the flags do to the scan, and which projections are taken
+again.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,12 @@ class FlaggedFrames:
     """The flags of the frames so far.
 
     Args:
-        sink: takes `FrameFlagged`, where a check begins to flag or its level changes, not for every frame.
-        react: told the flags of each frame.
-        retaken_warnings: checks whose warnings have views taken again.
+        sink: takes `FrameFlagged` if a check begins to flag or its level changes, not for every frame.
+        react: gets the flags of each frame.
+        retaken_warnings: checks whose warnings also cause projections to be taken again.
 
     Attributes:
-        retaken: views that were taken again.
+        retaken: projections that were taken again.
     """
 
     def __init__(
@@ -35,7 +37,7 @@ class FlaggedFrames:
         self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._flags: list[Flag] = []
         self._active: set[tuple[str, Level]] = set()
-        self._triggers: dict[int, int] = {}  # of the views, by row
+        self._triggers: dict[int, int] = {}  # of the projections, by row
         self._replaced: set[int] = set()
         self.retaken = 0
 
@@ -69,12 +71,12 @@ class FlaggedFrames:
 
     @property
     def alarmed_views(self) -> set[int]:
-        """The views among them."""
+        """The projections among them."""
         return self.alarmed & self._triggers.keys()
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
+        """Projections with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
         warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
         return [Retake(row, self._triggers[row]) for row in sorted((self.alarmed | warned) & self._triggers.keys())]
 
@@ -87,7 +89,8 @@ class AlarmReaction:
     """What the monitor's alarms do to a scan.
 
     Args:
-        act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
+        act_after: number of consecutive frames with an alarm of a check after which its policy is carried out; and
+            again after as many.
         policies: by the name of the check.
     """
 
@@ -108,7 +111,7 @@ class AlarmReaction:
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
-        frames = f"{n} frames in a row have" if n > 1 else "1 frame has"
+        frames = f"{n} consecutive frames have" if n > 1 else "1 frame has"
         reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
         match self._policies.get(flag.check, Policy.LOG):
             case Policy.WARN:

@@ -1,13 +1,13 @@
-"""Ledger: which trigger exposed which frame, derived from framestamps and times, so that no angle is guessed.
+"""Ledger: assigns frames to triggers from framestamps and times, so that no angle is guessed.
 
 A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
 While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
 nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the
-first frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does.
-This needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at
-which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
+Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the first
+frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does. This
+needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at which their
+triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 
-FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
-NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
-CONFIRMED = 0.2  # periods; the same for a frame of a stage that brakes
+FREE = 0.35  # periods by which a frame may be away from its trigger; a frame further away was not exposed by a trigger
+NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next frame, which may be nearer
+CONFIRMED = 0.2  # periods; the same for a frame taken while the stage brakes
 KNOWN = 0.25  # periods: largest error of the first trigger's time that still identifies the first frame
 TRAIN, LOOK = 3, 6  # frames that make a train, and the most frames searched for one
 UNEVEN = 0.25  # periods; frames of a train are more regular than this
@@ -101,7 +101,7 @@ class Ledger:
 
     @property
     def complete(self) -> bool:
-        """Whether the last trigger has its frame, so that no more frames are expected."""
+        """True if the last trigger has its frame, so that no more frames are expected."""
         return self.last == self.train.n - 1
 
 
@@ -218,7 +218,7 @@ def start_known(train: Train) -> bool:
 
 
 def _off(ledger: Ledger, trigger: int, time: float) -> float:
-    """Periods from the time when its trigger was expected to a frame; negative: it came before."""
+    """Periods from the expected time of a frame's trigger to the frame; negative: the frame came before."""
     if ledger.last >= 0:
         return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
     return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger
@@ -263,7 +263,7 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
     """The largest shift of all angles that the time of the first frame allows.
 
     Args:
-        at_the_end: triggers without a frame there; None where it is not known: then as many as the first frame's time
+        at_the_end: triggers without a frame there; None if it is not known: then as many as the first frame's time
             suggests.
     """
     if ledger.last < 0:

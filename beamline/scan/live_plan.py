@@ -1,4 +1,4 @@
-"""Plan of the live volume of a scan: its binning, its views and its memory."""
+"""Plan of the live volume of a scan: binning, number of projections, and memory."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from beamline.core.text import count, size
 from beamline.plan.plan import Mode, ScanPlan, one_way
 
-# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
+# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 projections.
 _A_RAY, _A_VOXEL = 40, 50
-_WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
-_FEWEST = 90  # views
+_WIDEST = 512  # columns: no processor can reconstruct a wider volume as fast as projections arrive
+_FEWEST = 90  # projections
 _SHARE = 0.5  # share of the free memory
 _PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
 _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
@@ -23,7 +23,7 @@ class LivePlan:
     """The part of a scan that its live volume uses."""
 
     binning: int = 1  # binning of rows and columns
-    every: int = 1  # one of so many views, in the order taken
+    every: int = 1  # one projection in N is used, in the order taken
     bytes: int = 0  # of memory, about
 
     @property
@@ -32,10 +32,10 @@ class LivePlan:
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Choose binning and omitted views so that the live volume has at most 512 columns and fits half of the free
+    """Choose binning and omitted projections so that the live volume has at most 512 columns and fits half of the free
     memory.
 
-    Views are left out as long as 90 are used, then the binning grows.
+    Projections are left out as long as 90 are used, then the binning grows.
 
     Args:
         shape: rows and columns of a frame.
@@ -56,8 +56,9 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that recommends an order of views with a better live volume before the end; empty if the plan has
-    it."""
+    """A sentence that recommends an order of angles with a better live volume before the end; empty if the plan already
+    has it.
+    """
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:
         return ()
@@ -68,29 +69,32 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
     else:
         return ()
     return (
-        "until the last view the live volume knows a sector: after a quarter, half and three quarters of a scan of "
-        f"particles it has {_SEQUENTIAL} dB, by scan.angles {other} {expected} dB, and in the end the same",
+        "with angles in sequence the live volume is a limited-angle reconstruction until the last "
+        f"projection. In a test scan of particles it has {_SEQUENTIAL} dB after a quarter, half and three "
+        f"quarters of the scan. With scan.angles {other} it has {expected} dB; the final volume is the "
+        "same",
     )
 
 
 def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
-    """Estimated memory in bytes of a live volume of `n_views` views of this shape."""
+    """Estimated memory in bytes of a live volume of `n_views` projections of this shape."""
     rows, cols = (max(1, n // binning) for n in shape)
     return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
 
 
 def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
-    """A sentence on the live volume: its views and pixels, its memory, and the reason for its size."""
+    """A sentence on the live volume: its projections and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
-    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
+    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} of free memory"
     need = (
-        f"the live volume is of {count(views, 'view')} of {rows} x {cols} pixels, in about {size(plan.bytes)} of memory"
+        f"the live volume uses {count(views, 'projection')} of {rows} x {cols} pixels and about "
+        f"{size(plan.bytes)} of memory"
     )
     if plan.whole:
-        return f"{need}; it may take {most}"
-    how = [f"one view of {plan.every}"] if plan.every > 1 else []
+        return f"{need}; at most {most} is allowed"
+    how = [f"one projection in {plan.every}"] if plan.every > 1 else []
     how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
-    whole = f"all {n_views} of {shape[0]} x {shape[1]} would take {size(live_bytes(shape, n_views))}"
-    wide = f"at most {_WIDEST} columns, and " if shape[1] > _WIDEST else ""
-    return f"{need}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
+    whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
+    wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
+    return f"{need}: {', '.join(how)}, because it may use {wide}{most}; {whole}. `beamline recon` makes the full volume"

@@ -1,4 +1,6 @@
-"""Live reconstruction: a separate process that follows the growing file, so that its failure cannot harm the scan."""
+"""Live reconstruction: starts a separate process that follows the growing file, so that its failure cannot harm the
+scan.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,10 @@ if TYPE_CHECKING:
 
 LiveCommand = Callable[[Path, Path], Sequence[str]]  # (scan file, output file) -> the command line
 
-_SILENCE = 300.0  # real s without output, after which the process is ended
+_SILENCE = 300.0  # real s without output after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
-_AGAIN = 2  # times that it is started again
+_AGAIN = 2  # how often it is started again
 _POLL = 0.1  # real s between two checks of its readiness
 _SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
@@ -45,7 +47,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
     """The command `beamline recon SCAN --follow` with the options of the configuration.
 
     Args:
-        earlier: files of the same scan, whose views come first.
+        earlier: files of the same scan, whose projections come first.
     """
     plan = plan or LivePlan()
     options = {**_common(config), "--seconds": config.recon.seconds}
@@ -58,7 +60,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
 
 
 def finished_command(config: Config) -> LiveCommand:
-    """The command `beamline recon SCAN` for the complete scan, for a method that needs all views."""
+    """The command `beamline recon SCAN` for the complete scan, for a method that needs all projections."""
     return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
 
 
@@ -81,10 +83,10 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     if not config.recon.live:
         return Commands()
     if not streams(method):
-        remark = f"{method} needs the complete scan: the volume comes after it."
+        remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
-        remark = "Only darks and flats are taken: the volume is made of joined.h5 afterwards."
+        remark = "Only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
@@ -104,15 +106,21 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
-    """Whether the live reconstruction of an ended scan should end with its present volume: after a new stop, or
-    ASK_LIVE_AFTER after that of the scan; also with a `useless` file, which is broken or has no projections."""
+    """True if the live reconstruction of an ended scan should end with its present volume.
+
+    That is after a new stop, or ASK_LIVE_AFTER after the stop of the scan; also if the file is `useless`: broken or
+    without projections.
+    """
     last = ASK_LIVE_AFTER if stop.stopping else 0.0
     return lambda: useless or (stop.stopping and stop.seconds >= last)
 
 
 def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
-    """A question for the wait for the live volume of a scan that has ended: was the scan aborted? Then the live
-    reconstruction is killed. Of a stopped scan it says when first asked, then every 5 s, how long that has waited."""
+    """A function for the wait for the live volume after a scan: was the scan aborted? Then the live reconstruction is
+    killed.
+
+    For a stopped scan it reports how long the wait has lasted, when first called and then every 5 s.
+    """
     asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0  # for the volume, see `live_should_end`
     due, most = 0.0, asked_at + _GRACE
 
@@ -121,7 +129,10 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
         if stop.stopping and not stop.aborting and stop.seconds >= due:
             due = stop.seconds + _SAY_EVERY
             waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
-            say(f"Waiting for the live volume of the views so far: {waited}. Ctrl-C ends the scan without it")
+            say(
+                f"Waiting for the live volume from the projections taken so far ({waited}). Press Ctrl-C to "
+                "finish without it"
+            )
         return stop.aborting
 
     return aborting
@@ -130,20 +141,21 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
 class LiveReconstruction:
     """A running reconstruction whose events are passed on, each marked with source="recon".
 
-    Its `done` becomes `recon_done` and its `failed` a warning: `done` and `failed` belong to the scan. Its stderr goes
-    to the file `log`. A process that cannot be started is a warning, too. It ends with this process, also with one that
-    is killed, and then leaves no volume. One that a signal kills while the scan runs is started again, twice at most:
-    the file has all views, and its last round makes up for the steps that are lost.
+    Its `done` becomes `recon_done` and its `failed` a warning, because `done` and `failed` belong to the scan. Its
+    stderr goes to the file `log`. If the process cannot be started, that is a warning, too. It ends with this process,
+    also if this one is killed, and then leaves no volume. If a signal kills it during the scan, it is started again, at
+    most twice: the file has all projections, and the final fit makes up for the lost steps.
 
     Args:
-        on_law: takes each law of the error that it measures, in the thread that reads the output.
+        on_law: takes each error model that it measures, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
-        low_priority: a scan beside it takes precedence.
+        low_priority: a scan on the same computer takes precedence.
         child: starts the process, as `Standby.start`.
 
     Attributes:
-        ended: no law will come: it could not be started, or has ended in the scan and is not started again.
+        ended: no error model will come: the process could not be started, or ended during the scan and is not started
+            again.
     """
 
     def __init__(
@@ -164,7 +176,7 @@ class LiveReconstruction:
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
-        self._changing = threading.Lock()  # of the process, and of whether another is wanted
+        self._changing = threading.Lock()  # protects the process and the wish for another one
         with self._changing:
             self._start("x")
 
@@ -187,26 +199,27 @@ class LiveReconstruction:
         deadline = time.monotonic() + seconds
         if not self._ready.is_set():
             say(
-                "Waiting until the live reconstruction has compiled its kernels (once on a machine 1 to 2 minutes, "
-                f"otherwise seconds; at most {seconds:.0f} s). A pause begins after this wait; a stop ends it"
+                "Waiting until the live reconstruction has compiled its kernels (1 to 2 minutes the "
+                f"first time on a computer, otherwise seconds; at most {seconds:.0f} s). A pause starts "
+                "after this wait; a stop ends the wait"
             )
         while self._process is not None and self._process.running and not stop():
             if self._ready.wait(_POLL):
                 return
             if time.monotonic() >= deadline:
                 message = (
-                    f"The live reconstruction is not ready after {seconds:.0f} s. The scan begins; the volume takes "
-                    "its views up later."
+                    f"The scan starts now. The live reconstruction is still loading after {seconds:.0f} s "
+                    "and will catch up later."
                 )
                 self._sink(Warned(message))
                 return
 
     def finish(self, stop: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
-        """Wait until it ends; the data of its `done` event, or None if it failed.
+        """Wait until it ends; returns the data of its `done` event, or None if it failed.
 
         Args:
             stop: polled a few times a second; True asks it to end with its present volume.
-            hurry: polled in the same way, and while it ends; True kills it. It may tell how long that takes.
+            hurry: polled in the same way, also while it ends; True kills it. It may report how long the wait takes.
         """
         with self._changing:
             process, self._wanted = self._process, False
@@ -219,7 +232,7 @@ class LiveReconstruction:
                 ProcessEnd.SILENT: f"it was stopped after {self._silence:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
-            message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."
+            message = f"The {self._what} gave no volume: {reason}. See {self._log.name}. The scan is not affected."
             self._sink(Warned(message, source="recon"))
         return self._done
 
@@ -239,16 +252,16 @@ class LiveReconstruction:
                 return
             process.let_go()
             since = time.monotonic()
-            while process.code is None and time.monotonic() - since < _CLOSE:  # its output ends before it does
+            while process.code is None and time.monotonic() - since < _CLOSE:  # the output ends before the process does
                 time.sleep(_POLL)
-            when = "in the middle of the scan" if self._ready.is_set() else "before it was ready"
+            when = "during the scan" if self._ready.is_set() else "before it was ready"
             if killed := process.code is not None and process.code < 0 and self._again > 0:
                 self._again -= 1
-                then = "It is started again, and takes up the views in the file."
+                then = "It is started again, and uses the projections in the file."
             else:
                 self.ended = True
-                then = "The scan goes on without it. To start another: beamline recon FILE --follow -o OUT.h5"
-            message = f"The live reconstruction has ended {when} (code {process.code}); see {self._log.name}. {then}"
+                then = "The scan continues without it. To start another one: beamline recon FILE --follow -o OUT.h5"
+            message = f"The live reconstruction ended {when} (code {process.code}). See {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
             if killed:
                 self._start("a")
@@ -272,13 +285,13 @@ class LiveReconstruction:
 
 
 class Standby:
-    """A process that warms up for a live reconstruction before its scan begins, and becomes it, until `close`."""
+    """A process that loads a live reconstruction before its scan begins, and then becomes it, until `close`."""
 
     def __init__(self) -> None:
         self._process: ChildProcess | None = None
 
     def prepare(self) -> None:
-        """Have one that waits, unless one does; a failure shows where it would be used."""
+        """Start a waiting process, unless there is one; a failure shows when the process is used."""
         if self._process is None or not self._process.running:
             with suppress(OSError), Path(os.devnull).open("w") as nowhere:
                 self._process = ChildProcess(
@@ -289,7 +302,7 @@ class Standby:
         self, command: Sequence[str], stderr: TextIO, on_line: Callable[[str], None], *, on_end: Callable[[], None],
         tether: bool, behind: bool,
     ) -> ChildProcess:  # fmt: skip
-        """A process of a command of ours, as a `ChildProcess`: the one that waits, else another one."""
+        """Run a command of this program as a `ChildProcess`: in the waiting process, or else in a new one."""
         process, self._process = self._process, None
         if process is None or not process.running:
             return ChildProcess(command, stderr, on_line, tether=tether, on_end=on_end, behind=behind)
@@ -297,13 +310,13 @@ class Standby:
         return process
 
     def close(self) -> None:
-        """End one that waits."""
+        """End the waiting process."""
         if self._process is not None:
             self._process.end()
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """The data of the `done` event of a reconstruction of a complete scan, as `LiveReconstruction.finish`."""
+    """The data of the `done` event of a reconstruction of a complete scan, as in `LiveReconstruction.finish`."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

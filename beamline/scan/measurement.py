@@ -1,4 +1,4 @@
-"""Measurement: acquisition, decider, recorder and live reconstruction of one scan, until its file is closed."""
+"""Measurement: runs acquisition, decider, recorder and live reconstruction of one scan until its file is closed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class FrameSource(Protocol):
 
     Attributes, to be read after the last frame:
         missing: triggers, counted over the whole plan, that gave no frame.
-        recovered: views that gave no frame at first, but when they were repeated.
+        recovered: projections that gave no frame at first, but when they were repeated.
         unsafe: a device failed while the instrument was made safe.
     """
 
@@ -70,8 +70,9 @@ class Measurement:
 
     Attributes:
         began: when the run did, on the monotonic clock.
-        series: the run that goes on, if one does.
-        source_of: makes what delivers the frames where others control the scan; None: we do, with the devices.
+        series: the run that is continued, if any.
+        source_of: makes the object that delivers the frames if another program controls the scan; None: this program
+            does, with the devices.
         child: starts the live reconstruction.
     """
 
@@ -214,7 +215,7 @@ class Measurement:
     ) -> None:
         if self.config.simulation is None and self.source_of is None:
             self._wait_for(follower)
-        # Closing the iterator is what makes the instrument safe when the recorder fails.
+        # Closing the iterator makes the instrument safe if the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
                 self.decider.began = min(self.decider.began, frame.time)
@@ -223,7 +224,7 @@ class Measurement:
                 recorder.put(frame)
 
     def _wait_for(self, follower: LiveReconstruction | None) -> None:
-        """Wait until the live reconstruction is ready for views."""
+        """Wait until the live reconstruction is ready for projections."""
         if follower is not None:
             follower.wait_ready(
                 READY_WITHIN, lambda: self.stop.stopping, lambda text: self.states.enter(self.states.state, text)
@@ -265,7 +266,7 @@ class Measurement:
             acquisition.wait_while_paused(reopen=False)
             return wait_in_pause(recorder)
 
-        cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
+        cone = "" if ready.info.source_distance_mm is None else "improvements are not predicted for a cone beam"
         ended = "no live reconstruction is running"
         decider.why_no_law = lambda: cone or (ended if follower is None or follower.ended else "")
         decider.record, decider.wait_a_moment = recorder.add_decision, wait_a_moment
@@ -283,37 +284,40 @@ class Measurement:
         if not faults or self.config.references.on_fault == "log":
             return None
         return (
-            f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter was asked to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
-            "at a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the "
-            "scan as it is."
+            "Stopped before the first projection, because the darks or flats cannot be used. "
+            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks "
+            "and flats are in the file. Fix this, check a few frames and the exposure with `beamline "
+            "tune`, and start the scan again. To scan anyway, set references.on_fault: log."
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged for it or gave no frame, which are announced."""
+        """Projections that are taken again because they were flagged or gave no frame; they are announced."""
         chosen, n_bad = self._to_retake(recorder, missing)
         if not chosen:
             return ()
         if len(chosen) < n_bad:
             self.sink(
                 Warned(
-                    f"{n_bad} views were flagged or gave no frame, and {len(chosen)} may be taken again "
-                    f"(monitor.retake_share): {n_bad - len(chosen)} between them stay as they are."
+                    f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be "
+                    f"taken again (monitor.retake_share). The other {n_bad - len(chosen)} remain as they "
+                    "are."
                 )
             )
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
-        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
+        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'projection')} again")
         return chosen
 
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
-        """Views that may be taken again now, and how many were flagged or gave no frame: of more than the plan still
-        allows, an even spread."""
+        """Projections that may be taken again now, and how many were flagged or gave no frame. If more than the plan
+        allows, an even selection.
+        """
         allowed = self.ready.plan.retakes - recorder.announced - self.decider.retaken
         if allowed <= 0:
             return (), 0
         recorder.wait()
         flagged = recorder.flagged.views_to_retake
-        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]  # others were taken again
+        # the others were already taken again
+        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]
         bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
 
@@ -326,8 +330,9 @@ def wait_in_pause(recorder: Recorder) -> bool:
 
 
 class _Ending:
-    """The error that ends a run, raised after everything is closed: any other one before a stop or lost frames, which
-    become a warning."""
+    """Collects the error that ends a run, and raises it after everything is closed. Any other error has precedence over
+    a stop or lost frames, which become a warning.
+    """
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -335,7 +340,7 @@ class _Ending:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """A step whose failure does not keep the next ones from being taken."""
+        """A step whose failure does not prevent the next ones."""
         try:
             yield
         except BaseException as after:

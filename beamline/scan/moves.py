@@ -1,4 +1,6 @@
-"""Moves: stage, shutter and sample come to where a block needs them, are looked at again, and are left safe."""
+"""Moves: brings stage, shutter and sample to the positions that a block needs, checks them afterwards, and leaves
+them safe.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,11 @@ from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices, Rechecked, RotationStage
 
-WRITTEN = "The last frames are being written"  # Message of the state `finishing`
-SAFE = "Stage stopped, shutter closed; the last frames are being written"  # The same with devices of ours
+WRITTEN = "Writing the last frames"  # Message of the state `finishing`
+SAFE = "Stage stopped, shutter closed; writing the last frames"  # the same for devices of this program
 UNSAFE = (
-    "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
-    "the last frames are being written"
+    "DANGER: stage, camera or shutter did not respond at the end of the scan. Check the instrument "
+    "before anybody goes near the beam; writing the last frames"
 )
 """The same where a device failed while the instrument was made safe; warnings name it."""
 POLL = 0.02  # s between status queries of a moving stage
@@ -58,21 +60,24 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
     while stage.moving():
         stop.refuse_abort()
         if clock.now() > deadline:
-            raise InstrumentError(f"{stage.name}: it is still moving after a stop. Use its emergency stop.")
+            raise InstrumentError(f"Use the emergency stop of {stage.name}: it is still moving after a stop command.")
         clock.sleep(POLL)
 
 
 def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
     """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
-    anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
+    anything.
+
+    The frame exists, and the stage was at `before` (rad) when its exposure began.
+    """
     moving, after = stage.moving(), stage.position()
     wanted, most = stage.to_counts(angle), stage.limits.tolerance
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
         return (before + after) / 2, ""
     return after, (
-        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
-        f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
-        f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
+        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, although it "
+        f"had arrived there: it was at {math.degrees(before):.4f}° before the exposure and "
+        f"{'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
 
 
@@ -96,10 +101,10 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
 
 
 def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
-    """Tests of whether each device stays where this kind of frame needs it, by its name."""
+    """Functions that test whether each device stays where this kind of frame needs it, by its name."""
     shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
     if not shutter.by_hand:
-        # A scan that is stopped in a pause ends with a closed one.
+        # A scan that is stopped in a pause ends with a closed shutter.
         remembered[shutter.name] = lambda: "" if stop.stopping else _wrong_shutter(kind, shutter.is_open())
     for device in (devices.sample, devices.filter, devices.monochromator):
         if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
@@ -113,9 +118,9 @@ def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows:
     if moved and rows and not stop.aborting:
         raise InstrumentError(
             f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. It was moved while "
-            f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken: which of "
-            "them show it elsewhere is not known, so none should be used. Look who or what moved it, bring it "
-            "back, and take the scan again. What was taken before is good."
+            f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken. "
+            "Do not use these frames, because it is not known which of them are affected. Find out who "
+            "or what moved the device, move it back, and repeat the scan. Frames taken before are good."
         )
 
 
@@ -124,7 +129,7 @@ def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
     if is_open is not (kind is FrameKind.DARK):
         return ""
     wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
-    return f"it is {actual}, {kind.name.lower()}s need it {wanted}"
+    return f"it is {actual}, but {kind.name.lower()}s need it {wanted}"
 
 
 def make_safe(
@@ -136,7 +141,7 @@ def make_safe(
         home: where the stage goes then, after the sample is back, rad; None: both stay.
 
     Returns:
-        the first error of each step, and whether stage, camera or shutter may be as during the scan.
+        The first error of each step, and True if stage, camera or shutter may still be as during the scan.
     """
     stage, camera, shutter = devices.stage, devices.camera, devices.shutter
     failed: list[BaseException] = []
@@ -171,5 +176,5 @@ def make_safe(
 
 
 def in_words(error: BaseException) -> str:
-    """The message of an error; with its type if it is not ours."""
+    """The message of an error; with its type if it is not an error of this program."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"

@@ -78,8 +78,9 @@ class DryRun:
         if each := self.energies:
             seconds = sum(need.duration for need in each)
             sentence = (
-                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
-                f"{hms_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
+                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one such scan at each: "
+                f"{hms_text(seconds)} and {size(self.total_bytes)} in total (without the moves of the "
+                "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
         return lines
@@ -109,7 +110,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Warnings of implausible values, as from a mistaken unit; empty if all are plausible."""
+    """Warnings of implausible values, for example because of a wrong unit; empty if all are plausible."""
     theta = np.degrees(plan_of(config).angles)
     ends = float(np.ptp(theta))
     spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
@@ -121,22 +122,26 @@ def doubts(config: Config) -> list[str]:
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 
 
-_DEMAGNIFIED = 100  # pixels at the sample over those of the camera: no optics images a field so much larger
+_DEMAGNIFIED = 100  # ratio of the pixel size at the sample to that of the camera; no optics demagnifies more
 
 
 def _doubt_optics(config: Config) -> str:
-    """A sentence where pixel size and distance cannot go with the camera, as by another unit; "" where they can."""
+    """A sentence if pixel size and distance do not match the camera, for example because of a wrong unit; otherwise
+    empty.
+    """
     optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
-            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, the camera's pixels are {own:g} um: the field would "
-            f"be {2 * half:.4g} mm wide. It is the size of an unbinned pixel at the sample; is it in nm?"
+            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
+            f"um: the field of view would be {2 * half:.4g} mm wide. The setting is the size of an "
+            "unbinned pixel at the sample; is it in nm?"
         )
     return (
-        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of "
-        f"{2 * half:.4g} mm: a sample that fills it could not turn there. Is it in m?"
+        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the "
+        f"field of view of {2 * half:.4g} mm: a sample that fills the field could not rotate there. Is it "
+        "in m?"
         if optics.distance_mm and optics.distance_mm < half
         else ""
     )
@@ -151,16 +156,16 @@ def dry_run(
     """Compute the plan of a configuration without devices.
 
     Args:
-        runs: where the file would be, for the free disk; the configured folder unless given.
+        runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) of a series that were taken already; not all of them.
+        whole: energies (keV) of a series that were already taken; not all of them.
 
     Raises:
-        ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
-            here: they are the timeline's violations.
+        ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
+            timeline's violations.
     """
     each = [one for one in at_energies(settings) if one.scan.energy not in whole]
-    if len(each) > 1:  # a scene is read at both ends of the range
+    if len(each) > 1:  # a scene is read at both ends of the energy range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
     there = disk_of(runs or Path(settings.storage.folder))
@@ -181,8 +186,8 @@ def _of_energies(each: Sequence[DryRun]) -> DryRun:
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
     if total.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"{len(each)} energies need {size(total.total_bytes)} and a tenth more, the disk has "
-            f"{size(total.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
+            f"free some space, choose another storage.folder, or set fewer energies: {len(each)} energies "
+            f"need {size(total.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
@@ -205,7 +210,7 @@ def _worked(
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
-    """The plan, with a violation where files in the folder cannot be locked."""
+    """The plan, with a violation if files in the folder cannot be locked."""
     no_locking = no_locks(folder)
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
@@ -214,25 +219,28 @@ def refuse_violations(worked: Timeline) -> None:
     """Raise ConfigError with all violated limits, if there are any."""
     broken = worked.violations
     if len(broken) == 1:
-        raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
+        raise ConfigError(f"a limit is exceeded, nothing was started: {broken[0]}.")
     if broken:
-        raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
+        raise ConfigError("\n  ".join([f"{len(broken)} limits are exceeded, nothing was started:", *broken]))
 
 
 def disk_of(folder: Path) -> Path:
     """`folder`, or its nearest existing parent, which is on the same disk.
 
     Raises:
-        ConfigError: a file stands in the way, or there is no such disk.
+        ConfigError: a file has this name, or the disk does not exist.
     """
     folder = folder.absolute()
     if link := broken_link(folder):
-        raise ConfigError(f"runs cannot be written to {folder}: {link} Choose another folder; nothing was started.")
+        raise ConfigError(
+            f"choose another folder, because runs cannot be written to {folder}: {link} Nothing was started."
+        )
     there = next((place for place in (folder, *folder.parents) if place.exists()), None)
     if there is None or not there.is_dir():
         problem = "no such disk" if there is None else f"a file at {there}"
         raise ConfigError(
-            f"runs cannot be written to {folder}: there is {problem}. Choose another folder; nothing was started."
+            f"choose another folder, because runs cannot be written to {folder}: there is {problem}. "
+            "Nothing was started."
         )
     return there
 
@@ -243,7 +251,7 @@ class ReadyScan:
 
     plan: ScanPlan
     timeline: Timeline
-    settings: CameraSettings  # of the camera for the views, as it accepted them
+    settings: CameraSettings  # of the camera for the projections, as it accepted them
     timing: CameraTiming  # of the camera with these settings
     monitor: Monitor  # before the first frame
     info: ScanInfo  # written into the file before the first frame
@@ -291,7 +299,7 @@ def ready_scan(
 ) -> ReadyScan:
     """A planned scan with the monitor before its first frame; sections `monitor` and `storage` of `config` count."""
     monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
-    # The first call compiles, which must not happen while frames are coming.
+    # The first call compiles, which must not happen while frames arrive.
     check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     check_stop()

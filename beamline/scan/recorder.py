@@ -1,4 +1,5 @@
-"""Recorder: digests, checks and writes every frame beside the scan, so that taking frames never waits for the disk.
+"""Recorder: computes statistics of every frame, checks it and writes it, in threads of its own, so that acquisition
+never waits for the disk.
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
 frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
@@ -34,10 +35,10 @@ from drivers.base.frame import Frame, FrameKind
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
 STALL = 60.0  # real s that a write may take, after which the disk counts as dead
-CHECKS = 60.0  # real s that the checks of a frame may take, after which they hang
-COMPILES = 300.0  # the same of the first frame of a kind, whose checks may compile
+CHECKS = 60.0  # real s that the checks of a frame may take, after which they count as hanging
+COMPILES = 300.0  # the same for the first frame of a kind, whose checks may have to be compiled
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
-SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
+SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two checks of the stop request
 
 _Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
 """A frame, its digests for the checks and for the file, and the flags; None: no check has looked at it."""
@@ -51,19 +52,19 @@ class Recorder:
 
     Appended frames are flushed when no frame waits; otherwise the writer decides how often.
 
-    No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
-    so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
-    raise DataError where a frame could not be written, or a write takes longer than STALL. Checks that hang switch the
-    monitor off. A stop or an abort waits for neither: what the camera still owes is kept in memory.
+    No frame is dropped: while the disk is too slow, `put` waits. A fly scan cannot wait for room, so it pauses before
+    the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish` raise DataError if a
+    frame could not be written, or if a write takes longer than STALL. If checks hang, the monitor is switched off. A
+    stop or an abort waits for neither: frames that the camera still delivers are kept in memory.
 
     Args:
-        flagged: told the flags of each frame.
+        flagged: gets the flags of each frame.
         pause: a request that pauses the scan.
         stop: the scan's.
 
     Attributes:
         n_frames: written so far.
-        announced: frames beyond the timeline, by `expect_more`.
+        announced: frames beyond the timeline, from `expect_more`.
         references: the darks and flats so far.
         flagged: the flags so far.
     """
@@ -85,14 +86,14 @@ class Recorder:
         self._progress = FrameProgress(timeline)
         self._stop, self._pause = stop or StopRequest(), pause or PauseRequest()
         self._monitor_off = False
-        self._unjudged: list[int] = []  # frames that the monitor did not look at
-        self._check_name = ""  # that looks, or looked last
-        self._handing = threading.Lock()  # for the next two values: one thread alone hands the frame on
-        self._under_checks: tuple[Frame, float] | None = None  # what the first thread works on, and since when
-        self._alone = False  # the second thread goes on without the first
+        self._unjudged: list[int] = []  # frames that the monitor did not check
+        self._check_name = ""  # the check that is running, or ran last
+        self._handing = threading.Lock()  # for the next two values: only one thread passes the frame on
+        self._under_checks: tuple[Frame, float] | None = None  # the frame of the first thread, and since when
+        self._alone = False  # the second thread continues without the first
         self._compiled: set[FrameKind] = set()  # kinds of frames that were checked
         self.n_frames = 0
-        self._invalid: set[int] = set()  # rows that never were anything else
+        self._invalid: set[int] = set()  # rows that were invalid from the start
         self.announced, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
@@ -104,7 +105,8 @@ class Recorder:
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
         self._reserve = self._row_bytes * (self._most + in_work + on_the_way)
-        self._flies, self._flying = bool(views.trains), False  # in its views; now
+        # True if the projections are a fly scan; True while it flies
+        self._flies, self._flying = bool(views.trains), False
         self._looked_at, self._writing_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
         self._thread.start()
@@ -113,7 +115,7 @@ class Recorder:
     def put(self, frame: Frame) -> None:
         """Queue a frame for writing; waits while the queue is full."""
         self._enqueue(frame)
-        if frame.kind is not FrameKind.INVALID:  # which comes in any block
+        if frame.kind is not FrameKind.INVALID:  # invalid frames may come in any block
             self._flying = frame.kind is FrameKind.PROJECTION and not self._retaking
         self._look_at_backlog()
         self._raise_failure()
@@ -132,14 +134,14 @@ class Recorder:
         self._raise_failure()
 
     def end_pass(self) -> None:
-        """Record that the frames so far end a pass, if the scan decides. Views that were repeated end with it."""
+        """Record that the frames so far end a pass, if the scan makes decisions. Repeated projections end with it."""
         self._enqueue(self._writer.end_pass)
         if self._retaking:
             self.wait()
             self._retaking = False
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass: the values of its event, if the scan decides."""
+        """Record what was chosen after a pass (the values of its event), if the scan makes decisions."""
         self._enqueue(lambda: self._writer.add_decision(values))
         self._enqueue(lambda: self._progress.expect_fewer(self.n_frames, int(str(values.get("dropped", 0)))))
 
@@ -157,7 +159,10 @@ class Recorder:
         if not self._unjudged:
             return ""
         frames = f"{count(len(self._unjudged), 'frame')} ({spans(self._unjudged)})"
-        return f"The monitor did not look at {frames}: they have no flags. `beamline monitor {self._writer.path}` does."
+        return (
+            f"The monitor did not check {frames}: they have no flags. `beamline monitor {self._writer.path}` "
+            "checks them."
+        )
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Announce frames beyond the timeline; may be called while no frame waits."""
@@ -166,14 +171,14 @@ class Recorder:
 
     @property
     def hangs(self) -> bool:
-        """Whether a frame is still being written; after `finish` this means that the disk does not respond."""
+        """True if a frame is still being written; after `finish` this means that the disk does not respond."""
         return self._thread.is_alive()
 
     def _enqueue(self, item: Frame | _Call | None) -> None:
         """Queue a frame, a call to be made when its turn comes, or None after the last frame."""
         while True:
             if self._stop.aborting or (self._stop.stopping and self._flying):
-                self._waiting.maxsize = 0  # the stage turns before an open shutter: it stands first
+                self._waiting.maxsize = 0  # the stage turns in front of an open shutter: its frames come first
             try:
                 self._waiting.put(item, timeout=SLICE)
             except Full:
@@ -183,7 +188,7 @@ class Recorder:
 
     def _refuse_stall(self) -> None:
         if time.monotonic() - self._writing_since > STALL:
-            raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
+            raise DataError(f"Check the disk: it accepted no frame for {STALL:g} s. {self._safe()}")
 
     def _raise_failure(self) -> None:
         cause = self._failure
@@ -198,7 +203,9 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _check_frames(self) -> None:
-        """The first thread: digests and checks, until the last frame, or until the second one goes on alone."""
+        """The first thread: computes statistics and checks frames, until the last frame, or until the second thread
+        continues alone.
+        """
         while (item := self._next()) is not None:
             if not isinstance(item, Frame):
                 self._checked.put(item)
@@ -217,7 +224,9 @@ class Recorder:
         self._check_name = name
 
     def _digested(self, frame: Frame) -> _Item:
-        """A frame with its digests and flags, or why it has none: it then fails at its turn to be written."""
+        """A frame with its statistics and flags, or the error why it has none, which is raised when the frame is to be
+        written.
+        """
         begun = time.monotonic()
         try:
             seen, stored = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
@@ -228,7 +237,7 @@ class Recorder:
             self._checking += time.monotonic() - begun
 
     def _next_checked(self) -> _Item:
-        """The next item of the second thread, which digests frames itself once the checks hang."""
+        """The next item of the second thread, which computes statistics itself once the checks hang."""
         while True:
             with suppress(Empty):
                 return self._checked.get(not self._alone, SLICE)
@@ -238,7 +247,9 @@ class Recorder:
             self._give_up_checks_that_hang()
 
     def _give_up_checks_that_hang(self) -> None:
-        """Switch the monitor off where it takes too long, and take its frame; the first thread may hang for ever."""
+        """Switch the monitor off because it takes too long, and continue with its frame; the first thread may hang for
+        ever.
+        """
         with self._handing:
             if self._under_checks is None:
                 return
@@ -250,8 +261,8 @@ class Recorder:
             self._monitor_off = self._alone = True
         self._sink(
             Warned(
-                f"The check {self._check_name} has not come back from frame {frame.index} for {seconds:.0f} s. The "
-                "monitor is off: frames from here on are stored without flags."
+                f"The monitor is off: its check {self._check_name} has not finished frame {frame.index} "
+                f"for {seconds:.0f} s. From here on frames are stored without flags."
             )
         )
         self._checked.put(self._digested(frame))
@@ -275,7 +286,8 @@ class Recorder:
                         flushed = True
                 if callable(item):
                     item()
-            except BaseException as error:  # a plug-in may raise SystemExit, which would end this thread in silence
+            # a plug-in may raise SystemExit, which would end this thread without a message
+            except BaseException as error:
                 with suppress(BaseException):  # the first one counts
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
@@ -291,7 +303,7 @@ class Recorder:
             self._look_at_backlog()
             if time.monotonic() - self._looked_at > LOOK:
                 self._looked_at = time.monotonic()
-                with suppress(OSError):  # a failing disk ends the scan where it takes no frame
+                with suppress(OSError):  # a failing disk ends the scan when it does not accept a frame
                     left = max(0, self._progress.total - self.n_frames) * self._row_bytes
                     hold_for_space(self._pause, self._reserve, shutil.disk_usage(self._writer.path.parent).free, left)
             with suppress(Empty):
@@ -316,14 +328,15 @@ class Recorder:
         if frame.kind is FrameKind.INVALID:
             self._invalid.add(frame.index)
         if frame.kind is FrameKind.INVALID or beside:
-            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
+            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # unplanned and unannounced
         self.flagged.add(frame, flags)
         if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
             self._sink(event)
 
     def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...] | None:
-        """The monitor's flags; None where it is off. An error costs no frame: a check that raises is switched off, with
-        a warning."""
+        """The monitor's flags; None if it is off. No frame is lost by an error: a check that raises one is switched
+        off, with a warning.
+        """
         if self._monitor_off:
             return None
         try:
@@ -338,6 +351,8 @@ class Recorder:
 
 
 def _as_stored(frame: Frame) -> Frame:
-    """The frame as a reader gives it: a file holds degrees, whose radians differ in the last bit. A check that keeps
-    "a view every 5°" must choose the same views now and later."""
+    """The frame as a reader of the file gets it: a file contains degrees, whose radians differ in the last bit.
+
+    A check that keeps "a projection every 5°" must choose the same projections now and later.
+    """
     return replace(frame, angle=math.radians(math.degrees(frame.angle)))

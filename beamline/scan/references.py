@@ -1,4 +1,4 @@
-"""References of a running scan: darks and flats are noted as they are recorded, and judged before the projections."""
+"""Darks and flats of a running scan: collects them as they are recorded, and checks them before the projections."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
-VIEWS = 4  # enough for a median
+VIEWS = 4  # projections that are enough for a median
 
 
 class ReferenceLog:
-    """The evidence of the darks, the flats and the first views of a scan, as they are recorded."""
+    """The evidence of the darks, the flats and the first projections of a scan, as they are recorded."""
 
     def __init__(self) -> None:
         self.evidence, self._before = Evidence(), FrameKind.INVALID
@@ -34,13 +34,13 @@ class ReferenceLog:
             self.evidence = self.evidence.without({frame.replaces})
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """What is wrong with darks and flats so far, by what it is of, in one or more sentences each.
+        """What is wrong with darks and flats so far, by kind, in one or more sentences each.
 
         Args:
-            planned: blocks that are over by now; references without any frame are missing.
+            planned: blocks that are over by now; darks or flats without any frame are missing.
         """
         missing = {
-            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the views did not come."
+            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."
             for block in planned
             if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }
@@ -48,8 +48,8 @@ class ReferenceLog:
         return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
-        """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
-        `exposure`: s, of the views."""
+        """A warning if noise would dominate the projections, because a pixel of the open beam has few photons; or None.
+        `exposure`: s, of the projections."""
         bad = {row for finding in judge(self.evidence, limits) for row in finding.frames}
         good = self.evidence.without(bad)
         flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
@@ -60,10 +60,11 @@ class ReferenceLog:
         if not found < FEW_PHOTONS:
             return None
         return (
-            f"Too little light: in the views a pixel of the open beam has {found:.3g} photons, by mean and variance of "
-            f"the flats {spans([flat.row for flat in flats])}; expected {FEW_PHOTONS} or more, else noise rules the "
-            f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s to "
-            "match), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
+            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s "
+            "to match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A "
+            f"pixel of the open beam has {found:.3g} photons per projection (from mean and variance of "
+            f"the flats {spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise "
+            "noise dominates the volume. `beamline tune` measures it."
         )
 
 
@@ -71,7 +72,7 @@ class ReferenceReport:
     """Warns of the faults of darks and flats, once for each group, and once of too little light.
 
     Args:
-        exposure: s, of the views.
+        exposure: s, of the projections.
     """
 
     def __init__(self, section: ReferencesSection, exposure: float, sink: Sink) -> None:

@@ -1,8 +1,8 @@
-"""Resume: a run that was killed, failed, stopped or aborted goes on; missing frames go into a new file.
+"""Resume: continues a run that was killed, failed, stopped or aborted; the missing frames go into a new file.
 
-Existing files are only read (after `recover`, if their writer died), so that stored frames are never at risk. The
-new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first
-file joins them all.
+Existing files are only read (after `recover`, if their process was killed), so that stored frames are never at risk.
+The new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first file
+joins them all.
 """
 
 from __future__ import annotations
@@ -52,17 +52,18 @@ class ResumableRun:
 
     Attributes:
         run: its folder.
-        lock: keeps other processes from recovering the run or going on with it.
+        lock: keeps other processes from recovering or continuing the run.
         config: its configuration.
-        parts: its files so far, each with a frame at least.
-        views: of the plan, in these files, or decided against.
-        planned: views of the whole plan.
-        offset: triggers of the offset views in these files; offset_missing: how many the plan still has.
+        parts: its files so far, each with at least one frame.
+        views: planned projections that are in these files, or that the scan decided to omit.
+        planned: projections of the whole plan.
+        offset: triggers of the offset projections in these files; offset_missing: how many the plan still has.
         choices: after each pass that ended in them, oldest first.
-        choice_due: the last one ended, and nothing was chosen yet.
-        seconds: that they took, from the first frame of each to its last one.
-        retaken: views that they took again, in place of others.
-        end_references: missing kinds of references after the views, if no view is missing; None if views are.
+        choice_due: the last pass ended, and nothing was chosen yet.
+        seconds: duration of the files, from the first frame of each to its last one.
+        retaken: projections that they took again, in place of others.
+        end_references: missing kinds of darks and flats after the projections, if no projection is missing; None if
+            some are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
     """
@@ -90,13 +91,13 @@ class ResumableRun:
         if self.end_references is not None:
             kinds = ["offset views"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
-            all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
+            all_views = "the projections that it was to take" if self.choices else f"{self.planned} views"
             return (
-                f"Preparing: {self.run} has all {all_views}, its missing {' and '.join(kinds)} of the end are taken now"
+                f"Preparing: {self.run} has all {all_views}; its missing {' and '.join(kinds)} of the end are taken now"
             )
-        if self.choices:  # some views were decided against, or are taken twice
-            return f"Preparing: {self.run} lacks {missing} of the views that it was to take, which are taken now"
-        return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
+        if self.choices:  # some projections were omitted by a decision, or are taken twice
+            return f"Preparing: {self.run} lacks {missing} of the projections that it was to take; they are taken now"
+        return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
         """The part of the plan that is still missing."""
@@ -105,10 +106,10 @@ class ResumableRun:
         return replace(plan, stored=stored, choices=self.choices, choice_due=self.choice_due, end_references=references)
 
     def begin(self, ready: ReadyScan) -> Path:
-        """Recover parts whose writer died, join the parts, and create the folder of the new part.
+        """Recover parts whose process was killed, join the parts, and create the folder of the new part.
 
         Raises:
-            ConfigError: plan, frames or devices are not what they were; nothing was changed.
+            ConfigError: plan, frames or devices have changed; nothing was written.
             DataError: a part cannot be recovered, or the parts cannot be joined.
         """
         with hdf5.open_hdf5(self.parts[0]) as first, hdf5.readable(self.parts[0]):
@@ -147,8 +148,8 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must be the run's.
 
     Raises:
-        ConfigError: it is no run, a process has it in work, or its configuration differs. NothingMissing, NoFrame, and
-            NotJoined where `recover_run` is all that it lacks.
+        ConfigError: it is not a run, another process is working on it, or its configuration differs. NothingMissing,
+            NoFrame, or NotJoined if only `recover_run` is needed.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
@@ -159,21 +160,21 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
 
 @contextmanager
 def _alone(run: Path) -> Iterator[WriterLock]:
-    """A context in which no other process recovers the run or goes on with it.
+    """A context in which no other process recovers or continues the run.
 
     Raises:
-        ConfigError: a process takes it, recovers it or goes on with it; or it cannot be written to.
+        ConfigError: a process is taking, recovering or continuing it; or it is write-protected.
     """
     try:
         lock = WriterLock(run / EVENTS, exclusive=True)
     except OSError as error:
         raise ConfigError(
-            f"{run} cannot be held ({error.strerror}): another process goes on with it or recovers it, or it cannot be "
-            f"written to. {_UNTOUCHED}"
+            f"{run} cannot be locked ({error.strerror}): another process is continuing or recovering it, "
+            f"or it is write-protected. {_UNTOUCHED}"
         ) from None
     try:
         if alive(parts_of(run)[-1]):
-            raise ConfigError(f"The scan of {run} still runs: wait for its end, or stop it. {_UNTOUCHED}")
+            raise ConfigError(f"The scan of {run} is still running: wait until it ends, or stop it. {_UNTOUCHED}")
         yield lock
     finally:
         lock.release()
@@ -182,8 +183,8 @@ def _alone(run: Path) -> Iterator[WriterLock]:
 def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     if is_ride(run):
         raise ConfigError(
-            f"{run} is a ride on the scan of another program, which cannot be continued here: `beamline ride` records "
-            f"the next one in a new run. {_UNTOUCHED}"
+            f"{run} recorded the scan of another program, which cannot be continued here. `beamline ride` "
+            f"records the next scan in a new run. {_UNTOUCHED}"
         )
     files, left_out = _files(run)
     config = load(run / CONFIG, environment={})
@@ -197,17 +198,17 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 if other is not None:
                     require_same_config(run, file["/entry/record/config"].asstr()[()], other)
             if not (angles := views_planned(file)):
-                raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
+                raise DataError(f"The missing projections are unknown, because {part} has no plan. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
-                table = frames_in(file)  # a damaged one is named
+                table = frames_in(file)  # the error names a damaged file
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
                 numbers = table.triggers[table.views]
-                retaken += int((numbers >= planned).sum())  # which count on from those of the plan
+                retaken += int((numbers >= planned).sum())  # their numbers continue after those of the plan
     if not parts:
-        raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
+        raise NoFrame(f"{run} has no frame: start the scan again. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
         each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         missing, choices, due = still_to_take(each)
@@ -225,11 +226,11 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
-    whole = f"{run} has all views that it was to take, and its references"
+    whole = f"{run} has all projections that it was to take, and its darks and flats"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
-    what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
-    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
+    what = f"{JOINED} does not have the frames of its {len(parts)} parts" if closed else "a file was not closed"
+    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` fixes that. {_UNTOUCHED}")
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
@@ -237,7 +238,9 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     these."""
     files = files_with_frames(run)
     empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
-    return files, [f"{scan} is left out: no frame can be read in it, and its {EVENTS} names none." for scan in empty]
+    return files, [
+        f"{scan} is left out, because none of its frames can be read and its {EVENTS} lists none." for scan in empty
+    ]
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:
@@ -247,17 +250,19 @@ def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN)
     before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
     differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
     if differ is not None or len(before) != len(now):
-        difference = " `{}`, not `{}`,".format(*differ) if differ else ""
+        difference = " `{}` instead of `{}`".format(*differ) if differ else ""
         raise ConfigError(f"{run} was taken with another configuration:{difference} in its {name}. {_UNTOUCHED}")
 
 
 def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> None:
     if stored["/entry/record/plan"].asstr()[()] != ready.info.plan:
-        raise ConfigError(f"{run} was planned with other angles: has their file changed? {_UNTOUCHED}")
+        raise ConfigError(f"{run} was planned with other angles: was the angle file changed? {_UNTOUCHED}")
     if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
-        raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
+        raise ConfigError(
+            f"{run} has frames of {frames} pixels, but the camera gives {ready.timing.shape}. {_UNTOUCHED}"
+        )
     for device, before, now in _devices_differing(stored, ready):
-        raise ConfigError(f"{run} was taken with another {device}: {before}; now there is {now}. {_UNTOUCHED}")
+        raise ConfigError(f"{run} was taken with another {device}: {before}; now it is {now}. {_UNTOUCHED}")
 
 
 def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str]]:
@@ -274,20 +279,21 @@ def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[st
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
-    """Recover every part of a run, and join several parts; the joined file comes last. The record of a run that died
-    then has the state of its newest file.
+    """Recover every part of a run, and join several parts; the joined file comes last.
+
+    The record of a run whose process was killed then gets the state of its newest file.
 
     Args:
-        say: takes a sentence on the room that each needs, before anything is written to it.
+        say: takes a sentence on the disk space that each needs, before anything is written to it.
 
     Returns:
-        the result for each file, and a sentence on each part that was left out.
+        The result for each file, and a sentence on each part that was left out.
 
     Raises:
-        ConfigError: a process takes it, recovers it or goes on with it.
+        ConfigError: a process is taking, recovering or continuing the run.
         DataError: no run, or a part that cannot be recovered; those before it are recovered.
     """
-    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # copies of its files have no process
+    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on copies of its files
         files, left_out = _files(run)
         if not files:
             why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."

@@ -1,4 +1,4 @@
-"""Run: one scan from configuration to file, in its own folder, reported by events, and closed in any case."""
+"""Run: one scan from configuration to file, in a folder of its own, reported by events, and closed in any case."""
 
 from __future__ import annotations
 
@@ -57,25 +57,27 @@ def run_scan(
     """Run the scan that `config` describes.
 
     Args:
-        runs: the folder in which the run gets its own; the configured one unless given. Or the run that goes on, with
-            the configuration that it has.
-        sinks: besides events.jsonl and user.log in the run's folder.
+        runs: the folder in which the run gets its own; default: the configured one. Or the run that is continued, with
+            its own configuration.
+        sinks: in addition to events.jsonl and user.log in the run's folder.
         stop: ends the scan from another thread or a signal handler.
         live: gives the command line of a live reconstruction; None: there is none.
         afterwards: gives the command line of a reconstruction of the complete scan; a scan that ends early has none.
         instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
-        ask: puts a request to the operator, if the shutter or the sample is moved by hand.
+        ask: asks the operator, if the shutter or the sample is moved by hand.
 
     Raises:
-        ConfigError: the plan breaks a limit, or the instrument is another than the run began with; nothing has moved.
+        ConfigError: the plan exceeds a limit, or the instrument differs from that with which the run began; nothing has
+            moved.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
-        DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
-            the file; the event `scan_done` says how much, and `failed` why.
+        DataError: frames are missing (LedgerError), or the disk failed. In all these cases the frames taken so far are
+            in the file; the event `scan_done` says how many, and `failed` why.
     """
     if config.scan.energies is not None:
         raise ConfigError(
-            "scan.energies lists several scans, but this call runs one: set scan.energy. Nothing was started."
+            "set scan.energy instead of scan.energies, which lists several scans: this call runs one "
+            "scan. Nothing was started."
         )
     began = time.monotonic()
     stop = stop or StopRequest()
@@ -94,7 +96,7 @@ def run_scan(
         with ExitStack() as stack:
             sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
             if series is not None:
-                series.lock.release()  # that of the part keeps others away from here on
+                series.lock.release()  # from here on the lock of the part keeps other processes away
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
             guarded = stack.enter_context(_watched(measurement))  # until the instrument is free for another scan
@@ -103,7 +105,7 @@ def run_scan(
 
 
 def _watched(measurement: Measurement) -> ExitStack:
-    """A watchdog beside the scan of a real instrument, which ends as the stack is closed."""
+    """A watchdog for the scan of a real instrument; it ends when the stack is closed."""
     config, guarded = measurement.config, ExitStack()
     if config.simulation is None:
         without = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
@@ -121,13 +123,14 @@ def record_scan(
     *,
     live: Standby | None,
 ) -> RunResult:
-    """Record a scan that others control, in a run folder of its own, as `run_scan` does one of ours.
+    """Record a scan that another program controls, in a run folder of its own, as `run_scan` records one of this
+    program.
 
     Nothing waits for the live reconstruction, no watchdog runs, and no device is operated.
 
     Args:
-        config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor count.
-        source_of: makes what delivers the frames, from the measurement that takes them.
+        config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor are used.
+        source_of: makes the object that delivers the frames, from the measurement that takes them.
         runs: the folder in which the run gets its own.
         live: starts a live reconstruction; None: there is none.
 
@@ -135,7 +138,7 @@ def record_scan(
         LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
     """
     began = time.monotonic()
-    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # whose devices nobody asks for
+    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # whose devices are never used
     with ExitStack() as stack:
         folder = create_run_folder(runs, config.sample.name, others.clock.now())
         sink = _announcing(config, ready, folder, others.clock, sinks, stack)
@@ -152,18 +155,21 @@ def _announcing(
     """One sink for the run's record, its logs and `sinks`, each reached by a thread until the stack closes; it begins
     with the settings that the devices had before they were opened."""
     record, *logs = _logs(config, ready, folder, stack)
-    # The record in a thread of its own: a terminal that takes no event does not hold it up.
+    # The record has a thread of its own, so that a blocked terminal does not delay it.
     announcers = [Announcer(each, clock) for each in ([record], [*logs, *sinks])]
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
         if settings := description.get(FOUND):
-            sink(Warned(f"{device}: before it was opened: {settings}."))
+            sink(Warned(f"{device}: settings before it was opened: {settings}."))
     return sink
 
 
 def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
-    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written beside
-    them. The events come last: with them the folder is a run."""
+    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written next to
+    them.
+
+    events.jsonl is created last: with it the folder counts as a run.
+    """
     try:
         (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
         first = RunRecord(State.PREPARING, sample=config.sample.name, planned=ready.timeline.n_frames)
@@ -171,9 +177,7 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
         log = stack.enter_context(new_log(folder / USER_LOG))
         events = stack.enter_context(new_log(folder / EVENTS))
     except OSError as error:
-        raise DataError(
-            f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
-        ) from error
+        raise DataError(f"{folder} cannot be written to ({error.strerror}). Nothing was moved or taken.") from error
     return record_sink(record), JsonLines(events), UserLog(log)
 
 
@@ -185,7 +189,7 @@ def _named(config: Config) -> str:
 def _refuse_stop(stop: StopRequest) -> None:
     """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
     if stop.stopping:
-        raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing has moved.")
+        raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
 
 def _to_its_end(
@@ -202,7 +206,7 @@ def _to_its_end(
         if series is not None:
             _set_aside([volume, volume.with_name(REPORT)], folder.name, states, sink)
         result = measurement.take(command, release)
-        if afterwards is not None:  # Ctrl-C ends the reconstruction alone
+        if afterwards is not None:  # Ctrl-C ends only the reconstruction
             began = time.monotonic()
             words = afterwards(result.path, volume)
             recon = reconstruct(words, folder / RECON_LOG, sink, measurement.stop)
@@ -223,11 +227,22 @@ def _to_its_end(
 
 
 def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sink) -> None:
-    """Rename volume and report of the views before this part of a run: that of all parts gets their names."""
+    """Rename volume and report of the projections before this part of a run, because the volume of all parts gets their
+    names.
+    """
     for path in filter(os.path.lexists, files):
         aside = path.with_stem(f"{path.stem}.before-{part}")
         try:
             path.rename(aside)
-            sink(StateEntered(states.state, f"{path.name}, of the views before, is {aside.name} now"))
-        except OSError as error:  # Windows, where a viewer holds it open
-            sink(Warned(f"{path} could not be renamed ({error.strerror}): there is no volume of all parts of the run."))
+            sink(
+                StateEntered(
+                    states.state, f"{path.name}, the volume of the earlier projections, was renamed to {aside.name}"
+                )
+            )
+        except OSError as error:  # on Windows, if a viewer has it open
+            sink(
+                Warned(
+                    f"There is no volume of all parts of the run, because {path} could not be renamed "
+                    f"({error.strerror})."
+                )
+            )

@@ -35,13 +35,13 @@ class Run:
         sample: its name.
         time: s since the Unix epoch, when it began.
         frames: in its files; None: not known.
-        planned: frames of the parts before the newest one, and those that it was to have; None: not known.
+        planned: frames of the parts before the newest one, plus the planned frames of the newest; None: not known.
         ended: who ended it before its plan by a choice, and why; "" if nobody did.
         flags: frames that the monitor flagged: their number by check, then by level.
-        state: of its newest part, see docs/states.md; `died` if its process ended without writing its last one.
+        state: of its newest part, see docs/states.md; `died` if its process ended without writing its final state.
         bytes: of all files in the folder.
-        parts: 1, and one for each time that it was resumed.
-        next_step: what can be done with one that died, or whose state is not known; "" for others.
+        parts: 1, plus one for each time that it was resumed.
+        next_step: what the user can do if its process was killed or its state is not known; "" otherwise.
     """
 
     folder: Path
@@ -58,7 +58,7 @@ class Run:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended; it may be resumed."""
+        """True if the run has ended; it may be resumed."""
         return self.state not in [state for state in State if not state.ended]
 
 
@@ -73,13 +73,14 @@ def newest(folder: Path) -> Path:
     """The folder of the scan that is running, else of the newest run. Raises ConfigError if there is no run."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
-        raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
+        raise ConfigError(f"{folder} contains no run. Name the folder of a run, or a scan file.")
     return candidates[0]
 
 
 def describe(run: Path) -> Run:
-    """What the records of a run's parts say of it. Reads no pixel."""
-    taken_up = held(run / EVENTS, exclusively=True)  # asked first, as a new part is there before this lock goes
+    """What the records of a run's parts state about it. Reads no pixel."""
+    # asked first, because a new part exists before this lock is released
+    taken_up = held(run / EVENTS, exclusively=True)
     parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # which comes after its record
     records = [record_of(part) for part in parts]
     frames: int | None = 0
@@ -146,10 +147,11 @@ def record_sink(file: RecordFile) -> Sink:
 
 
 def record_of(part: Path) -> RunRecord:
-    """The record of a part; frames of one that died, and all of a part without a record, by its file.
+    """The record of a part; for frames of one whose process was killed, and for a part without a record, the file is
+    read.
 
-    If the file cannot be read, as after a kill while it was created, the number of frames is the record's last one.
-    Flags come from the record if it has any, since the file does not hold those of level `info`.
+    If the file cannot be read, for example after a kill while it was created, the number of frames is the record's last
+    one. Flags come from the record if it has any, because the file does not contain those of level `info`.
     """
     record = read_record(part)
     if record is not None and record.state != DIED:
@@ -162,13 +164,13 @@ def record_of(part: Path) -> RunRecord:
 
 
 def end_record(part: Path) -> None:
-    """Give the record of a part that died the state that its closed file has."""
+    """Give the record of a part whose process was killed the state of its closed file."""
     if (record := record_of(part)).state == DIED and (state := _by_file(part / SCAN).state) != NOT_KNOWN:
         write_record(part, replace(record, state=state, over=True))
 
 
 def _by_file(scan: Path) -> RunRecord:
-    """What the head of a scan file tells."""
+    """What the beginning of a scan file states."""
     from beamline.storage import hdf5
     from beamline.storage.flag_legend import read_flags
     from beamline.storage.writers import layout
@@ -196,7 +198,7 @@ def _numbered(run: Path) -> tuple[int, str]:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file; 0 of one that has gone meanwhile."""
+    """Bytes of a file; 0 if it was removed in the meantime."""
     with suppress(OSError):
         return path.lstat().st_size
     return 0

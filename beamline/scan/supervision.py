@@ -1,4 +1,6 @@
-"""Supervision: what an acquisition asks of the scan around it, and the beam monitor, whose log may pause it."""
+"""Supervision: hooks of an acquisition into the scan around it, and the beam monitor, whose readings may pause the
+scan.
+"""
 
 from __future__ import annotations
 
@@ -32,28 +34,32 @@ def _wait_in_pause() -> bool:
 class Supervision:
     """Callbacks of the acquisition that pause a scan."""
 
-    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no projection
+    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no
+    # projection
     # should be taken; None: projections may be taken
     refusal: Callable[[], str | None] = lambda: None
-    # pause: checked before each frame of a standing stage, and all the time while it turns
+    # pause: checked before each frame of a stage at rest, and continuously while it turns
     pause: PauseRequest = field(default_factory=PauseRequest)
     # wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at
-    # the terminal has let the scan go on
+    # the terminal has ended the pause
     wait_in_pause: Callable[[], bool] = _wait_in_pause
     # states: told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
     # retakes: called with the triggers without a frame, after the last projection and where retakes were chosen;
-    # returns the views that are repeated now
+    # returns the projections that are repeated now
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
-    # wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there was
+    # wait_for_beam_reading: called after the last frame of flats and projections: returns when it is known whether
+    # there was
     # beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
-    # next_pass: called after each pass of views, offset views or retakes, if something is left; returns a possible
+    # next_pass: called after each pass of projections, offset projections or retakes, if something is left; returns a
+    # possible
     # choice. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
     next_pass: Callable[[Passes], Choice] | None = None
     # pass_ended: called before `next_pass`, and after the last pass, too; all frames were delivered
     pass_ended: Callable[[], None] = lambda: None
-    # n_retakable: called before `next_pass` with the triggers without a frame; how many views `retakes` would return
+    # n_retakable: called before `next_pass` with the triggers without a frame; how many projections `retakes` would
+    # return
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 
@@ -62,8 +68,8 @@ class BeamGuard:
 
     Args:
         pause_below: a reading below it pauses the scan, in the monitor's unit.
-        resume_above: readings of at least so much mean that the beam is back.
-        settle: s for which they must be so, before the scan goes on.
+        resume_above: readings of at least this value mean that the beam is back.
+        settle: s for which they must be so, before the scan continues.
     """
 
     def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
@@ -82,8 +88,9 @@ class BeamGuard:
                 return
             self._paused = True
             self._pause.no_beam(
-                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {self._pause_below:.4g}. The "
-                f"scan goes on by itself when it has read {self._resume_above:.4g} again for {self._settle:g} s",
+                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than "
+                f"{self._pause_below:.4g}. The scan continues automatically after the reading has been at "
+                f"least {self._resume_above:.4g} for {self._settle:g} s",
                 self._good,
             )
         if reading.value < self._resume_above:

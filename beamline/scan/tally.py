@@ -1,4 +1,4 @@
-"""Tally: what came of each block of a scan, in numbers and in sentences."""
+"""Tally: counts the frames of each block of a scan, and describes missing and extra ones in sentences."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from beamline.scan.ledger import Ledger
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame
 
-NAMED = 5  # views that a sentence names
+NAMED = 5  # projections that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
-TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
+TRIES = 3  # exposures of a projection whose stage is not at its angle, after which the projection counts as missing
 ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
-    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
-    "that a move is done"
+    f"Such a frame is kept as an invalid row, and its projection is taken again, up to {TRIES} times in "
+    "total. Possible causes are another program or person that moves the stage, its manual knob, a servo "
+    "that oscillates, or a controller that reports the end of a move too early"
 )
 
 Exposed = tuple[CameraFrame, int, float, bool]
@@ -32,7 +32,7 @@ class BlockTally:
     """A block with its frames and missing triggers; filled while the block is recorded.
 
     Attributes:
-        again: the block repeats views, so losing them is no failure.
+        again: the block repeats projections, so losing them is no failure.
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, whose expected frame did not come.
@@ -72,12 +72,12 @@ class BlockTally:
 
 
 def first_taken(done: Iterable[BlockTally]) -> list[BlockTally]:
-    """Tallies of the views, without those that repeat views."""
+    """Tallies of the projections, without those that repeat projections."""
     return [taken for taken in done if taken.block.kind is FrameKind.PROJECTION and not taken.again]
 
 
 def missing_views(done: Iterable[BlockTally]) -> tuple[int, ...]:
-    """Triggers of the views that gave no frame, in ascending order."""
+    """Triggers of the projections that gave no frame, in ascending order."""
     return tuple(sorted(i for taken in first_taken(done) for i in taken.missing))
 
 
@@ -92,13 +92,14 @@ def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
 def astray_views(taken: BlockTally) -> str:
     """A sentence on frames exposed while the stage was not at its angle, and where it was."""
     where = [
-        f"view {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: {math.degrees(places[-1][1]):.4f}°"
+        f"projection {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: "
+        f"{math.degrees(places[-1][1]):.4f}°"
         for trigger, places in list(taken.astray.items())[:NAMED]
     ]
     more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
     return (
-        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of {len(taken.astray)} "
-        f"views ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of "
+        f"{len(taken.astray)} projections ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
     )
 
 
@@ -108,7 +109,7 @@ def discrepancies(done: Sequence[BlockTally]) -> str:
 
 
 def _of_block(taken: BlockTally) -> str:
-    """Sentences on missing, extra and doubtful frames of a block; a view that was repeated misses none."""
+    """Sentences on missing, extra and doubtful frames of a block; a projection that was repeated misses none."""
     block, noun = taken.block, taken.block.kind.name.lower()
     text = ""
     if taken.missing and not taken.again:
@@ -129,18 +130,19 @@ def _of_block(taken: BlockTally) -> str:
         text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
     if taken.unconfirmed:
         text += (
-            f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
-            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
-            "stage's. They are kept as invalid rows."
+            f" {taken.unconfirmed} frames came while the stage braked, and are kept as invalid "
+            "rows. Their angles are not certain: neither the trigger times nor the final position of the "
+            "stage confirm them. Either the trigger line picks up noise, or the stage decelerates "
+            "differently from its configured value."
         )
     if taken.shift:
         text += (
-            f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "
-            "ends frames are missing or too many."
+            f" The angles of a pass may all be wrong by up to {taken.shift} steps, because it is not "
+            "known at which of its ends frames are missing or too many."
         )
     if text and taken.off > DOUBTFUL:
         text += (
-            f" A frame came {taken.off:.2f} periods off its trigger: its angle may be wrong by as much of a step "
-            "(warnings of `timing` name such frames)."
+            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong "
+            "by as much of a step (warnings of `timing` name such frames)."
         )
     return text.strip()

@@ -1,11 +1,11 @@
-"""Watchdog: a process that makes the instrument safe when the process of the scan dies or freezes without doing so.
+"""Watchdog: a process that stops the stage and closes the shutter if the process of the scan is killed or freezes.
 
 `python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
 it writes a byte each BEAT: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A line
-says that it is ready. One that has ended is replaced. A frozen scan holds the
-stage's port, so it is killed first. What the scan held is free then: the port, which the watchdog opens, and the
-camera, which stops without its program. A scan that ends by itself kills the watchdog first. As long as its scan lives,
-the watchdog ignores the requests to end that a shutdown sends to every process.
+says that it is ready. One that has ended is replaced. A frozen scan holds the stage's port, so it is killed first. What
+the scan held is free then: the port, which the watchdog opens, and the camera, which stops without its program. A scan
+that ends by itself kills the watchdog first. As long as its scan lives, the watchdog ignores the requests to end that a
+shutdown sends to every process.
 """
 
 from __future__ import annotations
@@ -118,22 +118,27 @@ class _Keeper:
                 continue
             code = self._process.code
             if code == ACTED:
-                why = f"the process did nothing for {FROZEN:.0f} s, and the watchdog made the instrument safe"
+                why = (
+                    f"the process did nothing for {FROZEN:.0f} s, so the watchdog stopped the stage and "
+                    "closed the shutter"
+                )
                 self._sink(Warned(f"Failed: {why}. The scan ends."))
                 stop.abort(why)
                 return
             self._process.end()
             if not left:
                 self._sink(
-                    Warned(f"The watchdog has ended (code {code}), too: a scan that is killed leaves the shutter open.")
+                    Warned(
+                        f"The watchdog ended as well (code {code}): if the scan is killed now, the shutter stays open."
+                    )
                 )
                 if pause is not None:
-                    pause.pause("no watchdog runs")
+                    pause.pause("no watchdog is running")
                 return
             left -= 1
             with suppress(OSError):
                 self._process = self._started()
-            self._sink(Warned(f"The watchdog has ended (code {code}); another one is started."))
+            self._sink(Warned(f"The watchdog ended (code {code}); another one is started."))
 
     def _started(self) -> ChildProcess:
         return self._start(self._command, lambda line: self._ready.set())
@@ -170,7 +175,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     monochromator = config.devices.monochromator
     if isinstance(monochromator, FoundMonochromator) and monochromator.stops:
         done.append(_insist(partial(monochromator.halt, clock), clock, say, "The monochromator was told to stop."))
-    done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))
+    done.append(_insist(disarm, clock, say, f"The stage is stopped, its trigger output is disarmed, {closed}."))
     return all(done)
 
 
@@ -182,7 +187,7 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
             step()
         except BaseException as error:  # after any error, also SystemExit of a plug-in, the next step must be tried
             if clock.now() > deadline:
-                say(f"{error} LOOK AT THE INSTRUMENT before anybody goes near the beam.")
+                say(f"DANGER: {error} Check the instrument before anybody goes near the beam.")
                 return False
             clock.sleep(BETWEEN)
         else:
@@ -248,14 +253,15 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
     if frozen:
         say(
-            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. It is killed to free its port."
+            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. The watchdog "
+            "kills it to free its port."
         )
         try:
             psutil.Process(scan).kill()  # the number still belongs to that process: the pipe is open
         except psutil.Error as error:
             say(f"It could not be killed: {error}.")
     else:
-        say("The process of the scan has died.")
+        say("The process of the scan was killed.")
     make_safe(config, clock, say)
     return ACTED
 

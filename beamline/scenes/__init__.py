@@ -1,1 +1,1 @@
-"""Scenes: their files, the truth behind them, and what can be asked of them. Features share it."""
+"""Scenes: their files and their ground truth, for all features that use them."""

@@ -1,4 +1,4 @@
-"""Scene files, shipped or of a user, and the truth of their samples: attenuation and labels on a grid."""
+"""Scene files, shipped or from the user, and the ground truth of their samples: attenuation and labels on a grid."""
 
 from __future__ import annotations
 
@@ -66,7 +66,9 @@ def _scene_text(name: str, overrides: Sequence[str]) -> tuple[Path, Mapping[str,
     path = Path(name)
     if not path.is_file():
         if name not in shipped:
-            raise ConfigError(f"There is no file {name}, and {unknown('scene', name, shipped)}. Nothing was simulated.")
+            raise ConfigError(
+                f"The file {name} does not exist, and {unknown('scene', name, shipped)}. Nothing was simulated."
+            )
         path = shipped[name]
     try:
         text = text_in(path, SETTINGS)

@@ -1,1 +1,1 @@
-"""Storage: readers, writers and rules of scan, volume and checkpoint files."""
+"""Storage: reads, writes and checks the files of scans, volumes and checkpoints."""

@@ -1,4 +1,4 @@
-"""Arrays that a Zarr, an .npy or an .npz has by their names, as an HDF5 file has datasets."""
+"""Arrays of a Zarr, an .npz or an .npy, opened by name like the datasets of an HDF5 file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of 
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr store, written by any program."""
+    """True if a folder is a Zarr store, written by any program."""
     return any((path / name).is_file() for name in METADATA)
 
 
@@ -31,7 +31,8 @@ def zarr_library(path: Path) -> Any:
         import zarr
     except ImportError as error:
         raise DataError(
-            f"{path}: a Zarr needs zarr, which cannot be loaded here ({error}): pip install splatline[zarr]."
+            f"{path}: reading a Zarr needs the package zarr, which cannot be loaded ({error}): pip "
+            "install splatline[zarr]."
         ) from error
     return zarr
 
@@ -64,7 +65,7 @@ class NamedArray:
 
 
 class ArrayFile(dict[str, NamedArray]):
-    """The arrays of a file by their paths; "" stands for the only one."""
+    """The arrays of a file by their paths; the path "" is the only array of a file."""
 
     def __init__(self, path: Path) -> None:
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
@@ -89,10 +90,10 @@ class ArrayFile(dict[str, NamedArray]):
 
 
 def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by their names, in memory; that of an .npy by "".
+    """The arrays of an .npz by name, in memory; the array of an .npy has the name "".
 
     Raises:
-        DataError: the memory does not hold them, or some are objects of Python.
+        DataError: they do not fit into memory, or some are Python objects.
         ValueError, OSError, ...: a damaged file.
     """
     try:
@@ -108,45 +109,49 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
         if "bject" not in str(error):
             raise
         raise DataError(
-            f"{path} holds objects of Python among its arrays, which are pickles: these are never opened here, as one "
-            "may run any program. Save the arrays alone (numpy.save, numpy.savez). Nothing was read."
+            f"Save the arrays alone (numpy.save, numpy.savez): {path} contains Python objects among its "
+            "arrays. These are pickles, which this program never opens, because a pickle can run any "
+            "program. Nothing was read."
         ) from error
 
 
 def require_room(path: Path, n: int) -> None:
-    """Raise DataError if n bytes exceed the free memory: a damaged file may claim any size."""
+    """Raise DataError if n bytes exceed the free memory, because a damaged file may state any size."""
     if n > (free := free_memory()):
         raise DataError(
-            f"{path} cannot be read: it says that it holds {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are "
-            "free; cut the volume or bin it."
+            f"{path} does not fit in memory: its header states {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB "
+            "are free. Crop or bin the volume."
         )
 
 
 def open_array_file(path: Path, follow: bool = False) -> Any:
-    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
+    """Open a file with named arrays: HDF5, which may still grow, or `ArrayFile`."""
     return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
 _PICKLE = (
-    "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
-    'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
-    "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
-    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. Then: beamline '
-    "recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD --pixel-size-um "
-    "1000*dDetector. Nothing was read."
+    "{0} is a pickle, which this program never opens, because a pickle can run any program that its "
+    "author put into it. If you trust the author, convert FILE (in the layout of NAF and SAX-NeRF) "
+    "yourself: python -c \"import numpy as np, pickle; d = pickle.load(open('FILE', 'rb')); "
+    "np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
+    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. '
+    "Then: beamline recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals "
+    "--cone DSO:DSD --pixel-size-um 1000*dDetector. Nothing was read."
 )
 _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 
 
 def holds_arrays(path: Path) -> bool:
-    """Whether a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
+    """True for the path of an .npy, an .npz or a Zarr. Raises DataError for a pickle, whose arrays can be read after a
+    conversion.
+    """
     if path.is_file() and path.suffix.lower() in _PICKLES:
         raise DataError(_PICKLE.replace("{0}", str(path)))
     return (path.suffix.lower() in _NUMPY and path.is_file()) or zarr_root(path) is not None
 
 
 def zarr_root(path: Path) -> str | None:
-    """Where in a folder or .zip a Zarr begins; None without one."""
+    """Path of the Zarr within a folder or .zip; None if there is none."""
     if path.is_dir():
         return "" if is_zarr(path) else None
     if path.suffix.lower() != ".zip" or not path.is_file() or not zipfile.is_zipfile(path):

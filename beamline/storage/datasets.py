@@ -1,4 +1,4 @@
-"""Text, units, links and frames, in any order, of an open HDF5 file."""
+"""Datasets of an open HDF5 file: text, numbers with units, links, and frames in any order."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ BRIEF = 2**28  # bytes of a text, a number or a list of a scan
 
 
 def text(value: Any) -> str:
-    """A string from HDF5's representations: str, bytes, UTF-8 or Latin-1, or an array of one of these; without control
-    characters.
+    """A string from HDF5's representations (str, bytes in UTF-8 or Latin-1, or an array of one of these), without
+    control characters.
     """
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
@@ -68,7 +68,7 @@ def attribute(item: h5py.HLObject, name: str) -> str:
 
 
 def text_at(group: h5py.Group, path: str) -> str:
-    """A dataset as text; "" if it is missing, or as `text_of`."""
+    """A dataset as text; "" if it is missing, or where `text_of` gives ""."""
     item = dataset(group, path)
     return "" if item is None else text_of(item)
 
@@ -103,11 +103,11 @@ def first_of(item: h5py.Dataset) -> Any:
 
 
 def values_of(item: h5py.Dataset) -> Any:
-    """All values of a number, a text or a list of a scan. DataError: it holds more than BRIEF bytes."""
+    """All values of a number, a text or a list of a scan. Raises DataError if it has more than BRIEF bytes."""
     if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
         raise DataError(
-            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
-            f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
+            f"{item.name} in {item.file.filename} contains {n / 1e9:.3g} GB; expected a number, a text or "
+            f"a list of at most {BRIEF / 1e9:.3g} GB. Nothing was read."
         )
     return read_part(item, ())
 
@@ -125,8 +125,8 @@ def read_part(item: Any, where: Any) -> Any:
     """`item[where]` of a dataset.
 
     Raises:
-        DataError: a filter that its values were stored with is not installed; the message names it.
-        OSError: they cannot be read for another reason.
+        DataError: a filter with which its values were stored is not installed; the message names it.
+        OSError: the values cannot be read for another reason.
     """
     try:
         return item[where]
@@ -135,15 +135,15 @@ def read_part(item: Any, where: Any) -> Any:
         if lacking := next(_not_installed(stored), "") if isinstance(stored, h5py.Dataset) else "":
             folders = os.environ.get("HDF5_PLUGIN_PATH") or "not set"
             raise DataError(
-                f"{lacking}, which is not installed here. Put its HDF5 plugin into a folder that HDF5_PLUGIN_PATH "
-                f"names (now {folders}), or write the file again without the filter where it is installed: h5repack "
-                "-f NONE. Nothing was changed."
+                f"{lacking}, which is not installed here. Put the HDF5 plugin of this filter into a "
+                f"folder that HDF5_PLUGIN_PATH names (now {folders}), or, on a computer that has the "
+                "filter, write the file without it: h5repack -f NONE. Nothing was changed."
             ) from error
         raise
 
 
 def _not_installed(item: h5py.Dataset) -> Iterator[str]:
-    """Filters of a dataset and of those it draws on that are not installed, each as the beginning of a sentence."""
+    """Filters that are not installed, of a dataset and of those it refers to, each as the beginning of a sentence."""
     made = item.id.get_create_plist()
     for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
@@ -160,13 +160,13 @@ def _source_file(item: h5py.Dataset, name: str) -> AbstractContextManager[h5py.F
 
 
 def piece_of(item: h5py.Dataset) -> int:
-    """Bytes that HDF5 decompresses at once: a chunk; of a dataset without chunks, a value."""
+    """Bytes that HDF5 decompresses at once: a chunk, or a single value of a dataset without chunks."""
     return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
 
 
 def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
-    """Bytes that HDF5 decompresses to read one place of dimension `frames` of a three-dimensional dataset, or all of it
-    (None).
+    """Bytes that HDF5 decompresses to read one index of the dimension `frames` of a three-dimensional dataset, or all
+    of it (None).
     """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
@@ -174,7 +174,7 @@ def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
-    """The object at a path; None if there is none, as after a link to a missing file, or in a circle of links."""
+    """The object at a path; None if there is none, e.g. after a link to a missing file or in a circle of links."""
     try:
         return group[path]
     except (KeyError, OSError, RuntimeError):
@@ -190,7 +190,7 @@ def broken_link(group: h5py.Group, path: str) -> str:
         link, there = here.get(name, getlink=True), resolve(here, name)
         if there is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
             file = f"{link.filename}::" if isinstance(link, h5py.ExternalLink) else ""
-            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which is not there"
+            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which does not exist"
         here = there
     return ""
 
@@ -198,15 +198,15 @@ def broken_link(group: h5py.Group, path: str) -> str:
 def refuse_broken(group: h5py.Group, path: str) -> None:
     """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
-        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
+        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back next to this one.")
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
     """The dataset at a path, unpacked on reading if its numbers are packed; None if it is missing or has a null
     dataspace.
 
-    Of frames in pieces that hold parts of several, it keeps the unpacked pieces of a frame, or where these are too many
-    those of a row of all frames, until the next ones are read. `frames` is the number of the frame dimension.
+    If frames share chunks with other frames, the unpacked chunks of a frame are kept until the next frame is read; if
+    these are too many, those of one row of all frames. `frames` is the number of the frame dimension.
 
     Raises:
         DataError: a list longer than any scan.
@@ -215,7 +215,7 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
     if item is None or getattr(item, "shape", None) is None:
         return None
     if item.ndim == 1 and item.size > _FRAMES:
-        raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
+        raise DataError(f"{item.name} in {item.file.filename} has {item.size} values; expected at most {_FRAMES}.")
     several = isinstance(item, h5py.Dataset) and item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
     sizes = (bytes_unpacked(item, axis) for axis in (frames, int(not frames))) if several else ()
     if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
@@ -227,8 +227,9 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """The number in the unit of this program; of a list the median of the positive ones, or else of all. None as of
-    `in_units`, and if none is finite.
+    """The number in the unit of this program; of a list the median of the positive ones, or else of all.
+
+    None if `in_units` is None, and if no number is finite.
     """
     values = in_units(dataset(group, path), units)
     known = np.empty(0) if values is None else values[np.isfinite(values)]
@@ -236,7 +237,7 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
-    """Numbers in the unit of this program, as a list, also where they are written as text, such as "6.5 um".
+    """Numbers in the unit of this program, as a list, also if they are written as text, such as "6.5 um".
 
     None if there is no dataset of real numbers, or if its unit is unknown or missing.
     """
@@ -247,7 +248,9 @@ def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[n
 
 
 def _numbers(item: h5py.Dataset) -> tuple[NDArray[np.float64] | None, set[str]]:
-    """The numbers of a dataset as a list (None if it holds none), and the units by its attribute and its text."""
+    """The numbers of a dataset as a list (None if it contains none), and the units stated by its attribute and its
+    text.
+    """
     stated = {attribute(item, "units") or attribute(item, "angle_unit")} - {""}  # the latter of CIL
     if item.dtype.kind in "uif":
         return np.ravel(np.asarray(values_of(item), np.float64)), stated
@@ -263,20 +266,24 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     """Angles in radians, NaN for those that are not finite; a column becomes a list.
 
     Args:
-        unit: whatever the file says; None: what its attribute `units` and its text say, or `default` if they do not.
+        unit: the unit to use, whatever the file states; None: what its attribute `units` and its text state, or
+            `default` if they state none.
     """
     if lost := missing_links(item):
         raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
     if angles is None:
-        raise DataError(f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected whole or real numbers.")
+        raise DataError(
+            f"{where} contains {_SORTS.get(item.dtype.kind, item.dtype)}; expected integers or real numbers."
+        )
     unit = unit or " and ".join(sorted(stated)) or default
     factor = factor_of(unit, ANGLE_UNITS)
     if factor is None:
         raise DataError(
-            f"{where} has {f'the units {unit!r}' if unit else 'no units attribute'}; expected degrees or radians. Set "
-            "the attribute, give --angles FILE (degrees, one a line), or with --angles-path --angles-unit deg or rad."
+            f"{where} has {f'the units {unit!r}' if unit else 'no attribute units'}; expected degrees or "
+            "radians. Set the attribute, give --angles FILE (degrees, one per line), or add "
+            "--angles-unit deg or rad to --angles-path."
         )
     return np.where(np.isfinite(angles), angles * factor, np.nan)
 
@@ -295,14 +302,15 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None = None) -> list[str]:
     """Sources of a virtual dataset, in other files or in the same one, that cannot be read or differ in shape.
 
-    For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
+    For such sources HDF5 silently returns fill values (in another file), or crashes or reads for ever (in its own
+    file).
 
     Args:
-        whole: which datasets are, by file and path: each is opened once, however often it is drawn on. One that draws
-            on itself is not.
+        whole: datasets that are complete, by file and path: each is opened once, however often it is referred to. A
+            dataset that refers to itself is not complete.
 
     Raises:
-        DataError: sources whose numbers are packed, where the dataset itself does not say so.
+        DataError: the numbers of sources are packed, but the dataset itself does not say so.
     """
     drawn, packed, lost, whole = dict[tuple[str, str], list[Any]](), list[str](), set(), {} if whole is None else whole
     for each in item.virtual_sources() if item.is_virtual else ():
@@ -323,9 +331,10 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
         lost.add(where if name == "." else str(path))
     if packed:
         raise DataError(
-            f"{item.name} in {item.file.filename} draws on {packed[0]}, whose attributes (scale_factor, ...) say that "
-            "its numbers are packed, and a virtual dataset passes them on as they are stored. Give it the same "
-            "attributes in a copy of the file, or store the values. Nothing was read."
+            f"{item.name} in {item.file.filename} is a virtual dataset. The values behind it, "
+            f"{packed[0]}, are packed (attributes scale_factor, ...), and a virtual dataset returns them "
+            "without unpacking. In a copy of the file, give the virtual dataset the same attributes, or "
+            "store unpacked values. Nothing was read."
         )
     return sorted(lost)
 
@@ -338,7 +347,7 @@ def _holds(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def _fills(drawn: h5py.Dataset, source: Any) -> bool:
-    """Whether all of a dataset has the shape of its place: some frames, or a stripe or tile of each."""
+    """True if the shape of a dataset fills its place: some frames, or a stripe or tile of each."""
     place = source.vspace
     extent = place.shape
     if place.get_select_type() == h5py.h5s.SEL_HYPERSLABS and place.is_regular_hyperslab():
@@ -348,7 +357,7 @@ def _fills(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def require_possible(item: Any) -> int:
-    """Bytes of memory that are taken while a chunk of frames [frame, row, col] is unpacked.
+    """Bytes of memory that are needed while a chunk of frames [frame, row, col] is unpacked.
 
     Raises:
         DataError: frames without pixels, or too large for any memory, or for this one.
@@ -360,13 +369,14 @@ def require_possible(item: Any) -> int:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    stored = getattr(item, "item", item)  # pieces of a Zarr are packed as a rule
+    stored = getattr(item, "item", item)  # pieces of a Zarr are packed usually
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "
-            f"{size(needed)} of memory, {size(free)} are free. On a machine with more, copy it with one frame in each "
-            "chunk (h5repack -l CHUNK=...). Nothing was read."
+            f"{item.name} in {item.file.filename} is stored in chunks of {size(piece_of(item))}: "
+            f"unpacking one needs {size(needed)} of memory, and {size(free)} are free. On a computer with "
+            "more memory, copy the file with one frame per chunk (h5repack -l CHUNK=...). Nothing was "
+            "read."
         )
     return needed
 
@@ -375,7 +385,7 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
     """Fill out [frame, row, col] with frames in the requested order; consecutive ones are read at once.
 
     Raises:
-        DataError: the file does not give them: damaged or cut chunks, or a compression that is not installed.
+        DataError: the frames cannot be read: damaged or missing chunks, or a compression that is not installed.
     """
     start = 0
     for first, end in runs(indices):
@@ -395,10 +405,10 @@ def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
 
 
-_SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}
+_SORTS = {"c": "complex numbers", "b": "Boolean values", "V": "records", "O": "text", "S": "text", "U": "text"}
 
 
 def require_real(dtype: np.dtype[Any], what: str) -> None:
-    """Raise DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
+    """Raise DataError if pixels, keys or angles are not real numbers, for example text or complex numbers."""
     if dtype.kind not in "uif":
-        raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")
+        raise DataError(f"{what} contains {_SORTS.get(dtype.kind, str(dtype))}; expected integers or real numbers.")

@@ -1,4 +1,4 @@
-"""Files on a disk: under HDF5 for its driver `fileobj`, scratch arrays without a name, and fsync in a thread."""
+"""Files on a disk: Python file objects that HDF5 writes to, unnamed scratch arrays, and fsync in a thread."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file that this program is writing, or wrote until it died, presented as if it were closed.
+    """A file that this program is writing, or wrote until it was killed, presented as if it were closed.
 
-    A refresh by HDF5 finds its present state. Torn blocks are read as whole ones.
+    A refresh by HDF5 finds its present state. Blocks that are half written are read as whole ones.
     """
 
     def __init__(self, path: Path, head: Superblock) -> None:
@@ -100,9 +100,9 @@ class GrowingFile(UnderHdf5):
 class DiskFile(UnderHdf5):
     """A file that h5py writes to.
 
-    HDF5 holds chunks and metadata back and writes them when an object closes, where h5py cannot raise. It may crash
-    after a failed write. So no method called by HDF5 fails: the first error waits for `require_taken`, and nothing
-    further is written. Until HDF5 has closed the file, it reads later writes from memory.
+    HDF5 keeps chunks and metadata in memory and writes them when an object closes; h5py cannot raise an error there,
+    and HDF5 may crash after a failed write. Therefore no method that HDF5 calls fails: the first error waits for
+    `require_taken`, and nothing further is written. Until HDF5 has closed the file, it reads later writes from memory.
     """
 
     def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
@@ -148,7 +148,7 @@ class DiskFile(UnderHdf5):
         self._error = self._error or error
 
     def require_taken(self) -> None:
-        """Raise the first error recorded so far: OSError if the disk refused."""
+        """Raise the first error recorded so far: OSError if the disk failed."""
         error = self._error
         if isinstance(error, OSError):  # HDF5's own have no number
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error
@@ -156,7 +156,7 @@ class DiskFile(UnderHdf5):
             raise error
 
     def finish(self) -> None:
-        """Wait until the file is on the disk. OSError: the disk did not take it, or the file has another length."""
+        """Wait until the file is on the disk. Raises OSError if the disk failed, or if the file has another length."""
         self.require_taken()
         to_disk(self._file.fileno())
         if (size := os.fstat(self._file.fileno()).st_size) != self._size:
@@ -167,7 +167,7 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """A float32 array of zeros of this shape, memory-mapped from a file in `folder`.
 
     Raises:
-        DataError: the disk has not so much space.
+        DataError: the disk does not have enough free space.
     """
     wanted = 4 * int(np.prod(shape, dtype=np.int64))
     with tempfile.TemporaryFile(dir=folder) as file:  # the map keeps it open
@@ -176,17 +176,17 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def reserve(descriptor: int, wanted: int, folder: Path) -> None:
-    """Allocate `wanted` bytes for an open file in the folder, where the system can. Missing space is then found now,
+    """Allocate `wanted` bytes for an open file in the folder, if the system can. Then missing space is found now and
     not during the work.
 
     Raises:
-        DataError: the disk has not so much space.
+        DataError: the disk does not have enough free space.
     """
     there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
     taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
     refusal = (
-        f"{folder} has {size(free)} free, and {size(wanted - taken)} more are needed while the volume is made. Write "
-        "the output to another disk. Nothing was written."
+        f"Write the output to another disk: {folder} has {size(free)} free, and {size(wanted - taken)} "
+        "more are needed during the reconstruction. Nothing was written."
     )
     if wanted - taken > free:
         raise DataError(refusal)
@@ -208,7 +208,7 @@ class ToDisk:
     The thread is a daemon: a disk that hangs does not keep the program from ending.
 
     Attributes:
-        failed: the disk did not take what a call was for.
+        failed: the disk failed in a call.
         rows: written to the file before the last call that succeeded.
     """
 
@@ -224,10 +224,10 @@ class ToDisk:
         return self._error is not None
 
     def __call__(self, rows: int) -> None:
-        """Begin a call, unless one is under way or began less than SECONDS ago.
+        """Start a call, unless one is running or started less than SECONDS ago.
 
         Raises:
-            OSError: the disk did not take what an earlier call was for.
+            OSError: the disk failed in an earlier call.
         """
         if self._error is not None:
             raise self._error
@@ -251,7 +251,7 @@ class ToDisk:
                 last.start()
             last.join(_PATIENCE)
             if last.is_alive():
-                self._error = OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
+                self._error = OSError(errno.ETIMEDOUT, f"the disk has accepted no data for {_PATIENCE:.0f} s")
             if self._error is not None:
                 raise self._error
 

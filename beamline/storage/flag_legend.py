@@ -43,8 +43,8 @@ class Mark:
 
     Attributes:
         bits: as `beamline.monitor.checks.bitmask` makes them.
-        scores: float32 [check], in the order of the legend; NaN where the check did not flag the frame, or only when
-            it saw later ones.
+        scores: float32 [check], in the order of the legend; NaN if the check did not flag the frame, or flagged it only
+            after later frames.
         regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
     """
 
@@ -54,7 +54,7 @@ class Mark:
 
     @property
     def valid(self) -> bool:
-        """Whether no check raised an alarm."""
+        """True if no check raised an alarm."""
         return self.bits & ALARMS == 0
 
 
@@ -85,7 +85,7 @@ class FrameFlags:
         bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
         scores: [frame, check] as in `Mark`.
-        regions: [frame, check, 4], likewise.
+        regions: [frame, check, 4], in the same way.
     """
 
     bits: NDArray[np.uint64]
@@ -95,7 +95,7 @@ class FrameFlags:
 
     @classmethod
     def of_marks(cls, marks: Sequence[Mark]) -> FrameFlags:
-        """The flags of frames as today's checks found them."""
+        """The flags of frames as the present checks found them."""
         return cls(
             np.array([mark.bits for mark in marks], np.uint64),
             TODAY,
@@ -105,7 +105,7 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """Marks [row] of the frames of a file with these flags; a flag for earlier rows marks these, too."""
+        """Marks [row] of the frames of a file with these flags; a flag that refers to earlier rows marks these, too."""
         flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
         for flag in chain.from_iterable(found):
             rows, at = flag.frames, place_of(flag)
@@ -117,7 +117,7 @@ class FrameFlags:
         return flags
 
     def mark(self, frame: int) -> Mark:
-        """The row of a frame as today's checks would write it, without checks that do not exist now."""
+        """The row of a frame as the present checks would write it, without checks that no longer exist."""
         mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
         bits, row = 0, int(self.bits[frame])
         for i, entry in enumerate(self.legend):
@@ -128,17 +128,17 @@ class FrameFlags:
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
-        """The same flags with today's bits, without checks that no longer exist."""
+        """The same flags with the bits of the present version, without checks that no longer exist."""
         return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """Whether a check flagged each frame [frame], at any level."""
+        """True if a check flagged each frame [frame], at any level."""
         return np.asarray(self.bits != 0)
 
     @property
     def alarmed(self) -> NDArray[np.bool_]:
-        """Whether a check raised an alarm for each frame [frame]."""
+        """True if a check raised an alarm for each frame [frame]."""
         mask = sum(1 << entry.alarm_bit for entry in self.legend)
         return np.asarray((self.bits & np.uint64(mask)) != 0)
 
@@ -158,10 +158,10 @@ class FrameFlags:
 
     @classmethod
     def joined(cls, each: Sequence[FrameFlags | None], sizes: Sequence[int] | NDArray[np.int64]) -> FrameFlags | None:
-        """The flags of several scans, one after another, by the number of frames of each; None for those that no
-        monitor looked at.
+        """The flags of several scans, one after another, given the number of frames of each; None for scans that no
+        monitor checked.
 
-        The legend is theirs if they have the same, else today's.
+        If all have the same legend it is kept, otherwise the present one is used.
         """
         known = [flags for flags in each if flags is not None]
         if not known:
@@ -198,7 +198,7 @@ class FrameFlags:
 
 
 def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[check] the scores [frame, check] farthest from 0; NaN where no frame has one."""
+    """[check] the scores [frame, check] farthest from 0; NaN if no frame has one."""
     at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
     return np.asarray(scores[at, np.arange(scores.shape[1])])
 
@@ -234,12 +234,13 @@ def write_legend(file: h5py.File) -> None:
     group.create_dataset("unit", data=[check.unit for check in CHECKS], dtype=text)
     group.create_dataset("meaning", data=[check.meaning for check in CHECKS], dtype=text)
     file[SCORES].attrs["description"] = (
-        "score of each check of flag_legend; NaN where it did not flag the frame, or only when it saw later ones"
+        "score of each check of flag_legend; NaN if the check did not flag the frame, or flagged it only "
+        "after later frames"
     )
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"
     file[VALID].attrs["description"] = "0: a check raised an alarm; the frame's pixels are as the camera gave them"
-    group["bit"].attrs["description"] = "set in flags where the check flagged the frame; alarm_bit: and as an alarm"
+    group["bit"].attrs["description"] = "set in flags if the check flagged the frame; alarm_bit: if it raised an alarm"
     group["unit"].attrs["description"] = "of the check's score"
 
 

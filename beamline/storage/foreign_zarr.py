@@ -1,4 +1,4 @@
-"""Volumes in a Zarr, versions 2 and 3 with any codec, by the format's library where it is installed.
+"""Volumes in a Zarr of another program, versions 2 and 3 with any codec, read with the zarr library.
 
 Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
 """
@@ -26,7 +26,8 @@ Spacing = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """A scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length one.
+    """One scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length
+    one.
 
     Attributes:
         coarser: the same volume with fewer voxels.
@@ -79,7 +80,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except Exception as error:  # readers of foreign files raise various errors if one is damaged
         raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
     if not arrays:
-        raise DataError(f"{path} is not an OME-Zarr image; name an array in it, in `view` as {path.name}::NAME.")
+        raise DataError(f"{path} is not an OME-Zarr image. Name an array in it; in `view` as {path.name}::NAME.")
     finest, *coarser = arrays
     _require_volume(path, finest)
     scales = [finest, *(array for array in coarser if is_halved(finest.shape[-3:], array))]
@@ -91,27 +92,27 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
 
 
 def _require_volume(path: Path, array: Any) -> None:
-    """DataError for an array that is no volume of real numbers."""
+    """Raise DataError for an array that is not a volume of real numbers."""
     if array.ndim < 3 or any(n != 1 for n in array.shape[:-3]) or np.dtype(array.dtype).kind not in "uifb":
         raise DataError(
-            f"{path} holds {array.dtype} of shape {array.shape}; expected real numbers [z, y, x], of one time and "
-            "one channel. Copy one to a separate file."
+            f"{path} contains {array.dtype} of shape {array.shape}; expected real numbers [z, y, x] of "
+            "one time and one channel. Copy one time and channel to a separate file."
         )
 
 
 def _require_chunks(path: Path, array: Any) -> None:
-    """DataError for an impossible shape, and for chunks that the memory does not hold."""
+    """Raise DataError for an impossible shape, and for chunks that do not fit into memory."""
     try:
         shape_of(array.shape[-3:])
         piece = math.prod(shape_of(array.chunks[-3:], "chunk")) * np.dtype(array.dtype).itemsize
     except ValueError as error:
         raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
     if piece > free_memory():
-        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
+        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, which is more than the free memory.")
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
-    """None where a unit or the size is not stated."""
+    """None if a unit or the size is not stated."""
     (mine,) = [each for each in image.get("datasets", []) if each["path"] == name] or [{}]
     steps = [*mine.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
     scales = [numbers_of(step["scale"], axes, "scale")[-3:] for step in steps if step["type"] == "scale"]
@@ -123,7 +124,7 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
 
 
 def is_halved(finest: tuple[int, ...], array: Any) -> bool:
-    """Whether halving one shape repeatedly gives the shape of an array, along each axis, rounded either way."""
+    """True if repeated halving of one shape gives the shape of an array, along each axis, rounded either way."""
     shape = getattr(array, "shape", ())[-3:]  # a group has none
     if len(shape) < 3 or min(*shape, *finest) < 1:
         return False

@@ -1,4 +1,6 @@
-"""FrameTable: what each frame of a scan is, a column for each fact and a row for each frame."""
+"""FrameTable: a table of all frames of a scan, with a row for each frame and a column for each fact (kind, angle,
+time, ...).
+"""
 
 from __future__ import annotations
 
@@ -21,26 +23,26 @@ _NONE, _FIRST = np.zeros(0, np.int64), np.zeros(1, np.int64)
 class FrameTable:
     """The frames of a scan. Frames are selected and reordered by `take`, and joined by `concat`.
 
-    Nothing is guessed: what is unknown of a frame is NaN or -1, a column that a scan does not have is None. Arrays are
-    not written to: `dataclasses.replace` makes a table with other columns.
+    Nothing is guessed: an unknown value of a frame is NaN or -1, and a column that a scan does not have is None. Arrays
+    are never changed: `dataclasses.replace` makes a table with other columns.
 
     Attributes:
         kinds: int32 [frame], values of FrameKind.
         angles: float64 [frame], radians.
         exposures: float64 [frame], s.
-        triggers: int64 [frame], as of `Frame`; -1 where the record of a frame cannot be trusted.
+        triggers: int64 [frame], as in `Frame`; -1 if the record of a frame cannot be trusted.
         framestamps: int64 [frame], the camera's own counter.
-        altered: bool [frame], where the record differs from its checksum: such frames are INVALID.
+        altered: bool [frame], True if the record differs from its checksum: such frames are INVALID.
         part_starts: int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted. Between
             two parts beam and camera may have changed.
-        pass_ends: int64 [pass], rows at the end of each pass of views; empty where the scan has none.
+        pass_ends: int64 [pass], rows at the end of each pass of projections; empty if the scan has none.
         times: float64 [frame], s at the trigger.
-        replaces: int64 [frame], the row of the view that a frame repeats (the old row is then INVALID).
-        numbers: int64 [frame], in the name of the file of each frame.
-        aside: float64 [frame], mm, as of `Frame`.
+        replaces: int64 [frame], the row of the projection that a frame repeats (the old row is then INVALID).
+        numbers: int64 [frame], number in the file name of each frame.
+        aside: float64 [frame], mm, as in `Frame`.
         shifts: float64 [frame, 2], displacement of the image along (columns, rows) in pixels.
         energies: float64 [frame], keV.
-        currents: float64 [frame] of the ring, or another reading of a monitor of the beam, in its own unit.
+        currents: float64 [frame], ring current, or another reading of a beam monitor, in its own unit.
         flags: of the monitor.
     """
 
@@ -119,7 +121,7 @@ class FrameTable:
 
     @property
     def replaced(self) -> I64:
-        """Rows of the views that were repeated, ascending."""
+        """Rows of the projections that were repeated, ascending."""
         return _NONE if self.replaces is None else np.sort(self.replaces[self.replaces >= 0])
 
     def views_of(self, first: int, end: int) -> I64:
@@ -127,7 +129,8 @@ class FrameTable:
         return self.views[slice(*np.searchsorted(self.views, (first, end)))]
 
     def numbers_taken(self, first: int = 0, kind: int = FrameKind.PROJECTION) -> frozenset[int]:
-        """Numbers, from 0, of the planned views that were taken. A view taken again has the number of the first.
+        """Numbers, from 0, of the planned projections that were taken. A projection taken again has the number of the
+        first attempt.
 
         Args:
             first: the row from which frames count.
@@ -145,7 +148,7 @@ class FrameTable:
         return FrameKind(int(self.kinds[row]))
 
     def has(self, *kinds: int) -> bool:
-        """Whether there is a frame of each of these kinds."""
+        """True if there is a frame of each of these kinds."""
         return set(kinds) <= {*self.kinds.tolist()}
 
     def frame(self, row: int, counts: NDArray[np.uint16], kind: FrameKind | None = None) -> Frame:
@@ -170,9 +173,11 @@ class FrameTable:
         return replace(self, kinds=kinds)
 
     def take(self, rows: I64) -> FrameTable:
-        """The frames of these rows, in that order. A view that repeats one which is not among them repeats none.
+        """The frames of these rows, in that order. A projection that repeats one which is not among them counts as not
+        repeating any.
 
-        Parts and passes are those of the frames that are left, if the rows ascend; in another order they mean nothing.
+        Parts and passes are those of the frames that are left, if the rows ascend; in another order they are
+        meaningless.
         """
         own: dict[str, Any] = {
             name: None if (column := getattr(self, name)) is None else column[rows] for name in _ARRAYS
@@ -204,7 +209,7 @@ class FrameTable:
 
 
 def kinds_of(image_keys: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
-    """Kinds of frames [frame] by NXtomo's image keys, or the finer ones; codes that nobody defined are INVALID."""
+    """Kinds of frames [frame] from NXtomo's image keys, or this program's finer ones; undefined codes are INVALID."""
     known = [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]  # files tell it by a translation
     return np.where(np.isin(image_keys, known), image_keys, FrameKind.INVALID).astype(np.int32)
 
@@ -213,7 +218,7 @@ _ARRAYS = [each.name for each in fields(FrameTable) if each.name not in ("part_s
 
 
 def _joined(each: Sequence[NDArray[Any] | None], sizes: Sequence[int]) -> NDArray[Any] | None:
-    """Values [frame, ...] of several tables, NaN (-1 of whole numbers) where one states none; None where none does."""
+    """Values [frame, ...] of several tables, NaN (-1 of whole numbers) where one states none; None if none does."""
     known = next((values for values in each if values is not None), None)
     if known is None:
         return None

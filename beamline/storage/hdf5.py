@@ -1,4 +1,4 @@
-"""Opening and writing HDF5 files that may be growing, locked or damaged, and why one cannot be read."""
+"""Opens and writes HDF5 files, also growing, locked or damaged ones, and explains why a file cannot be read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WITHOUT, LockFailure, abandoned, lock_failure, opened_whole
 
-COMMITTED = "/entry/progress/frames_committed"  # of our own files
+COMMITTED = "/entry/progress/frames_committed"  # of this program's own files
 
 
 class NotReadyError(DataError):
@@ -39,12 +39,13 @@ class UnreadableError(DataError):
 
 
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
-    """Open for reading, even a file that is being written or whose writer died (SWMR).
+    """Open for reading, even a file that is being written or whose program was killed (SWMR).
 
-    HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
-    end. Two followers of one file would both read wrong values. So such a file gets a handle of its own.
+    HDF5 shares a file within a program. A reader in the program that writes would see half of the file, and write to it
+    at the end. Two readers that follow one file would both get wrong values. Therefore such a file gets a handle of its
+    own.
 
-    Raises DataError if it is not a readable HDF5 file, or draws on a path that is not a file (see storage.structure).
+    Raises DataError if it is not a readable HDF5 file, or refers to a path that is not a file (see storage.structure).
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
@@ -73,7 +74,7 @@ def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None
     # A follower takes no lock, so as not to be taken for a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)
     ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
-    # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    # HDF5 would wait for ever for a writer that repairs what is missing or damaged
     waits = head is None or head.missing or not (follow or head.open_for_writing)
     return [way for way in ways if not (way[0] and waits)]
 
@@ -88,25 +89,27 @@ def _unopened(
     missing = int(cut[2]) - int(cut[1]) if cut else head.missing if head is not None else 0
     if missing:
         return DataError(
-            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If there is "
-            f"no other, `beamline recover {path}` rescues the frames of a scan of this program. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy the file again, or use the "
+            f"original. If there is no other copy, `beamline recover {path}` rescues the frames of a scan "
+            "that this program took. Nothing was read."
         )
     if head is not None and head.open_for_writing:
         return DataError(
-            f"{path} is marked as being written. If a scan just begins or ends, or its writer just died, try again in "
-            f"{QUIET:.0f} s. Of a dead writer `h5clear -s {path}` clears the mark. Nothing was read."
+            f"{path} is marked as being written. If a scan is just starting or ending, or its program was "
+            f"just killed, try again in {QUIET:.0f} s. If the program has ended, `h5clear -s {path}` "
+            "clears the mark. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(
-            f"{path} is held by another program, which has it open to write (HDF5 got no lock on it). Close it there, "
-            f"or wait until that program has ended. With {WITHOUT} in the environment it is read as it is, perhaps "
-            "half written. Nothing was changed."
+            f"{path} is open for writing in another program (HDF5 could not lock it). Close it there, or "
+            "wait until that program has ended. To read the file anyway, possibly incomplete, set "
+            f"{WITHOUT} in the environment. Nothing was changed."
         )
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 
 def grows_here(path: Path) -> bool:
-    """Whether this program has the file open through HDF5's own driver, for writing or following it."""
+    """True if this program has the file open through HDF5's own driver, for writing or following it."""
     here = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
@@ -118,11 +121,11 @@ def grows_here(path: Path) -> bool:
 
 
 def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
-    """A file that this program writes, or whose writer died, opened by a driver that shares it with no other handle of
-    HDF5.
+    """A file that this program writes, or whose process was killed, opened by a driver that shares it with no other
+    handle of HDF5.
     """
     if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
-        raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
+        raise (NotReadyError if follow else DataError)(f"This program is still creating {path}. Try again.")
     with readable(path):
         file = h5py.File(GrowingFile(path, head), "r")
         with closed_on_error(file):
@@ -133,7 +136,7 @@ def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
 def look_again(item: h5py.Dataset) -> None:
     """Refresh a dataset of a growing file.
 
-    HDF5 2.0 reads wrong values after a refresh of a dataset that is open twice, as one of an ended file may be.
+    HDF5 2.0 reads wrong values after a refresh of a dataset that is open twice, which can happen with a finished file.
     """
     plist = item.file.id.get_access_plist()
     if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
@@ -141,10 +144,10 @@ def look_again(item: h5py.Dataset) -> None:
 
 
 def n_written(item: Any) -> int:
-    """How many frames or values of a growing dataset are there.
+    """Number of frames or values of a growing dataset that are already written.
 
-    Its writer may have made room for more: for frames of which no chunk is stored yet, or for values at the end of a
-    list that are its fill value or NaN.
+    Its writer may have allocated more: frames of which no chunk is stored yet, or values at the end of a list that are
+    its fill value or NaN.
     """
     look_again(getattr(item, "item", item))
     if item.ndim == 1:
@@ -157,10 +160,10 @@ def n_written(item: Any) -> int:
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:
-    """Whether the path is an HDF5 file: by its signature, at the start or after a user block.
+    """True if the path is an HDF5 file: by its signature, at the start or after a user block.
 
-    h5py.is_hdf5 says no to a file that is being written. A path that does not exist, or that is followed, counts as
-    HDF5: `open_hdf5` says what is wrong with it, or that it is not ready.
+    h5py.is_hdf5 returns False for a file that is being written. A path that does not exist, or that is followed, counts
+    as HDF5: `open_hdf5` then reports what is wrong with it, or that it is not ready.
     """
     if follow or not path.is_file():
         return True
@@ -188,9 +191,9 @@ def readable(path: Path) -> Iterator[None]:
     except ALTERED as error:
         if isinstance(error, MemoryError | PermissionError | FileNotFoundError) or _of_our_own(error):
             raise
-        what = " ".join(str(error).split()) or "no more is known"
+        what = " ".join(str(error).split()) or "no further information"
         raise DataError(
-            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was changed."
+            f"{path} is damaged or has an unexpected structure ({type(error).__name__}: {what}). Nothing was changed."
         ) from error
 
 
@@ -198,9 +201,10 @@ _CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a T
 
 
 def _of_our_own(error: Exception) -> bool:
-    """Whether a mistake of a reader raised it, and no library that met what it did not expect.
+    """True if a programming error in a reader raised it, and not a library that found something unexpected.
 
-    A dataset where a group was expected lacks that group's attributes: the object is the file's then.
+    If a dataset is where a group was expected, the group's attributes are missing: then the object is the file's, and
+    the error counts as one of the file.
     """
     content = isinstance(
         getattr(error, "obj", None), h5py.HLObject | h5py.Empty | np.ndarray | np.generic | str | bytes
@@ -222,7 +226,7 @@ def closed_on_error(file: Any) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """The reason of the disk or the system, in its own words, without HDF5's addresses and offsets."""
+    """The reason that the disk or the system gives, in its own words, without HDF5's addresses and offsets."""
     message = re.search(r"error message = '([^']*)'", str(error))
     return message[1] if message else (isinstance(error, OSError) and error.strerror) or str(error)
 
@@ -240,7 +244,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Abstract
     """Create a file. At the end of the block it is flushed to the disk.
 
     Raises:
-        OSError: the disk refused the bytes; the file is closed and stays.
+        OSError: the disk failed; the file is closed and stays.
     """
     return _written(path, "x", libver)
 

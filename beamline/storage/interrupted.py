@@ -1,4 +1,5 @@
-"""Interrupted runs: the scan and the volume of a run, and the next step for one that ended early.
+"""Interrupted runs: finds the scan file and the volume of a run, and tells the user the next step if the run ended
+early.
 
 Every command that meets such a run says the same, by `next_step`.
 """
@@ -50,7 +51,7 @@ def scan_file(path: str | Path) -> Path:
         return path / JOINED
     if len(parts := files_with_frames(path)) > 1:
         step = next_step(parts[-1]) or f"{to_join(path)}."
-        raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
+        raise DataError(f"{path} has {len(parts)} parts that were not joined. {step}")
     return path / SCAN
 
 
@@ -77,16 +78,20 @@ def volume_file(path: Path) -> Path:
     if not (path / SCAN).is_file():
         return _no_run(path, RECON) if path.is_dir() else path
     scan = scan_file(path)
-    make = f"`beamline recon {scan} -o {path / RECON}` makes one."
+    make = f"`beamline recon {scan} -o {path / RECON}` makes it."
     raise DataError(f"{path} has no volume ({RECON}). {next_step(parts_of(path)[-1] / SCAN) or make}")
 
 
 def _no_run(folder: Path, wanted: str) -> Path:
-    """The folder, which may hold slices, say. DataError: it is the folder of a run, or of runs."""
+    """The folder itself, which may contain slices for example. Raises DataError if it is the folder of a run, or of
+    runs.
+    """
     if (folder / EVENTS).is_file():
-        raise DataError(f"{folder} is the folder of a run without a {wanted}: it ended before its first frame.")
+        raise DataError(
+            f"{folder} is the folder of a run without a {wanted}, because the run ended before its first frame."
+        )
     if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
-        raise DataError(f"{folder} is a folder of runs: name one of them, such as {runs[-1]}.")
+        raise DataError(f"{folder} contains several runs. Name one of them, such as {runs[-1]}.")
     return folder
 
 
@@ -99,13 +104,14 @@ def next_step(scan: Path) -> str:
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
         if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
             return (
-                f"It is marked as being written, and has not changed for {QUIET:.0f} s or longer. Where the program "
-                f"that wrote it has ended, `h5clear -s {scan}` clears the mark."
+                f"It is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
+                f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
-                else f"Another program still writes it: `beamline recon {scan} --follow` reconstructs it meanwhile."
+                else f"Another program is still writing it: `beamline recon {scan} --follow` reconstructs it "
+                "during the scan."
             )
     if held(scan):
-        return f"Its scan still runs: `beamline recon {scan} --follow` reconstructs it meanwhile."
+        return f"Its scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
 
 
@@ -116,38 +122,46 @@ def _step_of_run(run: Path) -> str:
     growing = head is not None and head.open_for_writing
     if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
         return (
-            f"Its scan still runs: `beamline watch {run}` shows it, `beamline recon {scan} --follow` reconstructs it "
-            "meanwhile."
+            f"Its scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
+            "--follow` reconstructs it during the scan."
         )
     if not files_with_frames(run):
-        return "It ended before its first frame: start the scan anew."
-    ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes what is missing"
+        return "It ended before its first frame: start the scan again."
+    ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes the missing projections"
     if growing:
         resume = "" if ride else f"{resume}, "
         return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
-        return "It ended early, as a ride, which cannot be continued." if ride else f"It ended early: {resume}."
+        return (
+            "It ended early. It recorded the scan of another program, so it cannot be continued."
+            if ride
+            else f"It ended early: {resume}."
+        )
     record = read_record(parts[-1])
     died = record is not None and record.state == DIED
-    return f"Its process died after its scan file was closed: `beamline recover {run}` ends the run." if died else ""
+    return (
+        f"Its process was killed after its scan file was closed: `beamline recover {run}` marks the run as ended."
+        if died
+        else ""
+    )
 
 
 def is_ride(run: Path) -> bool:
-    """Whether a run recorded the scan of another program, which alone can take more of it."""
+    """True if a run recorded the scan of another program; only that program can continue it."""
     config = run / CONFIG
     return config.is_file() and "\nride:" in config.read_text(encoding="utf-8", errors="replace")
 
 
-_MAKES = "makes an ordinary file of the frames that are there"
+_MAKES = "makes an ordinary file of the complete frames"
 
 
 def _died(sure: bool) -> str:
-    """A sentence on a writer that died; where the disk has no locks, it may still run."""
-    return "Its scan has died" + ("" if sure else ", unless a program still writes to it")
+    """A sentence on a process that was killed; on a disk without locks, it may still be running."""
+    return "The process of its scan was killed" + ("" if sure else ", unless a program is still writing to it")
 
 
 def _lacks_views(run: Path) -> bool:
-    """Whether the files of a run, all closed, lack views that it was to take, wide ones included."""
+    """True if projections are missing in the files of a run, which are all closed; offset projections included."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
         return bool(still_to_take(files)[0]) or offset_planned(files[0]) > len(offset_taken(files))
@@ -155,15 +169,16 @@ def _lacks_views(run: Path) -> bool:
 
 
 def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str, ...], bool]:
-    """Views that a scan still has to take, by its plan and what it chose; nothing for a file without its plan.
+    """Projections that a scan still has to take, from its plan and its decisions; none for a file without its plan.
 
     Args:
-        files: all of the scan, in the order that they were taken in, or the one that joins them.
+        files: all files of the scan, in the order in which they were taken, or the one that joins them.
 
     Returns:
-        The triggers of these views, counted from 0: not those that the scan decided against, but those of a pass that
-        it was taking again. What it chose after each pass that ended, `Choice.NEXT` where the files do not say. Whether
-        a choice is due: the last pass has ended, and neither a choice nor a view follows.
+        The triggers of these projections, counted from 0: without those that the scan decided to omit, but with those
+            of a pass that it was taking again. What it chose after each pass that ended, `Choice.NEXT` if the files do
+            not state it. True if a choice is due: the last pass has ended, and neither a choice nor a projection
+            follows.
     """
     views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
@@ -184,19 +199,21 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
 
 
 def n_still_to_take(file: h5py.File) -> int | None:
-    """How many views `still_to_take` has for a file; None: not known, as what it chose is damaged."""
+    """Number of projections in `still_to_take` for a file; None: not known, because the record of its choices is
+    damaged.
+    """
     with suppress(*hdf5.ALTERED):
         return len(still_to_take([file])[0])
     return None
 
 
 def offset_taken(files: Sequence[h5py.File]) -> frozenset[int]:
-    """Triggers of the offset views in the files of a scan."""
+    """Triggers of the offset projections in the files of a scan."""
     return frozenset[int]().union(*(frames_in(file).numbers_taken(kind=FrameKind.OFFSET_VIEW) for file in files))
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:
-    """The passes of a plan as a file holds it, after these choices. How many views a pass of a step scan has, its
+    """The passes of a plan as a file holds it, after these choices. How many projections a pass of a step scan has, its
     configuration says."""
     plan, config = plan_in(file), file["/entry/record/config"].asstr()[()]
     angles, stated = np.radians(plan["angles_deg"]), re.search(r"^  pass_views: (\d+)", config, re.MULTILINE)

@@ -1,4 +1,6 @@
-"""Packed numbers: datasets whose attributes say what values the stored numbers stand for, as of CF (netCDF) and CIL."""
+"""Packed numbers: datasets whose attributes (scale, offset) say how stored numbers are converted to values, as in CF
+(netCDF) and CIL files.
+"""
 
 from __future__ import annotations
 
@@ -66,8 +68,9 @@ def packing(
             f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, pair_values, strict=True)
         )
         raise DataError(
-            f"{where} has the attributes {shown}, and nothing says how its numbers are read by them. In a copy, name "
-            "them scale_factor and add_offset, where value = stored * scale_factor + add_offset, or store the values."
+            f"{where} has the attributes {shown}, but it is unknown how they convert its numbers. In a "
+            "copy of the file, name them scale_factor and add_offset (value = stored * scale_factor + "
+            "add_offset), or store the converted values."
         )
     if pair is _CIL:
         scale, offset = 1 / scale, -offset / scale

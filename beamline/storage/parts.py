@@ -1,4 +1,8 @@
-"""Parts: a scan that was resumed lies in several files; the views that each holds, and one file that joins them.
+"""Parts: a resumed scan has several files. Finds which projections each contains, and joins them in one file.
+
+The joined file is an NXtomo of this program whose pixels are virtual (HDF5 virtual datasets, as in the /exchange
+projection). It contains no frame itself, so it can be made again at any time. The files with the frames are never
+written again. It records name and number of frames of each part, so that a reader can check that it has all parts.
 
 The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
 holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
@@ -41,13 +45,13 @@ _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_planned(file: h5py.File) -> int | None:
-    """Number of planned views of the scan; None if the file does not contain its plan."""
+    """Number of planned projections of the scan; None if the file does not contain its plan."""
     angles = plan_in(file).get("angles_deg")
     return None if angles is None else len(angles)
 
 
 def offset_planned(file: h5py.File) -> int:
-    """Number of planned offset views of the scan."""
+    """Number of planned offset projections of the scan."""
     plan = plan_in(file)
     kind = "wide" if "wide_views" in plan else "offset"  # the name in files of earlier versions
     return int(plan.get(f"{kind}_views", 0)) * len(plan.get(f"{kind}_places_mm", ()))
@@ -59,9 +63,10 @@ def plan_in(file: h5py.File) -> dict[str, Any]:
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
-    """Triggers before the last view without a frame, judged by the frames themselves: for files whose writer died.
+    """Triggers without a frame before the last projection, found from the frames themselves: for files whose process
+    was killed.
 
-    None of a later part of a run, which takes what the parts before lack, and of files without their plan.
+    None for a later part of a run, which takes what is missing in the parts before, and for files without their plan.
     """
     table = frames_in(file)
     views = table.views
@@ -70,23 +75,24 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     references = table.of_kind(FrameKind.DARK, FrameKind.FLAT)
     first = references[references < views[0]].max(initial=-1) + 1
     seen = table.triggers[first : views[-1] + 1]
-    seen = seen[seen < (views_planned(file) or 0)]  # offset views, and those taken again, count on from there
+    seen = seen[seen < (views_planned(file) or 0)]  # offset projections, and those taken again, count on from there
     gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
     return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references planned after the views that are missing, wholly or in part, in the files of a scan.
+    """Kinds of darks and flats planned after the projections that are missing, completely or in part, in the files of a
+    scan.
 
     Args:
-        files: all of the scan, in the order that they were taken in.
+        files: all files of the scan, in the order in which they were taken.
     """
     taken = _after_views(files)
     return frozenset(kind for kind, n in _planned(files[0], "end").items() if len(taken[kind]) < n)
 
 
 def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
-    """Numbers of references planned at the "start" or the "end" of the views, in the order of acquisition at the
+    """Numbers of references planned at the "start" or the "end" of the projections, in the order of acquisition at the
     end."""
     plan = plan_in(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
@@ -94,7 +100,7 @@ def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
 
 
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
-    """Triggers, counted within their block, of the references after the last view of all files."""
+    """Triggers, counted within their block, of the references after the last projection of all files."""
     table = FrameTable.concat([frames_in(file) for file in files])
     after = table.views[-1] if table.views.size else len(table)
     rows = {kind: table.of_kind(kind) for kind in (FrameKind.FLAT, FrameKind.DARK)}
@@ -112,7 +118,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
     """
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
-            raise DataError(f"{joined} could not be made: {part} was not closed. The parts are untouched.")
+            raise DataError(f"{joined} could not be made, because {part} was not closed. The parts were not changed.")
     with atomic_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:
@@ -120,7 +126,9 @@ def join(parts: Sequence[Path], joined: Path) -> int:
                 names = [Path(os.path.relpath(part, joined.parent)).as_posix() for part in parts]
                 return _join(files, names, file)
         except hdf5.ALTERED as error:
-            raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
+            raise DataError(
+                f"{joined} could not be made ({hdf5.reason(error)}). The parts were not changed."
+            ) from error
 
 
 def other_parts(part: Path) -> list[Path]:
@@ -135,7 +143,7 @@ def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """Whether a part may have frames: its file has one, or its log of events (perhaps not all) names one.
+    """True if a part may have frames: its file has one, or its log of events (perhaps incomplete) names one.
 
     A part that ended before its first frame does not count.
     """
@@ -162,7 +170,7 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
 
 def to_join(run: Path) -> str:
     """The command that joins the parts of a run, as the end of a sentence."""
-    return f"`beamline recover {run}` joins the parts that are there"
+    return f"`beamline recover {run}` joins the existing parts"
 
 
 def require_joined(file: h5py.File) -> None:
@@ -175,13 +183,13 @@ def require_joined(file: h5py.File) -> None:
     joined = Path(file.filename)
     if why := _disagreement(file, joined.parent):
         raise DataError(
-            f"{joined} does not have the frames of its scan: {why}. {to_join(joined.parent)}; where parts are "
-            "elsewhere, copy the folder of the run as a whole. Nothing was changed."
+            f"{joined} does not have all frames of its scan: {why}. {to_join(joined.parent)}. If parts "
+            "are in another place, copy the whole folder of the run. Nothing was changed."
         )
 
 
 def is_joined(joined: Path) -> bool:
-    """Whether this file exists and has the frames of all parts of its scan."""
+    """True if this file exists and has the frames of all parts of its scan."""
     with suppress(DataError), hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
         require_joined(file)
         return True
@@ -190,18 +198,20 @@ def is_joined(joined: Path) -> bool:
 
 def _disagreement(joined: h5py.File, folder: Path) -> str:
     if layout.PARTS not in joined:
-        return "it does not say what its parts are"
+        return "it does not list its parts"
     names, frames = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames"))
     parts = [folder / datasets.text(name) for name in names]
     for part, n in zip(parts, frames, strict=True):
         if not part.is_file():
-            return f"its part {part} is not there"
+            return f"its part {part} does not exist"
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             committed = int(file[layout.COMMITTED][()])
             if committed != n:
-                return f"its part {part} has {committed} frames, not the {n} which it was made of"
+                return (
+                    f"its part {part} has {committed} frames instead of the {n} that it had when the parts were joined"
+                )
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
-    return f"it lacks those of {others[0]}" if others else ""
+    return f"the frames of {others[0]} are missing" if others else ""
 
 
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:
@@ -258,7 +268,7 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> tuple[int, ...]:
 
 
 def is_whole(file: h5py.File, row: int) -> bool:
-    """Whether the pixels of a row are as they were written, by their checksum."""
+    """True if the pixels of a row are as they were written, by their checksum."""
     with suppress(*hdf5.ALTERED):
         return has_checksum(file[layout.DATA][row], int(file["/entry/digest/checksum"][row]))
     return False

@@ -1,4 +1,6 @@
-"""PoseTable: displacement, roll and tilt of each view, or its vectors, from a CSV, .npz, a volume or an NXtomo file."""
+"""PoseTable: displacement, roll and tilt of each projection, or its vectors, read from a CSV, an .npz, a volume or
+an NXtomo file.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ from recon.base.arrays import F64
 from recon.base.vectors import geometry_of_vectors
 
 Key = Literal["frame", "view", "angle_deg"]
-IGNORE = "ignore"  # In place of a file: views count as not displaced, whatever their scan file says
+IGNORE = "ignore"  # In place of a file: projections count as not displaced, whatever their scan file says
 _KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
@@ -37,25 +39,29 @@ _VECTORS = {
 _ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and whether they are of a cone
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
-_HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+_HOW = (
+    "state the directions: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """Poses of some views, in unbinned pixels.
+    """Poses of some projections, in unbinned pixels.
 
     Attributes:
         path: of the file.
-        by: what `keys` are: rows of the scan file, views counted from 0 in its order, or angles in degrees.
+        by: meaning of `keys`: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
-        angles_deg: float64 [row] of the views, to be compared with the scan's; None where the file has none.
+        angles_deg: float64 [row] of the projections, to be compared with the scan's; None if the file has none.
         shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
-        turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
+        turns_deg: float64 [row, 2], roll and tilt, as in `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.
-        frames: of the scan that the file was made with; None: not known.
-        axis_col: of the volume that the poses are of, in columns of the whole detector; None: not known.
-        vectors: float64 [row, 12] in mm, as of `recon.base.vectors`, which state all of the geometry; None: no such.
-        cone: the vectors are of a cone.
+        frames: number of frames of the scan for which the file was made; None: not known.
+        axis_col: rotation axis of the volume with which the poses were found, in columns of the whole detector; None:
+            not known.
+        vectors: float64 [row, 12] in mm, as in `recon.base.vectors`, which state the complete geometry; None: no
+            vectors.
+        cone: the vectors are of a cone beam.
     """
 
     path: Path
@@ -72,7 +78,7 @@ class PoseTable:
 
     @property
     def leans(self) -> bool:
-        """Whether a row of a view may show several slices, because the view is rolled or tilted."""
+        """True if a row of a projection may show several slices, because the projection is rolled or tilted."""
         return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
@@ -97,7 +103,7 @@ class PoseTable:
 
 
 class _NoPosesError(Exception):
-    """A sound file that does not state poses: a ValueError would be taken for damage."""
+    """A valid file that does not state poses: a ValueError would be mistaken for damage."""
 
 
 def read_poses(text: str) -> PoseTable:
@@ -129,9 +135,9 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
     if lines and len(re.split(r"[\s,]+", lines[0].strip())) == 12 and not re.search("[a-df-z]", lines[0]):
         raise ValueError(
-            f"{path} has 12 numbers a line and no names, as vectors of ASTRA. Save them with the name of their kind, "
-            f"cone_vec or parallel3d_vec: python -c \"import numpy as np; np.savez('poses.npz', cone_vec=np.loadtxt("
-            f"'{path.name}'))\", and give --poses poses.npz"
+            f"{path} has 12 numbers per line and no names, like vectors of ASTRA. Save them under the "
+            'name of their kind, cone_vec or parallel3d_vec: python -c "import numpy as np; '
+            f"np.savez('poses.npz', cone_vec=np.loadtxt('{path.name}'))\", and give --poses poses.npz"
         )
     _require_header(path, names, cone)
     columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
@@ -152,19 +158,19 @@ def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
     missing = set(stated) - set(names)
     if not set(names) & set(_KEYS) or (len(missing) == len(stated) if cone is None else missing):
         raise ValueError(
-            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"{'some' if cone is None else 'all'} of {', '.join(stated)}"
+            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or "
+            f"angle_deg, and with {'some' if cone is None else 'all'} of {', '.join(stated)}"
         )
     legal = (*_KEYS, *stated, *(_FOR_PEOPLE if cone is None else ()))
     for name in names:
         if name not in legal or names.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(legal)}")
+            raise ValueError(f"{path}: column {name!r} is unknown or occurs twice; known: {', '.join(legal)}")
 
 
 def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
     """The table [row, column]; ValueError for cells that are no numbers, and without a row."""
     if not rows:
-        raise ValueError(f"{path} has a header and no rows; expected one for each view")
+        raise ValueError(f"{path} has a header and no rows; expected one row for each projection")
     values = np.empty((len(rows), len(names)))
     for number, row in enumerate(rows):
         try:
@@ -180,17 +186,17 @@ def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
         given = columns[name]
         bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
         if bad.any():
-            kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
+            kind = "finite angles" if name == "angle_deg" else "integers from 0 on"
             raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
 
 
 def _of_arrays(path: Path) -> PoseTable:
-    """Vectors of all views, in an .npz under the name that ASTRA has for their kind."""
+    """Vectors of all projections, in an .npz under the name that ASTRA has for their kind."""
     with hdf5.readable(path):
         arrays = numpy_arrays(path)
     read = {name: values for name, values in arrays.items() if name in _ARRAYS}
     if len(read) != 1:
-        raise ValueError(f"{path} holds {', '.join(arrays)}; expected one of {' and '.join(_ARRAYS)}")
+        raise ValueError(f"{path} contains {', '.join(arrays)}; expected one of {' and '.join(_ARRAYS)}")
     ((name, vectors),) = read.items()
     if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
         raise ValueError(f"{path}: {name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")
@@ -221,9 +227,11 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
         np.atleast_1d(np.asarray(parameters.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
     )
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
-        raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
+        raise ValueError(f"{path} contains no poses: its projections were used as not displaced and not tilted")
     if CENTRES_KEPT in parameters:
-        raise ValueError(f"{path} was made with vectors of each view, but does not hold them: give their file")
+        raise ValueError(
+            f"{path} was made with vectors of each projection, but does not contain them: give the file of the vectors"
+        )
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
     turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
@@ -239,7 +247,9 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 
 
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
-    """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
+    """Translations of the sample, in mm from their median, because a common translation is not a displacement of a
+    projection.
+    """
     places = choose(file, find(file))
     kinds = places.kinds()
     shown = kinds == FrameKind.PROJECTION
@@ -264,7 +274,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         moved[axis] = values - np.median(values[shown])
     if not moved:
         raise _NoPosesError(
-            f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV"
+            f"{path} has none of sample/x_translation, y_translation and z_translation; expected at least "
+            "one of them, or a CSV"
         )
     directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:
@@ -274,7 +285,7 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
     named = {way[-1] for way in ways} - {"0"}
     if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
         raise _NoPosesError(
-            f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}"
+            f"{path}: {','.join(ways)} must name two translations that the file has ({', '.join(moved)}); {_HOW}"
         )
     shifts = [np.zeros(kinds.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
     rows = np.flatnonzero(shown)
@@ -283,8 +294,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:
-    """Write the poses of the views of a volume file as a CSV that `read_poses` reads; returns the number of views, and
-    the axis' column.
+    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads; returns the number of
+    projections, and the axis' column.
 
     Raises:
         DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.

@@ -1,4 +1,4 @@
-"""ReconRecord: the record of a volume, the same in its file, in the event `done` and in scripts."""
+"""ReconRecord: the facts about a volume, identical in its file, in the event `done` and in scripts."""
 
 from __future__ import annotations
 
@@ -67,16 +67,17 @@ class ReconRecord:
         time: s since the Unix epoch when it was made.
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.
-        history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
+        history: equally long arrays, by name (step, seconds, loss ...); empty if there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         series: all volumes, where `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
-        model: the Gaussians behind the volume and the geometry of their views (`result.arrays_of_model`); empty: none.
-        compared: metrics of FBP of the same views; None without. This and what follows are of a volume that was made
-            by this program just now; files do not hold it.
+        model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
+            none.
+        compared: metrics of FBP of the same projections; None without. This and what follows are of a volume that was
+            made by this program just now; files do not hold it.
         warnings: sentences.
         hiding: the warning of what the volume may hide; empty without.
-        chosen: how `auto` or a preset came to its settings; empty where they were given.
+        chosen: how `auto` or a preset came to its settings; empty if they were given.
         output, report: files of the volume and of its report; None: not written.
         elapsed, times: s in all, and of each phase.
     """
@@ -132,12 +133,12 @@ class ReconRecord:
 
     @property
     def ended_early(self) -> bool:
-        """Whether the reconstruction was stopped before its end."""
+        """True if the reconstruction was stopped before its end."""
         return self.ending.early
 
     @property
     def seconds_of_volumes(self) -> tuple[float, ...]:
-        """Time of each of several volumes, in s from the first view on; empty for one volume."""
+        """Time of each of several volumes, in s from the first projection on; empty for one volume."""
         return () if self.series is None else tuple(self.series.seconds.tolist())
 
     @property

@@ -1,4 +1,4 @@
-"""Frames as a scan file of this program records them: their table, and rows that no longer match their checksum."""
+"""Frames in a scan file of this program: their table, and rows that no longer match their checksum."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED]
 def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
     """What the log says of the first n frames, without flags.
 
-    Alignment frames aside are offset views; frames whose record differs from its checksum are INVALID.
+    Alignment frames aside are offset projections; frames whose record differs from its checksum are INVALID.
 
     Args:
         n: None: those that are committed.
@@ -69,13 +69,13 @@ def _part_starts(file: h5py.File) -> I64:
 
 
 def pass_ends_in(file: h5py.File) -> I64:
-    """Rows of a file at the end of each pass [pass], of those committed; empty where the scan chose nothing."""
+    """Rows of a file at the end of each pass [pass], of those committed; empty if the scan chose nothing."""
     ends = np.asarray(_list_in(file, layout.PASS_ENDS), np.int64)
     return ends[ends <= int(file[layout.COMMITTED][()])] if ends.size else ends
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty likewise."""
+    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty in the same way."""
     return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
 
 
@@ -90,7 +90,7 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
 def codes_of(kind: FrameKind) -> dict[str, int]:
     """The codes of a kind of frame, by their columns: NXtomo's image key, and the finer one of the log.
 
-    NXtomo has no key for alignment frames: programs that do not know them must not use them. An offset view is a
+    NXtomo has no key for alignment frames: programs that do not know them must not use them. An offset projection is a
     projection, of a translated sample; the log has it as an alignment frame.
     """
     key = {FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind)
@@ -135,7 +135,7 @@ def _column(file: h5py.File, path: str, n: int) -> NDArray[Any]:
 
 
 def _altered(columns: Mapping[str, NDArray[Any]]) -> Mask:
-    """Whether each row differs from its checksum."""
+    """True if each row differs from its checksum."""
     checksums = columns[layout.RECORD_CHECKSUM]
     good = np.asarray(record_checksums(columns) == checksums)
     marked = ~good & np.any([columns[path] == code for path, code in codes_of(FrameKind.INVALID).items()], axis=0)

@@ -1,4 +1,4 @@
-"""recover: an ordinary scan file in place of one whose writer died, with every committed frame.
+"""recover: replaces the file of a scan whose process was killed by an ordinary file with all complete frames.
 
 The frames are copied to a new file, which takes the place of the old one once it is on the disk. Whatever stops the
 copy leaves the old file as it was.
@@ -46,12 +46,12 @@ class Recovered:
     Attributes:
         changed: whether the file was changed.
         frames: committed, and kept.
-        dropped: frames at the end that were not committed when the writer died, and are cut off.
-        missing: views that were to be taken, by the plan and by what the scan chose, and were not; None where the file
-            does not hold its plan, and of a later part of a run, which others come before.
+        dropped: frames at the end that were not committed when the process was killed, and are cut off.
+        missing: projections that were to be taken, by the plan and by what the scan chose, and were not; None if the
+            file does not hold its plan, and of a later part of a run, which others come before.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames that differ from their checksum; they are kept.
-        altered: frames whose row in the log differs from its checksum; likewise kept.
+        altered: frames whose row in the log differs from its checksum; in the same way kept.
         remark: a step that failed although the frames are in order; "" if none failed.
     """
 
@@ -67,22 +67,28 @@ class Recovered:
 
     def in_words(self) -> str:
         """The result as one line of text."""
-        wrong = f"; with another record than was written: {frames_text(self.altered)}" if self.altered else ""
+        wrong = (
+            f"; records differ from the checksum stored with them: {frames_text(self.altered)}" if self.altered else ""
+        )
         if not self.changed:
-            order = "cannot be mended" if wrong else "is in order"
-            sentence = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}; nothing was changed."
+            order = "cannot be repaired" if wrong else "is intact"
+            sentence = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}. Nothing was changed."
         else:
-            gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
-            lost = f"; committed, but not on the disk: {frames_text(self.lost)}" if self.lost else ""
-            damaged = f"; with another checksum than was written: {frames_text(self.damaged)}" if self.damaged else ""
-            views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
+            gone = f", {count(self.dropped, 'incomplete frame')} left out" if self.dropped else ""
+            lost = f"; written by the scan but lost on the disk: {frames_text(self.lost)}" if self.lost else ""
+            damaged = (
+                f"; pixels differ from the checksum stored with them: {frames_text(self.damaged)}"
+                if self.damaged
+                else ""
+            )
+            views = f"; {count(self.missing, 'planned projection')} not taken" if self.missing else ""
             sentence = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
         return f"{sentence} {self.remark}".strip()
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
-    """Put a closed file with the committed frames in the place of one whose writer died, or that was cut off; add the
-    /exchange view where a closed one lacks it.
+    """Put a closed file with the committed frames in the place of one whose process was killed, or that was cut off;
+    add the /exchange view where a closed one lacks it.
 
     Args:
         say: takes a sentence on the room that the copy needs.
@@ -95,8 +101,8 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         raise DataError(f"{no_file(path)} Nothing was changed.")
     if in_use := held(path):
         raise DataError(
-            f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
-            "Nothing was changed."
+            f"{path} is open in a program that is still running: a scan that waits or pauses, or a "
+            "reader. End it first. Nothing was changed."
         )
     lock = None
     with suppress(OSError):  # a file that nobody can write to may be in order
@@ -110,11 +116,15 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
                 return _with_view(path, head)
         if in_use is None and head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
             raise DataError(
-                f"{path} changed {age:.0f} s ago, is marked as being written, and its disk has no locks. If its "
-                f"writer is dead, try again in {QUIET:.0f} s. Nothing was changed."
+                f"{path} changed {age:.0f} s ago and is marked as being written, and its disk has no file "
+                f"locks. If the program that wrote it was killed, try again in {QUIET:.0f} s. Nothing was "
+                "changed."
             )
         free = size(shutil.disk_usage(path.parent).free)
-        say(f"{path}: its frames are copied, which takes up to {size(head.size)} on its disk; {free} are free.")
+        say(
+            f"Free some space on the disk of {path}: its frames are copied, which needs up to "
+            f"{size(head.size)}, and {free} are free."
+        )
         with atomic_file(path, replace=True) as partial:
             done = _copied(path, head, partial)
             if done.lost or done.damaged:
@@ -153,14 +163,17 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
             require_ours(path, file)
             committed, frames = int(file[layout.COMMITTED][()]), _frames_there(file)
             if frames == 0 < committed:
-                raise ValueError(f"all of its {committed} frames are damaged")
+                raise ValueError(f"all of its {committed} complete frames are damaged")
             ending, lost = ending_in(file), tuple(range(frames, committed))
             with hdf5.created(target, layout.LIBVER) as made:
                 damaged = copy_rows(file, frames, made)
                 if ending.status == RUNNING:
                     ending = ScanEnding("failed", gaps_in(path, made), DIED)
                 if lost:
-                    reason = f"{ending.reason} Written, but not on the disk: {frames_text(lost)}."
+                    reason = (
+                        f"{ending.reason} Lost, because the scan had written them but they did not reach the "
+                        f"disk: {frames_text(lost)}."
+                    )
                     ending = replace(ending, status="failed", reason=reason.strip())
                 state_ending(made, ending)
                 times = made[layout.TIME][()]
@@ -174,7 +187,8 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
         if isinstance(error, OSError) and error.filename == str(target):
             raise
         raise DataError(
-            f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
+            f"{path} is damaged, or its program was killed before the first frame ({hdf5.reason(error)}). "
+            "Nothing was changed."
         ) from error
     return Recovered(path, True, frames, dropped, missing, lost, damaged, altered)
 
@@ -188,7 +202,7 @@ def _kept_aside(path: Path) -> str:
             kept.hardlink_to(path)
     except OSError:  # a disk without links
         shutil.copy2(path, kept)
-    return f"The damaged file is {kept} now."
+    return f"The damaged file was renamed to {kept}."
 
 
 def _frames_there(file: h5py.File) -> int:

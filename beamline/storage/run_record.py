@@ -2,7 +2,7 @@
 work there.
 
 The process of a part holds a lock on the part's configuration as long as it lives, to the end of its last fit. The
-system drops it with the process. A process that recovers a run or goes on with it holds one on the run's events.
+system drops it with the process. A process that recovers a run or continues it holds one on the run's events.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def write_record(part: Path, record: RunRecord) -> None:
 
 
 def alive(part: Path) -> bool | None:
-    """Whether the process of a part lives; None: its file system has no locks."""
+    """True if the process of a part lives; None: its file system has no locks."""
     return held(part / CONFIG, exclusively=True)
 
 

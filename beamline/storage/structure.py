@@ -1,4 +1,4 @@
-"""Structure: the objects of an HDF5 file and the other files that it draws on, looked at before any of them is opened.
+"""Structure of an HDF5 file: checks its objects and the other files that it refers to, before any of them is opened.
 
 HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of deeply nested groups.
 
@@ -36,7 +36,7 @@ def require_harmless(file: h5py.File) -> None:
     """
     path = Path(file.filename)
     for name in dict.fromkeys(_names(file, path)):
-        # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
+        # Where HDF5 looks for it: as it is named, beside this file, and by its last part next to it.
         for place in (Path(name), path.parent / name, path.parent / Path(name).name):
             if place.is_dir():
                 continue
@@ -44,7 +44,7 @@ def require_harmless(file: h5py.File) -> None:
                 require_regular(place)
             except OSError as error:
                 raise DataError(
-                    f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
+                    f"{path} has a link to {name}, which does not occur in scans ({error.strerror}). Nothing was read."
                 ) from error
 
 
@@ -56,8 +56,8 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
         names = [*group]
         if len(known) + len(names) > MOST_OBJECTS or depth > DEEPEST:
             raise DataError(
-                f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} deep: it is no scan or "
-                "volume. Nothing was read."
+                f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} levels deep: "
+                "it is neither a scan nor a volume. Nothing was read."
             )
         for name in names:
             with suppress(*_DAMAGED):
@@ -86,8 +86,8 @@ def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
     """
     if made.get_external_count():
         raise DataError(
-            f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5 and is not read. Copy "
-            "them into the dataset. Nothing was read."
+            f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not an HDF5 file "
+            "and is not read. Copy the values into the dataset. Nothing was read."
         )
     chunk, shape = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
     sides = [-(-side // across) * across for side, across in zip(shape, chunk, strict=True)] if chunk else shape
@@ -95,7 +95,7 @@ def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
     if (n < CLAIMED and piece <= _LARGE) or made.get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()) or is_blank(n, stored, piece):
-        raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
+        raise DataError(f"{what} states {n / 1e9:.3g} GB, but only {stored} bytes are stored. Nothing was read.")
 
 
 def drawn_on(made: Any) -> Iterator[tuple[str, str]]:
@@ -108,8 +108,8 @@ def plain_name(written: str) -> str:
     """The name of a source of a virtual dataset, where %% stands for %. DataError for %b, a number to be filled in."""
     if "%b" in written.replace("%%", ""):
         raise DataError(
-            f"A virtual dataset draws on a numbered series, {written}, which is not read. Copy its values to a "
-            "dataset that holds them. Nothing was read."
+            f"A virtual dataset refers to a numbered series of files, {written}, which is not supported. "
+            "Copy its values to an ordinary dataset. Nothing was read."
         )
     return written.replace("%%", "%")
 
@@ -134,7 +134,7 @@ def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
     """Three integers of at least 1, the shape [z, y, x] of a volume or of a chunk."""
     sides = tuple(said) if isinstance(said, list | tuple) else ()
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
-        raise ValueError(f"its {what} is {_brief(said)}; expected three whole numbers")
+        raise ValueError(f"its {what} is {_brief(said)}; expected three integers")
     if not all(1 <= n < _LONGEST for n in sides) or math.prod(map(int, sides)) > _MOST:
         raise ValueError(
             f"its {what} is {_brief(said)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
@@ -166,7 +166,8 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
     needed = math.prod(shape) * dtype.itemsize
     if begin < 0 or begin + needed > stored:
         raise ValueError(
-            f"its header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but it has {stored} bytes"
+            f"its header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but the file "
+            f"has {stored} bytes"
         )
 
 
@@ -179,7 +180,7 @@ def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     needed = file.tell() + math.prod(map(int, shape)) * dtype.itemsize
     file.seek(at)
     if any(n < 0 for n in shape) or needed > stored:
-        raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but it has {stored} bytes")
+        raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but the file has {stored} bytes")
     return shape, dtype
 
 

@@ -1,4 +1,5 @@
-"""HDF5's own blocks: the first 48 bytes of a file, and blocks that a kill left half written.
+"""Low-level blocks of HDF5: the first 48 bytes of a file, and blocks that are half written because the process was
+killed.
 
 The head says whether the file is being written and how many bytes it has. A kill may end a write where two pages of the
 file system's memory meet. The block is then new up to there, and old after it. Each field is the new or the old one,
@@ -36,12 +37,12 @@ class Superblock:
 
     @property
     def open_for_writing(self) -> bool:
-        """Whether a program is writing the file, or died while writing."""
+        """True if a program is writing the file, or died while writing."""
         return self.head[_FLAGS] != 0
 
     @property
     def grows(self) -> bool:
-        """Whether the file is being written so that others may read it meanwhile (SWMR)."""
+        """True if the file is being written so that others may read it meanwhile (SWMR)."""
         return bool(self.head[_FLAGS] & _GROWS)
 
     @property
@@ -74,7 +75,7 @@ def superblock(path: Path) -> Superblock | None:
 
 
 def marked_as_being_written(path: Path) -> bool:
-    """Whether the file is marked as being written: a program writes it, or died while writing."""
+    """True if the file is marked as being written: a program writes it, or died while writing."""
     head = superblock(path)
     return head is not None and head.open_for_writing
 

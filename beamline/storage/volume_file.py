@@ -52,12 +52,15 @@ def read_volume(
     if not path.is_file():
         raise DataError(no_file(path))
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
-        raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
+        raise DataError(
+            f"{path} contains one volume, so a dataset ({dataset!r}) cannot be chosen; datasets exist in HDF5 "
+            "and .npz files."
+        )
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
     if not (is_hdf5 or is_numpy or name.endswith(SUFFIXES)):
-        raise DataError(f"{path} is not a known volume file; the kinds are {', '.join(SUFFIXES)}.")
+        raise DataError(f"{path} is not a known volume file; the known suffixes are {', '.join(SUFFIXES)}.")
     if name.endswith((".npz", ".npy")) and not is_numpy:
-        raise DataError(f"{path} cannot be read: it is neither an .npz nor an .npy, whatever its name says.")
+        raise DataError(f"{path} cannot be read: its content is neither .npz nor .npy, although its name says so.")
     try:
         if name.endswith((".nii", ".nii.gz")):
             return _from_nifti(path)
@@ -89,7 +92,7 @@ def axes_of(
 
 
 def _is_numpy(path: Path) -> bool:
-    """Whether it is a NumPy file by its first bytes, whatever its name."""
+    """True if it is a NumPy file by its first bytes, whatever its name."""
     with path.open("rb") as file:
         return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 
@@ -150,15 +153,15 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
         raise DataError(
             f"{path} is a folder without slices as TIFF or grey pictures"
             + (
-                f"; its volume is {inside[0]}."
+                f"; the folder contains the volume {inside[0]}."
                 if inside
-                else f"; a volume is such a folder, a Zarr, or {', '.join(SUFFIXES)}."
+                else f"; a volume must be such a folder, a Zarr, or {', '.join(SUFFIXES)}."
             )
         )
     if others := [f"{len(some)} of {name}" for name, some in series.items() if len(some) > 1 and some is not files]:
         raise DataError(
-            f"{path} holds several series of images: {len(files)} such as {files[0]}, {', '.join(others)}. Give each "
-            "volume a folder of its own."
+            f"Put each volume into a folder of its own: {path} contains several series of images: "
+            f"{len(files)} such as {files[0]}, {', '.join(others)}."
         )
     slices: NDArray[np.generic] | None = None
     for z, name in enumerate(files):
@@ -187,7 +190,7 @@ def _of_picture(path: Path) -> NDArray[np.generic]:
             return np.asarray(picture)
         colours = np.asarray(picture.convert("RGB"))
     if np.ptp(colours, axis=2).any():
-        raise ValueError("it has colours; expected greys")
+        raise ValueError("it has colours; expected grey values")
     return np.ascontiguousarray(colours[..., 0])
 
 
@@ -200,14 +203,14 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
         import nibabel
     except ImportError as error:
         raise DataError(
-            f"{path} is a NIfTI volume, which needs nibabel, and that cannot be loaded here ({error}): pip install "
-            "splatline[nifti]."
+            f"{path} is a NIfTI volume. Reading it needs the package nibabel, which cannot be loaded "
+            f"({error}): pip install splatline[nifti]."
         ) from error
     image: Any = nibabel.load(path)
     shape, unit = image.shape, LENGTHS.get(int(image.header["xyzt_units"]) & 7)
     dtype, steps = image.get_data_dtype(), np.abs(image.header.get_zooms()[:3])
     if len(shape) < 3 or any(n != 1 for n in shape[3:]) or dtype.kind not in "iuf":
-        raise DataError(f"{path} holds {dtype} of shape {shape}; expected real numbers of three axes.")
+        raise DataError(f"{path} contains {dtype} of shape {shape}; expected real numbers with three axes.")
     if unit is None or not (np.isfinite(steps).all() and steps.all()):
         raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
     require_room(path, math.prod(shape) * dtype.itemsize)
@@ -256,11 +259,11 @@ def _only(path: Path, axes: dict[str, int]) -> str:
 
         if (scan := scan_format(path)) is not None:
             raise DataError(
-                f"{path} is a scan ({scan}), not a volume: `beamline recon {path}` makes a volume of it, and "
-                f"`beamline view {path}` shows its frames."
+                f"{path} is a scan ({scan}), not a volume. `beamline recon {path}` makes a volume of it, "
+                f"and `beamline view {path}` shows its frames."
             )
         raise DataError(
-            f"{path} holds {len(volumes)} volumes ({', '.join(volumes) or 'none'}); name one as its dataset, in `view` "
-            "as FILE::NAME."
+            f"{path} contains {len(volumes)} volumes ({', '.join(volumes) or 'none'}). Name one as its "
+            "dataset; in `view` as FILE::NAME."
         )
     return volumes[0]

@@ -1,4 +1,4 @@
-"""Locks on files: ours on a file that is being written, and failures of HDF5's own.
+"""Locks on files: those of this program on a file that is being written, and failures of HDF5's own locks.
 
 Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
 however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read
@@ -87,8 +87,9 @@ def no_locks_sentence(place: Path, number: int | None = None) -> str:
     """A sentence with the cause and the remedy."""
     told = "" if number is None else f" (errno {number})"
     return (
-        f"the file system of {place} has no file locks{told}, as NFS is often mounted, and HDF5 creates no file there; "
-        f"choose a storage.folder on a local disk, have it mounted with locks, or set {WITHOUT} in the environment"
+        f"the file system of {place} has no file locks{told}, which is often so with NFS, and HDF5 "
+        "creates no file there. Choose a storage.folder on a local disk, mount the file system with "
+        f"locks, or set {WITHOUT} in the environment"
     )
 
 
@@ -115,7 +116,7 @@ class WriterLock:
     """A lock held until `release`, or until this process ends. There is no lock if the file system has none.
 
     Args:
-        exclusive: take an exclusive lock, and raise OSError where another process holds one; else a shared one.
+        exclusive: take an exclusive lock, and raise OSError if another process holds one; else a shared one.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
@@ -136,7 +137,7 @@ class WriterLock:
 
 
 def held(path: Path, *, exclusively: bool = False) -> bool | None:
-    """Whether a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
+    """True if a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
     its file system has no locks.
 
     Args:
@@ -160,7 +161,7 @@ def held(path: Path, *, exclusively: bool = False) -> bool | None:
 
 
 def abandoned(path: Path) -> bool:
-    """Whether no program seems to write the file: it has not changed for QUIET s, and no running program has it
+    """True if no program seems to write the file: it has not changed for QUIET s, and no running program has it
     open."""
     return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
@@ -171,8 +172,8 @@ class WriterWatch:
 
     Args:
         now: s, by the clock of the follower.
-        patience: s without a frame, after which a file without a lock counts as one whose writer died. With the lock
-            the writer waits: for the operator, the beam, or a long exposure.
+        patience: s without a frame, after which a file without a lock counts as one whose process was killed. With the
+            lock the writer waits: for the operator, the beam, or a long exposure.
     """
 
     def __init__(self, path: Path, now: float, patience: float = PATIENCE) -> None:
@@ -192,5 +193,5 @@ class WriterWatch:
         if grew or (self._held and now - self._last_frame > self._patience):
             self._last_frame = now
         if self._was_held and not self._held and not finished():
-            return "has lost its writer"
+            return "is no longer being written, because its program ended"
         return f"has not grown for {self._patience:.0f} s" if now - self._last_frame > self._patience else ""

@@ -1,4 +1,4 @@
-"""What accuracy costs: fewer views, other methods, against the truth of a simulation. Writes cost_of_accuracy.png.
+"""What accuracy costs: fewer projections and other methods, on a simulated scan. Writes cost_of_accuracy.png.
 
 beamline simulate cathode --frames 120 --set detector.shape=[4,160] --out scan.h5 --truth truth.h5
 python cost_of_accuracy.py scan.h5 truth.h5

@@ -1,4 +1,4 @@
-"""A day of samples: one scan each, a table at the end. A sample that fails does not cost those after it.
+"""A day of samples: scans each one and prints a table at the end. If one fails, the others are still scanned.
 
 python day_of_samples.py my.yaml cathode-1 cathode-2 cathode-3
 """
@@ -12,10 +12,10 @@ done = []
 
 with api.connect(config) as instrument:
     for sample in samples:
-        # Here the sample is changed: by a robot, or by you, with input("Mount it, close the hutch, press Enter ").
+        # Change the sample here: with a robot, or by hand, with input("Mount it, close the hutch, press Enter ").
         try:
             done.append(instrument.scan(sample=sample))
-        except api.DataError as error:  # frames are missing, or the disk failed; a failed device ends the day
+        except api.DataError as error:  # missing frames, or a full disk; a device that fails ends the script
             print(f"{sample}: {error}")
             if instrument.last is not None:
                 done.append(instrument.last)

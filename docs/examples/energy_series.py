@@ -1,4 +1,4 @@
-"""An energy series: the same sample at several energies, reconstructed, and what each volume's matter absorbs.
+"""An energy series: scans a sample at several energies, reconstructs it, and prints how much it absorbs at each.
 
 python energy_series.py my.yaml 24.9 25.1 25.3
 """
@@ -12,7 +12,7 @@ from beamline import api
 
 
 def move_monochromator(energy_kev: float) -> None:
-    """Your control system moves it, such as with `epics.caput(...)`, and returns when it stands."""
+    """Move the monochromator through your control system, e.g. by `epics.caput(...)`; return when it has stopped."""
 
 
 config, *energies = sys.argv[1:]
@@ -24,7 +24,7 @@ with api.connect(config, set={"recon.live": False}) as instrument:
         scans.append(instrument.scan(sample=f"cathode_{energy:g}keV", energy_kev=energy))
 
 for energy, scan in zip(energies, scans, strict=True):
-    # The same method for all: "auto" may choose another one at each energy.
+    # The same method for all energies, because "auto" may choose a different one for each.
     result = api.reconstruct(scan.path, recon.Fbp(), output=scan.folder / "fbp.h5")
     absorption = np.percentile(result.volume.data, 99)
-    print(f"{energy} keV: {absorption:.3f} {result.units} where most is absorbed, {result.output}")
+    print(f"{energy} keV: {absorption:.3f} {result.units} in the most absorbing voxels, {result.output}")

@@ -1,4 +1,4 @@
-"""Scan, look, scan again: a quick scan is judged by the monitor; one with alarms is repeated, then the full one runs.
+"""Scan, check, scan again: the monitor checks a quick scan. With alarms it is repeated; then the full scan runs.
 
 python inspect_and_rescan.py my.yaml cathode-3
 """

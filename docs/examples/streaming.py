@@ -1,4 +1,4 @@
-"""Streaming: a volume that grows with each view, of a running scan or a finished one. Writes streaming.png.
+"""Streaming: a volume that grows with each projection of a running or a finished scan. Writes streaming.png.
 
 python streaming.py runs/NAME/scan.h5
 """
@@ -14,11 +14,11 @@ from beamline import api
 path = sys.argv[1]
 AXIS = 79.5  # column of the rotation axis; `beamline align` measures it
 PIXEL = 0.0046  # mm
-SNAPSHOTS = (30, 60, 120)  # views
+SNAPSHOTS = (30, 60, 120)  # projections
 
 frames = {"DARK": [], "FLAT": [], "PROJECTION": []}
 references, fit, drawn = None, None, []
-for frame in api.stream(path):  # waits for the next one while the scan runs
+for frame in api.stream(path):  # waits for the next frame while the scan runs
     frames.setdefault(frame.kind.name, []).append(frame.counts)
     if frame.kind.name != "PROJECTION":
         continue
@@ -27,7 +27,7 @@ for frame in api.stream(path):  # waits for the next one while the scan runs
         fit = recon.StreamingFit(recon.Geometry.parallel([0.0], frame.counts.shape, pixel_pitch=PIXEL, axis_col=AXIS))
     line_integrals = recon.correct(frame.counts[None], [frame.index], references).data
     fit.add_views(line_integrals, [frame.angle])
-    at = fit.advance(0.02)  # s; a fit that is too slow for the scan falls behind it and costs it nothing
+    at = fit.advance(0.02)  # s; a fit that is too slow falls behind, and does not slow the scan down
     if at.n_views in SNAPSHOTS:
         drawn.append((at.n_views, fit.snapshot().data))
         print(f"{at.n_views:>4} views, {at.n_gaussians:>6} Gaussians; new views differ by {fit.unlearnt:.1%}")

@@ -1,4 +1,7 @@
-"""Search of the built pages: guides first, then other prose. Of the API names alone are searched, no descriptions."""
+"""The search of the built pages: guides come first, then other prose, then the API reference.
+
+The search looks only at the names in the API reference, not at its descriptions.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
 
 GUIDES = ("Start", "Tutorials", "How to")
-"""Groups of the navigation whose pages come first. Before a guide comes none that has its word less than BOOST times
-as often."""
+"""Groups of the navigation whose pages come first: another page comes before a guide only with a score over BOOST times
+as high."""
 BOOST = 4.0
 _ADD = "this.add(doc);"
 

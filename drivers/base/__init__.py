@@ -1,1 +1,1 @@
-"""Values that other packages may import: protocols of devices, frames, clocks and errors."""
+"""Base types that other packages may import: protocols of devices, frames, clocks and errors."""

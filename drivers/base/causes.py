@@ -1,6 +1,8 @@
-"""Causes: why a library does not load, a port does not open, and who else speaks on a line.
+"""Causes of failures: why a library does not load, why a port does not open, and which other service answers on a
+line.
 
-The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way on.
+The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way
+on.
 """
 
 from __future__ import annotations
@@ -12,33 +14,33 @@ from contextlib import suppress
 from pathlib import Path
 
 _LOADERS = (
-    (r"ELFCLASS(\d+)", "it is for {0} bits, and this Python is not", "Give the library for this Python"),
+    (r"ELFCLASS(\d+)", "it is a {0}-bit library, and this Python is not {0}-bit", "Use the library for this Python"),
     (
         r"^itself: cannot open|WinError 193|incompatible arch|mach-o",
-        "it is for another kind of computer, and this Python is of " + sysconfig.get_platform(),
-        "Give the library for this computer",
+        "it was built for another processor; this Python runs on " + sysconfig.get_platform(),
+        "Use the library for this processor",
     ),
     (
         r"([^\s:(]+): cannot open shared|Library not loaded: (\S+)",
-        "it needs {0}, which is not found",
-        "Install what has {0}, or add its folder to LD_LIBRARY_PATH",
+        "it needs {0}, which was not found",
+        "Install the package that contains {0}, or add its folder to LD_LIBRARY_PATH",
     ),
     (
         r"one of its dependencies|WinError 126",
-        "a library that it needs is not found",
+        "a library that it needs was not found",
         "Install the vendor's runtime again, with all its parts",
     ),
     (
         r"(?:undefined symbol:|symbol not found[^:]*:|version) (\S+)",
-        "it does not fit the other libraries here: {0} is missing",
-        "Install the version that was made for this system",
+        "it does not match the other libraries on this computer: {0} is missing",
+        "Install the version made for this operating system",
     ),
-    ("", "it is there, but no library that can be loaded", "Check the file, and the right to read it"),
+    ("", "the file exists but is not a library that can be loaded", "Check the file and the permission to read it"),
 )  # what the loaders of Linux (which calls one for another processor not found), macOS and Windows say
 
 
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
-    """Why a library is not loaded, and what to do; both empty where it is not there."""
+    """Why a library is not loaded, and what to do; both empty if it is not there."""
     for said, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
         if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
@@ -57,17 +59,19 @@ def of_port(url: str, problem: BaseException) -> str:
         ),
         (
             number in (errno.EACCES, errno.EPERM),
-            "This account has no right to it: ask for a udev rule that gives it to a group of yours (GROUP, MODE)",
+            "This account has no permission to use it: ask the administrator for a udev rule that gives "
+            "it to one of your groups (GROUP, MODE)",
         ),
         (
             number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # the latter on Windows
-            f"Another program holds it (on Linux, `fuser {url}` names it): close that",
+            f"Another program uses it (on Linux, `fuser {url}` names the program): close that program",
         ),
         (
             number == errno.ECONNREFUSED,
-            "Nothing listens there, or the server takes no further client: check the port's number, close others",
+            "No server answers at this port, or the server accepts no further client: check the port "
+            "number, and close other clients",
         ),
-        (True, "Check the cable, the port's name in the configuration and that no other program holds it"),
+        (True, "Check the cable, the name of the port in the configuration, and that no other program uses it"),
     )
     return next(advice for holds, advice in rows if holds)
 
@@ -77,7 +81,7 @@ TELNET = re.compile("\xff[\xf0-\xfe]")  # the beginning of its negotiation
 _FOREIGN = (  # searched in the URL, a line end, and what was heard
     (
         f"^socket:.*{TELNET.pattern}",  # on a serial line it is noise
-        "the server speaks Telnet (FF begins its negotiation)",
+        "the server speaks Telnet (FF starts its negotiation)",
         "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
     ),
     (
@@ -88,17 +92,17 @@ _FOREIGN = (  # searched in the URL, a line end, and what was heard
     (
         r"HTTP/\d|<html|SSH-\d",
         "a web or SSH server answers",
-        "Give the number of the port that leads to the serial line",
+        "Give the number of the port that is connected to the serial line",
     ),
     (
         r"already in use|(port|line) is (in use|busy)|too many (clients|connections|sessions)",
         "another client holds the server's port",
-        "Close the other program, or let the server take a second client",
+        "Close the other program, or configure the server to accept a second client",
     ),
     (
         rf"\n.*{NO_TEXT.pattern}",
         "it has bytes that are no text",
-        "Check the baud rate, the cable, and that the device is set to speak text",
+        "Check the baud rate, the cable, and that the device is set to a text protocol",
     ),
 )
 

@@ -1,4 +1,6 @@
-"""Clock: the time of devices and waits; an argument of every driver, so that a simulation can use its own."""
+"""Clock: the time that devices and waits use. Every driver takes it as an argument, so that a simulation can use its
+own.
+"""
 
 from __future__ import annotations
 

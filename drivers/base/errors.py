@@ -1,4 +1,4 @@
-"""DeviceError: the request, the reply, what was expected, what to do, and in which state the device was left."""
+"""DeviceError: an error of a device with request, reply, what was expected, what to do, and the state of the device."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # As a worker process sends it: with its parts, from which no message is made anew.
+        # As a worker process sends it: with its parts, from which no message is made again.
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:

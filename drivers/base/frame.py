@@ -1,4 +1,4 @@
-"""Frame: one detector image with its metadata; cameras, simulators and files all yield Frames."""
+"""Frame: one detector image with its metadata; cameras, simulators and files all deliver Frames."""
 
 from __future__ import annotations
 

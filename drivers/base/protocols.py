@@ -1,4 +1,6 @@
-"""Device Protocols: the interfaces of stage, camera, shutter and all that moves in the beam, in rad, s and keV."""
+"""Device Protocols: interfaces of stage, camera, shutter and devices that move in the beam; units are rad, s and
+keV.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,7 @@ class DigitalOutput(Protocol):
         """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
 
     def get(self) -> bool | None:
-        """Whether the line is high; None if the controller cannot read it back."""
+        """True if the line is high; None if the controller cannot read it back."""
 
 
 class RotationStage(Protocol):

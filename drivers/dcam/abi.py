@@ -1,4 +1,4 @@
-"""The DCAM-API v4 through ctypes: the library, with one Python method for each function that this driver calls."""
+"""DCAM-API v4 through ctypes: loads the library, with one Python method for each function that this driver calls."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
         Error.NOGRABBER: "Check the frame grabber and its driver",
         Error.FAILOPENCAMERA: "Close other programs that use the camera, then switch it off and on",
         Error.NOCONNECTION: "Check the camera's power and cable, then connect again",
-        Error.NOMEMORY: "Give the camera's ring fewer bytes or free memory",
-        Error.BUSY: "End other sessions with the camera in this process, or the capture that runs",
+        Error.NOMEMORY: "Give the camera's ring buffer fewer bytes, or free memory",
+        Error.BUSY: "End other sessions with the camera in this process, or the running capture",
         Error.FAILOPEN: "Close other programs that use the camera, then switch it off and on",
-        Error.TOOFREQUENTTRIGGER: "Turn the stage more slowly or expose for a shorter time: triggers come too fast",
+        Error.TOOFREQUENTTRIGGER: "Turn the stage more slowly or use a shorter exposure: triggers arrive too fast",
         Error.NOTRIGGER: "Check the trigger cable and its polarity",
         Error.DEVICEINITIALIZING: "The camera is still starting: wait half a minute and try again",
         Error.FRAMEGRABBER_NEEDS_FIRMWAREUPDATE: "Update the frame grabber's firmware with the vendor's tool",
@@ -86,7 +86,7 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
         Error.NEWAPIREQUIRED: "Install a newer DCAM-API runtime",
         Error.COOLINGTROUBLE: "Check the camera's fan and cooling water, and let it cool down",
         Error.TEMPERATURE_TROUBLE: "Check the camera's fan and cooling water, and let it cool down",
-        Error.LESSSYSTEMMEMORY: "Give the camera's ring fewer bytes or free memory",
+        Error.LESSSYSTEMMEMORY: "Give the camera's ring buffer fewer bytes, or free memory",
     }
 )
 
@@ -97,10 +97,10 @@ _STATE: Mapping[str, str] = MappingProxyType(
         "dcambuf_alloc": "The camera is not armed and no frame was taken",
         "dcamcap_start": "The camera is not armed and no frame was taken",
         "dcamcap_stop": "The camera may still capture; frames taken before are good",
-        "dcambuf_release": "The camera's ring is still held; frames taken before are good",
-        "dcamwait_close": "The camera may stay taken until this program ends",
-        "dcamdev_close": "The camera may stay taken until this program ends",
-        "dcamapi_uninit": "The camera may stay taken until this program ends",
+        "dcambuf_release": "The camera's ring buffer is still allocated; frames taken before are good",
+        "dcamwait_close": "The camera may remain reserved until this program ends",
+        "dcamdev_close": "The camera may remain reserved until this program ends",
+        "dcamapi_uninit": "The camera may remain reserved until this program ends",
         "dcamapi_init": "No camera was opened",
         "dcamdev_open": "No camera was opened",
         "dcamcap_firetrigger": "No frame was exposed",
@@ -176,9 +176,10 @@ def try_out(name: str, device: str) -> None:
     raise DeviceError(
         device,
         f"the camera's library {name} {how}",
-        advice="End other programs that use the camera, and switch it off and on. If it stays, install the vendor's "
-        "DCAM-API runtime anew, with the modules and drivers of this camera's interface alone",
-        state="It was tried in a process of its own, and nothing was changed",
+        advice="End other programs that use the camera, and switch it off and on. If the error persists, "
+        "reinstall the vendor's DCAM-API runtime, with only the modules and drivers of this camera's "
+        "interface",
+        state="The library was tested in a separate process, and nothing was changed",
     )
 
 
@@ -211,7 +212,7 @@ class Dcam:
             raise DeviceError(device, problem, advice=advice, state="Nothing was changed") from error
         missing = [call for call in ARGUMENTS if getattr(loaded, call, None) is None]
         if missing:
-            problem = f"{name} is not a DCAM-API version 4 library: it lacks {', '.join(missing)}"
+            problem = f"{name} is not a DCAM-API version 4 library: {', '.join(missing)} missing"
             raise DeviceError(
                 device, problem, advice="Check the library's path and version", state="Nothing was changed"
             )

@@ -1,4 +1,6 @@
-"""DcamCamera: a Hamamatsu camera over the DCAM-API, with a ring of buffers, one copy a frame and a check for losses."""
+"""DcamCamera: a Hamamatsu camera over the DCAM-API, with a ring buffer, one copy per frame, and detection of lost
+frames.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +110,7 @@ class DcamCamera:
         """
         self._require_open()
         if self._ring is not None:
-            raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
+            raise DeviceRefused(self.name, "it is already armed", advice="disarm() it first")
         if n_frames < 1:
             raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
         self.disarm()  # frees a ring that could not be freed before
@@ -125,7 +127,7 @@ class DcamCamera:
     def software_trigger(self) -> None:
         if self._ring is None or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "not armed" if self._ring is None else "armed"
-            problem = f"it accepts no software trigger ({armed}, trigger {self._settings.trigger})"
+            problem = f"it does not accept a software trigger ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         self._dcam.cap_firetrigger(self._camera)
 
@@ -146,8 +148,13 @@ class DcamCamera:
                     return frame
                 left = deadline - self._clock.now()
                 if left <= 0:
-                    problem = f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
-                    advice = "Check that triggers arrive, and are no closer together than the camera's shortest period"
+                    problem = (
+                        f"no frame arrived within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
+                    )
+                    advice = (
+                        "Check that triggers arrive, and that they are not closer together than the camera's "
+                        "shortest period"
+                    )
                     raise DeviceTimeout(self.name, problem, advice=advice, state="It is still armed")
                 self._await_event(min(left, _WAIT_SLICE))
 
@@ -224,7 +231,7 @@ class DcamCamera:
             if self._clock.now() > deadline:
                 raise DeviceTimeout(
                     self.name,
-                    f"{ring.arrived()} of 2 test frames came within {START_TIMEOUT:g} s in free run",
+                    f"only {ring.arrived()} of 2 test frames arrived within {START_TIMEOUT:g} s in free run",
                     expected=f"2 frames of {_TEST_SETTINGS.exposure:g} s",
                     advice="Check its cable, then switch it off and on",
                     state="Nothing was measured",
@@ -251,7 +258,7 @@ class DcamCamera:
         with self._ring_lock:
             ring = self._ring
             if ring is None:
-                raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
+                raise DeviceRefused(self.name, "it is not armed, so no frame will arrive", advice="arm() it first")
             state = ring.state()  # read before the ring, so that the last frame is not missed
             try:
                 taken = ring.take()

@@ -1,4 +1,4 @@
-"""Properties of one DCAM camera: set, read back and compare; the wait until its sensor is cold."""
+"""Properties of one DCAM camera: sets them, reads them back and compares; waits until the sensor is cold."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _REFUSALS = frozenset(
     )
 )
 """Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on their use."""
-_STATE = "No frame was taken with it; earlier frames are good"
+_STATE = "No frame was taken with this setting; earlier frames are good"
 
 
 class Properties:
@@ -92,7 +92,7 @@ class Properties:
                 request=f"{prop.name} = {value:g}",
                 reply=f"{accepted:g}",
                 expected=f"{value:g} within {tolerance:g}",
-                advice="Ask for a value that the camera has, or allow a larger exposure_tolerance",
+                advice="Choose a value that the camera has, or a larger exposure_tolerance",
                 state=_STATE,
             )
 
@@ -120,7 +120,7 @@ class Properties:
             request=f"{prop.name} = {value:g}",
             reply=reply,
             expected=f"another value, legal: {self._legal(prop)}",
-            advice="Choose one of them in the configuration",
+            advice="Choose one of the legal values in the configuration",
             state=_STATE,
         )
 
@@ -189,10 +189,10 @@ def _status(properties: Properties) -> Cooler:
 
 def _target(properties: Properties) -> str:
     target = properties.find(Property.SENSORTEMPERATURETARGET)
-    return "the cooler to be ready" if target is None else f"{target:.1f} °C"
+    return "the cooler to become ready" if target is None else f"{target:.1f} °C"
 
 
 def _steady(history: list[tuple[float, float]]) -> bool:
-    """Whether the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
+    """True if the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
     values = [value for _, value in history]
     return history[-1][0] - history[0][0] >= STEADY_FOR and max(values) - min(values) <= STEADY_BAND

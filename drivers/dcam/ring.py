@@ -1,4 +1,6 @@
-"""Ring: the library's ring of frame buffers during one capture; frames are taken in order, with one copy each."""
+"""Ring buffer: the frame buffers of the DCAM library during one capture; frames are read in order, with one copy
+each.
+"""
 
 from __future__ import annotations
 
@@ -75,11 +77,11 @@ class Ring:
         if self._count < before:
             raise DeviceError(
                 self._device,
-                f"its count of frames went back from {before} to {self._count}",
+                f"its frame counter went back from {before} to {self._count}",
                 request="dcamcap_transferinfo",
-                expected="a count that only increases during a capture",
+                expected="a counter that only increases during a capture",
                 advice="Check that no other program uses the camera, then arm it again",
-                state=f"{self._next} frames of this run were taken before",
+                state=f"{self._next} frames of this run were taken earlier",
             )
         return self._count
 
@@ -121,25 +123,25 @@ class Ring:
             self._overrun_reported = True
             raise DeviceError(
                 self._device,
-                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers {first} to "
-                f"{oldest - 1} of this run in the order of arrival",
-                expected="every frame to be taken before the ring overwrites it",
-                advice="Take frames faster, trigger more slowly or give the ring more memory",
-                state="Later frames can still be taken",
+                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers "
+                f"{first} to {oldest - 1} of this run in the order of arrival",
+                expected="every frame to be read before the ring buffer overwrites it",
+                advice="Read frames faster, trigger more slowly, or give the ring buffer more memory",
+                state="Later frames can still be read",
             )
 
     def _copy(self, frame: BufFrame) -> NDArray[np.uint16]:
         """Copy a frame, uint16 [row, col], out of the ring, where rows may be padded."""
         rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
         if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
-            problem = f"it returns a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes a row"
+            problem = f"it returned a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes per row"
             raise DeviceError(
                 self._device,
                 problem,
                 request="dcambuf_lockframe",
                 expected="whole rows of 16-bit pixels",
                 advice=f"{RUNTIME}, and that no other program sets the camera",
-                state=f"{self._next} frames of this run were taken before",
+                state=f"{self._next} frames of this run were taken earlier",
             )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
         pixels = self._memory.take((rows, cols))
@@ -162,10 +164,10 @@ def require_stamps(first: BufFrame, second: BufFrame, device: str) -> None:
         return
     raise DeviceError(
         device,
-        f"it does not count and date its frames: framestamps {first.framestamp}, {second.framestamp}, "
-        f"times {seconds_of(first):.6f} s, {seconds_of(second):.6f} s",
+        f"its frames have no usable counter and time: framestamps {first.framestamp}, "
+        f"{second.framestamp}, times {seconds_of(first):.6f} s, {seconds_of(second):.6f} s",
         request="2 frames in free run",
-        expected="framestamps one apart and times that grow, without which a lost frame cannot be seen",
+        expected="framestamps one apart and increasing times; without them a lost frame cannot be detected",
         advice="Update the camera's firmware and the vendor's DCAM-API runtime",
         state="Nothing was measured",
     )

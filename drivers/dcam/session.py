@@ -1,4 +1,4 @@
-"""Session: looks for the camera on USB, starts the library, opens one camera and its wait handle, and closes them."""
+"""Session: finds the camera on USB, starts the library, opens one camera and its wait handle, and closes them."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Session:
                 "DCAM finds no camera",
                 request=error.request,
                 reply=codes.error_name(error.code),
-                expected="a camera that is switched on and has started",
+                expected="a camera that is switched on and has started up",
                 advice=f"Switch the camera on and check its cable. {preflight().message}",
                 state="Nothing was changed",
             ) from error
@@ -161,14 +161,14 @@ def preflight(
     try:
         connected = [_describe(device) for device in usb.core.find(find_all=True, backend=backend, **fields)]
     except usb.core.NoBackendError:
-        return Preflight(Verdict.UNKNOWN, "USB cannot be checked: libusb is not installed on this machine.")
+        return Preflight(Verdict.UNKNOWN, "USB cannot be checked, because libusb is not installed on this computer.")
     except usb.core.USBError as error:
         return Preflight(Verdict.UNKNOWN, f"USB cannot be checked: {error}.")
     # A device whose serial number cannot be read may be the requested one.
     devices = tuple(device for device in connected if not (serial and device.serial and device.serial != serial))
     if not devices:
         which = f"{wanted} with serial number {serial}" if serial else wanted
-        message = f"No USB device {which} is connected (a CoaXPress camera does not show on USB)."
+        message = f"No USB device {which} is connected (CoaXPress cameras are not USB devices)."
         return Preflight(Verdict.ABSENT, message)
     if len(devices) > 1:
         message = (
@@ -177,9 +177,9 @@ def preflight(
         return Preflight(Verdict.AMBIGUOUS, message, devices)
     (device,) = devices
     if not device.speed:
-        return Preflight(Verdict.UNKNOWN, f"USB device {device} is connected; its link speed cannot be read.", devices)
+        return Preflight(Verdict.UNKNOWN, f"USB device {device} is connected; its link speed is unknown.", devices)
     if device.speed < usb.util.SPEED_SUPER:
-        message = f"USB device {device} needs a SuperSpeed link (5 Gbit/s): use another cable or a USB 3 port."
+        message = f"Use another cable or a USB 3 port: USB device {device} needs a SuperSpeed link (5 Gbit/s)."
         return Preflight(Verdict.SLOW, message, devices)
     return Preflight(Verdict.READY, f"USB device {device} is connected.", devices)
 

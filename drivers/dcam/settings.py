@@ -125,7 +125,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             device,
             problem,
             expected=f"another one, legal: {', '.join(_READOUTS)}",
-            advice="Choose one of them in the configuration",
+            advice="Choose one of the legal values in the configuration",
             state="Its settings were not changed",
         )
     # Sensor mode and speed first: they change the ranges of the others.
@@ -143,13 +143,13 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     properties.set_exactly(Property.BINNING, settings.binning)
     _apply_roi(properties, device, settings.roi)
     if properties.find(Property.FRAMEBUNDLE_MODE) == codes.ON:
-        problem = "the camera bundles several frames of this size into one transfer, which this driver cannot separate"
+        problem = "the camera combines several frames of this size into one transfer, which this driver cannot separate"
         raise DeviceRefused(
             device,
             problem,
             request=f"a region of {settings.roi or 'the whole sensor'}",
             expected="FRAMEBUNDLE_MODE off",
-            advice="Ask for a larger region of interest",
+            advice="Choose a larger region of interest",
             state="No frame was taken",
         )
     sensor_rows = properties.get(Property.IMAGE_HEIGHT) * settings.binning
@@ -228,7 +228,7 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     properties.set_exactly(Property.SUBARRAYHPOS, 0)
     height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))
     if not (0 <= row0 <= height - rows and 0 <= col0 <= width - cols):
-        problem = f"the region {roi} (row0, col0, rows, cols) does not lie on the sensor"
+        problem = f"the region {roi} (row0, col0, rows, cols) extends beyond the sensor"
         raise DeviceRefused(
             device,
             problem,

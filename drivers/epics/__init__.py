@@ -1,1 +1,1 @@
-"""EPICS: process variables by PVAccess and Channel Access, and the devices behind them that are no stages."""
+"""EPICS: process variables over PVAccess and Channel Access, and the devices behind them except stages."""

@@ -1,4 +1,4 @@
-"""Process variables, or records by their fields, over PVAccess (p4p) or Channel Access (aioca)."""
+"""EPICS process variables, and records with their fields, over PVAccess (p4p) or Channel Access (aioca)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 INVALID = 3
 """The severity of a value that the IOC does not vouch for: its hardware does not answer, or it was never set."""
 UNREACHABLE = (
-    "Check the name, that its IOC runs, and which hosts are asked: EPICS_PVA_ADDR_LIST for pva://, EPICS_CA_ADDR_LIST "
-    "for ca://"
+    "Check the name, that its IOC is running, and which hosts are searched: EPICS_PVA_ADDR_LIST for "
+    "pva://, EPICS_CA_ADDR_LIST for ca://"
 )
 
 
@@ -36,7 +36,7 @@ class PvValue:
         return self.label or f"{self.value}"
 
     def is_one(self, wanted: float | str) -> bool:
-        """Whether the value equals this number, text or label."""
+        """True if the value equals this number, text or label."""
         return wanted in (self.value, self.label) if self.label else self.value == wanted
 
 
@@ -78,7 +78,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
         library = getattr(error, "name", None) or f"for {scheme}://"
         raise DeviceError(
             device,
-            f"{url} needs the library {library}, which cannot be loaded here ({error})",
+            f"{url} needs the library {library}, which cannot be loaded ({error})",
             advice='pip install "splatline[epics]"',
             state="Nothing was asked",
         ) from error
@@ -88,7 +88,7 @@ def url_problem(url: str) -> str:
     """Why a URL names no process variable; "" if it names one."""
     scheme, _, name = url.partition("://")
     legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
-    return "" if legal else f"{url!r} names no process variable; expected pva://NAME (PVAccess) or ca://NAME"
+    return "" if legal else f"{url!r} does not name a process variable; expected pva://NAME (PVAccess) or ca://NAME"
 
 
 def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> None:
@@ -96,7 +96,7 @@ def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> N
     if value.severity >= INVALID:
         raise DeviceError(
             device,
-            f"{name} has an INVALID alarm: its IOC does not vouch for the value",
+            f"{name} has an INVALID alarm: its IOC does not guarantee the value",
             reply=str(value),
             advice="Check the record in its control screen: the IOC lost its controller, or the record was never set",
             state=state,
@@ -118,7 +118,7 @@ class _Errors:
     def refused(self, request: str, reply: object) -> NoReturn:
         raise DeviceError(
             self.device,
-            "the process variable refuses the request",
+            "the process variable rejected the request",
             request=request,
             reply=str(reply),
             advice="Check its access rights and that its record is enabled (DISP, DISA)",

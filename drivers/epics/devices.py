@@ -1,4 +1,4 @@
-"""Shutter, filter, monochromator and beam monitor behind process variables."""
+"""Shutter, filter, monochromator and beam monitor that are controlled by EPICS process variables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse
 from recon.base.setting import CheckedSettings, setting
 
 POLL = 0.05  # s between looks at a shutter that moves
-NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
 
 
 class _PvDevice:
@@ -56,14 +56,20 @@ class ShutterPvs(CheckedSettings):
 
     open_pv: str = setting(problem=url_problem)
     status_pv: str = setting(
-        doc="Where the blade itself is read; open_pv where there is nothing better.", problem=url_problem
+        doc="Process variable with the state of the blade itself; open_pv if there is none.", problem=url_problem
     )
-    close_pv: str | None = setting(None, "null: open_pv, which then takes both values.", problem=url_problem)
+    close_pv: str | None = setting(
+        None,
+        "Process variable that closes the shutter; null: open_pv, which then takes both values.",
+        problem=url_problem,
+    )
     open_value: float | str = setting(1.0, "Written to open_pv to open it: a number, a text or a label.")
     close_value: float | str = setting(0.0)
-    status_open: float | str = setting(1.0, "Its value or label while the shutter is open; anything else is closed.")
-    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = setting(10.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
+    status_open: float | str = setting(
+        1.0, "Its value or label while the shutter is open; any other value counts as closed."
+    )
+    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = setting(10.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
 
 
 class PvShutter(_PvDevice):
@@ -92,7 +98,7 @@ class PvShutter(_PvDevice):
         self._put(self._closer, self._pvs.close_value, False, lambda: None)
 
     def is_open(self) -> bool:
-        """Whether the status is open. Raises DeviceTimeout without an answer, DeviceError if the alarm is INVALID."""
+        """True if the status is open. Raises DeviceTimeout without an answer, DeviceError if the alarm is INVALID."""
         (status,) = self._status.read("")
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)
@@ -112,7 +118,7 @@ class PvShutter(_PvDevice):
                 request=request,
                 reply=f"{self._status.name} is {status}",
                 expected=f"{'' if wanted else 'another value than '}{self._pvs.status_open}",
-                advice="Check its permit, its interlock and the ring, and that this computer may write to it",
+                advice="Check its permit, its interlock and the ring, and that this computer has write access",
                 state=NOT_KNOWN,
             )
 
@@ -123,11 +129,13 @@ class FilterPvs(CheckedSettings):
 
     pv: str = setting(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
     status_pv: str | None = setting(
-        None, "Where the filter itself is read, with the same values; null: pv.", problem=url_problem
+        None,
+        "Process variable with the position of the filter itself, in the same values; null: pv.",
+        problem=url_problem,
     )
     places: Mapping[str, float | str] = setting(doc="Name: value.", min_length=1)
-    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = setting(30.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
+    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = setting(30.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
 
 
 class PvFilter(_PvDevice):
@@ -156,11 +164,11 @@ class PvFilter(_PvDevice):
         if not self._waited(lambda: self.place() == place, self._pvs.travel):
             raise DeviceTimeout(
                 self.name,
-                f"it did not come to {place} within {self._pvs.travel:g} s",
+                f"it did not reach {place} within {self._pvs.travel:g} s",
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
-                advice="Look where it is, and whether this computer may write to it",
+                advice="Check where it is, and whether this computer has write access",
             )
 
     def remember_place(self) -> Callable[[], str]:
@@ -169,7 +177,7 @@ class PvFilter(_PvDevice):
 
         def moved() -> str:
             now = self._status_now()
-            return "" if now.value == before.value else f"{self._status.name} was {before}, and is {now}"
+            return "" if now.value == before.value else f"{self._status.name} was {before}, and is now {now}"
 
         return moved
 
@@ -187,17 +195,19 @@ class MonochromatorPvs(CheckedSettings):
     """The process variables of a monochromator, as pva://NAME or ca://NAME; times in s, `tolerance` in eV."""
 
     pv: str = setting(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)
-    status_pv: str = setting(doc="Where the energy itself is read.", problem=url_problem)
-    stop_pv: str | None = setting(None, "Takes a 1 that stops it; null: it cannot be stopped.", problem=url_problem)
-    unit: EnergyUnit = setting(EnergyUnit.KEV, "Of pv and status_pv.")
+    status_pv: str = setting(doc="Process variable with the energy itself.", problem=url_problem)
+    stop_pv: str | None = setting(
+        None, "Process variable that stops it if 1 is written; null: it cannot be stopped.", problem=url_problem
+    )
+    unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
     tolerance: float = setting(
-        0.5, "Most difference of the energy from the one that was asked for.", unit="ev", gt=0, le=1e4
+        0.5, "Largest difference between the energy and the one that was asked for.", unit="ev", gt=0, le=1e4
     )
     settle: float = setting(
-        1.0, "Time that it must stay within tolerance_ev before the move has ended.", unit="s", ge=0, le=1e6
+        1.0, "How long it must stay within tolerance_ev before a move counts as finished.", unit="s", ge=0, le=1e6
     )
     timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = setting(60.0, "The longest that a move may take.", unit="s", gt=0, le=1e6)
+    travel: float = setting(60.0, "Longest time of a move.", unit="s", gt=0, le=1e6)
 
     @property
     def per_kev(self) -> float:
@@ -226,7 +236,7 @@ class PvMonochromator(_PvDevice):
             return float(status.value) / self._pvs.per_kev
         except ValueError:
             raise DeviceError(
-                self.name, f"{self._status.name} is no number", reply=str(status), expected="an energy"
+                self.name, f"{self._status.name} is not a number", reply=str(status), expected="an energy"
             ) from None
 
     def move_to(self, energy: float) -> None:
@@ -245,11 +255,11 @@ class PvMonochromator(_PvDevice):
             raise
         raise DeviceTimeout(
             self.name,
-            f"it did not come to {energy:.7g} keV and stay there within {pvs.travel:g} s",
+            f"it did not reach {energy:.7g} keV and stay there within {pvs.travel:g} s",
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
-            advice="Look where it is, and whether this computer may write to it",
+            advice="Check where it is, and whether this computer has write access",
         )
 
     def stop(self) -> None:
@@ -264,7 +274,7 @@ class PvMonochromator(_PvDevice):
         def moved() -> str:
             if self._waited(lambda: self._is_at(before), self._pvs.settle):
                 return ""
-            return f"it stood at {before:.7g} keV, and is at {self.energy():.7g} keV"
+            return f"it was at {before:.7g} keV, and is now at {self.energy():.7g} keV"
 
         return moved
 

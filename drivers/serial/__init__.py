@@ -1,1 +1,1 @@
-"""Serial lines: framing, ports, transcripts."""
+"""Serial lines: requests and replies, ports, and transcripts of the dialogue."""

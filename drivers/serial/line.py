@@ -1,4 +1,4 @@
-"""SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or a simulator's sim://.
+"""SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or sim:// of a simulator.
 
 Three rules keep requests and replies in step: one request at a time, a finite timeout, and every reply must match the
 form expected. After a timeout or a reply of another form, received data are discarded until the device has answered a
@@ -52,8 +52,8 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
     return port
 
 
-_SILENT = "Check power, cable and baud rate; the next request first brings the line into step again"
-_SERVER = ". Many terminal servers serve one client: another program may hold this port"
+_SILENT = "Check power, cable and baud rate; the next request first synchronises the line again"
+_SERVER = ". Many terminal servers allow one client only: another program may use this port"
 NEVER = r"(?!)"  # A form that no line has
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
@@ -131,7 +131,7 @@ class SerialLine:
             raise DeviceError(
                 device,
                 f"the transcript {str(transcript)!r} cannot be written: {problem}",
-                advice="Name a file in a folder that exists, or none",
+                advice="Name a file in an existing folder, or no file",
                 state="Nothing was sent",
             ) from problem
         try:
@@ -195,14 +195,17 @@ class SerialLine:
                 for _ in range(RECENT_LINES if self._socket else 0):  # what else a server says tells what it is
                     self._reader.line(self._clock.now() + QUIET)
             if text is None:
-                what, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
+                what, received = (
+                    f"no whole reply within {self._timeout:g} s",
+                    self._reader.incomplete[:80],
+                )
                 advice = _SILENT + (_SERVER if self._socket else "")
             elif isinstance(text, Damaged):
                 what, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
                 what, received = "the reply does not have the form it must have", text
-                advice = "The line may be disturbed, or the device may be another model"
+                advice = "There may be noise on the line, or the device may be another model"
             raise self._error(
                 DeviceTimeout if text is None else DeviceError,
                 what,
@@ -259,15 +262,15 @@ class SerialLine:
                 request=request,
                 reply=line,
                 expected="one reply",
-                advice="Two controllers on this line have the same address: give each its own, or unplug one",
-                state=f"{state}. Both did what was asked before",
+                advice="Two controllers on this line have the same address: give each its own address, or unplug one",
+                state=f"{state}. Both carried out earlier requests",
             )
 
     def _wait_for_quiet(self, request: str, state: str) -> None:
         if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):
             raise self._error(
                 DeviceTimeout,
-                "it sends without pause and without a request",
+                "it sends continuously, without a request",
                 request=request,
                 expected="a silent line before the next request",
                 advice="Check the baud rate and that the port is this device's",
@@ -285,7 +288,7 @@ class SerialLine:
     @contextlib.contextmanager
     def _port_errors(self, request: str) -> Iterator[None]:
         """Turn errors of the port into errors of the device."""
-        state = "The device may still be doing what it did before"
+        state = "The device may still be carrying out the earlier request"
         try:
             yield
         except serial.SerialTimeoutException as problem:
@@ -293,7 +296,7 @@ class SerialLine:
                 DeviceTimeout,
                 f"it accepted no bytes for {self._timeout:g} s",
                 request=request,
-                expected="a device that accepts what is sent",
+                expected="a device that accepts data",
                 advice="Check power, cable and flow control (none is expected)",
                 state=state,
             ) from problem
@@ -303,11 +306,11 @@ class SerialLine:
                 f"the port failed: {error}{'; the other side closed the connection' if self._socket else ''}",
                 request=request,
                 expected="a port that stays open",
-                advice="Let the server keep a connection without traffic (idle time 0), and see that no other client "
-                "takes its port. Then start again"
+                advice="Configure the server to keep idle connections (idle time 0), and check that no other "
+                "client uses its port. Then start again"
                 if self._socket
-                else "Check that the cable or adapter is still plugged in, then start again. "
-                f"Serial ports of this computer: {serial_ports()}",
+                else "Check that the cable or adapter is plugged in, then start again. Serial ports of this "
+                f"computer: {serial_ports()}",
                 state=state,
             ) from error
 

@@ -1,4 +1,4 @@
-"""LineReader: lines and replies from the bytes of a port, with a deadline. Transcript: record of the dialogue."""
+"""LineReader: reads lines and replies from a port, with a time limit. Transcript: record of the dialogue."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Rotation stages: one folder a controller."""
+"""Rotation stages: one folder per controller."""

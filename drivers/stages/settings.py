@@ -35,20 +35,22 @@ class StageFigures(CheckedSettings):
 
     stand_in: ClassVar[str] = ""
     """The kind of stage that is simulated in the place of this one; "": this one has a simulated controller itself."""
-    counts_per_turn: int = setting(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
+    counts_per_turn: int = setting(
+        doc="Motor pulses or encoder counts per 360 deg; triggers are possible only on whole ones.", gt=0
+    )
     max_speed: float = setting(unit="deg_s", gt=0)
     acceleration: float = setting(unit="deg_s2", gt=0)
     low: float = setting(-5.0, unit="deg")
-    high: float = setting(365.0, "The stage is never sent beyond low_deg and high_deg.", unit="deg")
+    high: float = setting(365.0, "Limits of the stage: it never moves beyond low_deg and high_deg.", unit="deg")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
             if not rate * self.per_radian < MOST:
-                raise ValueError(f"{rate:g} rad is not a possible {meaning} of a stage")
+                raise ValueError(f"{rate:g} rad is impossible as {meaning} of a stage")
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
-            raise ValueError(f"from {low:g} to {high:g} deg there is no room to move")
+            raise ValueError(f"low_deg {low:g} and high_deg {high:g} leave no room to move")
         if not (self.high - self.low) * self.per_radian < MOST:
             raise ValueError(
                 f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can resolve"
@@ -96,12 +98,14 @@ class Wiring(CheckedSettings):
     The baud rate is the controller's, nominal over USB and TCP.
     """
 
-    timeout: float = setting(1.0, "For a reply.", unit="s", gt=0)
+    timeout: float = setting(1.0, "Longest wait for a reply.", unit="s", gt=0)
     baudrate: int = setting(115_200, gt=0)
     pulse_width: float | None = setting(
         None, "Width of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
     )
-    active_high: bool = setting(True, "Trigger pulses are high; refused where the controller has no such choice.")
+    active_high: bool = setting(
+        True, "true: trigger pulses are high. The driver stops with an error if the controller cannot do what is set."
+    )
     transcript: Path | None = setting(
         None, "A file to which every byte to and from the controller is appended with its time; null: none."
     )
@@ -129,7 +133,7 @@ class StageSettings(Protocol):
 
     @property
     def pulse_output(self) -> int | None:
-        """Number of the digital output that the trigger pulses come from; None where no output can be set."""
+        """Number of the digital output that the trigger pulses come from; None if no output can be set."""
 
     def limits(self) -> StageLimits:
         """The stage's limits, as far as they are known before it is connected."""

@@ -1,4 +1,4 @@
-"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
+"""Code that all stages share: positions, stops, waiting for the end of a move, and restoring settings.
 
 Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
 program that is killed leaves its speed in the controller, and the next one would take it for the original.
@@ -43,8 +43,8 @@ class FoundSettings:
             whole.replace(file)
         if changed:
             self.notice = (
-                f"a program that was killed, or lost this stage, left {', '.join(changed)}; "
-                "what stood there before is restored at the end"
+                f"a program that was killed, or lost this stage, changed {', '.join(changed)}; the values "
+                "from before are restored at the end"
             )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
@@ -83,7 +83,7 @@ class Stops:
 
     @property
     def came_since(self) -> bool:
-        """Whether a stop came since the last move began."""
+        """True if a stop came since the last move began."""
         return self.count != self._before
 
     def came(self, *, hard: bool) -> None:
@@ -113,9 +113,9 @@ class Stops:
         if came:
             raise DeviceError(
                 self._name,
-                f"{purpose} was stopped while it was started",
-                advice="Find who stopped it before moving on",
-                state="The stop was sent again: it stands, or slows down to stand",
+                f"{purpose} was stopped while it was starting",
+                advice="Find who stopped it before you move it again",
+                state="The stop was sent again: the stage has stopped, or is slowing down",
             ) from problem
         if problem is not None:
             raise problem
@@ -159,7 +159,7 @@ def refuse_another(name: str, wanted: str | None, serial: str) -> None:
     if wanted is not None and serial != wanted:
         raise DeviceRefused(
             name,
-            f"another device answers: its serial number is {serial or 'not told'}",
+            f"another device answered: its serial number is {serial or 'unknown'}",
             expected=f"{wanted}, as configured",
             advice="Check whether cables or ports were swapped, or correct `serial` in the configuration",
             state="Nothing has moved",
@@ -172,8 +172,8 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
         name,
         f"{purpose} is not possible while it moves",
         reply=reply,
-        advice="Wait for the move to end, or stop it",
-        state=f"The move under way goes on; it is at {counts} counts",
+        advice="Wait until the move ends, or stop it",
+        state=f"The current move continues; it is at {counts} counts",
     )
 
 

@@ -1,4 +1,4 @@
-"""Travel of a stage: radians and whole counts, soft limits, and the refusal of impossible moves and trains."""
+"""Travel of a stage: converts radians to whole counts, and raises errors for moves and trains beyond the limits."""
 
 from __future__ import annotations
 
@@ -112,7 +112,9 @@ class Travel:
         uneven = train.n > 1 and interval % self.limits.interval_unit != 0
         within = all(self.low <= at <= self.high for at in (train.start, train.end))
         if train.n < 1 or interval == 0 or close or uneven or not within:
-            raise self.cannot_emit(train, advice="A lower max_speed lets pulses be closer" if close else "")
+            raise self.cannot_emit(
+                train, advice="A lower max_speed allows pulses that are closer together" if close else ""
+            )
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
         """The error for a train that the stage cannot emit, with the conditions for trains."""
@@ -121,10 +123,10 @@ class Travel:
         return DeviceRefused(
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
-            expected=f"one or more, not closer than {self.limits.pulse_spacing:g} s at full speed, which are {least} "
-            f"counts,{multiple} all within {self.span}",
+            expected=f"one or more, not closer than {self.limits.pulse_spacing:g} s at full speed, which are "
+            f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
-            state="This train is not armed and nothing was sent for it; the stage stands where the last move left it",
+            state="This train is not armed and nothing was sent for it; the stage is where the last move ended",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
@@ -134,11 +136,11 @@ class Travel:
         """
         here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
-            problem = f"it stands at {here}, at or past the first pulse at {self.degrees(train.start)}"
-            advice = "Move to before the first pulse, then arm"
+            problem = f"it is at {here}, at or past the first pulse at {self.degrees(train.start)}"
+            advice = "Move to a place before the first pulse, then arm"
         elif opening is not None and train.interval * (opening - counts) <= 0:
-            problem = f"it stands at {here}, at or past {self.degrees(opening)}, where pulses are let through"
-            advice = f"Move back by {self.degrees(abs(train.interval))} at least, then arm"
+            problem = f"it is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
+            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then arm"
         else:
             return
         raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
@@ -158,10 +160,10 @@ class Travel:
         """The error of a wait that ended after its timeout (s), before the stage has arrived."""
         return DeviceTimeout(
             self.name,
-            f"still moving after {timeout:g} s",
+            f"it is still moving after {timeout:g} s",
             request=request,
             reply=reply,
-            expected=f"to stand at {aim}" if aim else "",
+            expected=f"to be at {aim}" if aim else "",
             advice="Allow more time, or stop it",
             state=f"It was left moving and is at {self.degrees(counts)}",
         )
@@ -170,7 +172,7 @@ class Travel:
         """The error of a stop if the stage does not stand within `timeout` s."""
         return DeviceTimeout(
             self.name,
-            f"still moving {timeout:.1f} s after the stop command",
+            f"it is still moving {timeout:.1f} s after the stop command",
             request=request,
             advice="Abort, or use the emergency stop",
             state=f"It is moving, at {self.degrees(counts)}",

@@ -1,4 +1,4 @@
-"""Conformance suites: the laws for every driver of a camera or a stage, as pytest classes that its tests subclass.
+"""Conformance tests for drivers of cameras and stages, as pytest classes that the tests of a driver subclass.
 
 They need pytest, and import neither simulators nor beamline.
 """

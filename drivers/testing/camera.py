@@ -1,6 +1,7 @@
-"""Laws for every camera, real or simulated: the suite that each camera's tests subclass.
+"""Conformance tests for every camera, real or simulated; the tests of a camera subclass them.
 
-A subclass gives `bench`, a fixture that makes a CameraBench anew for each test. Frames are small and exposures short.
+A subclass gives `bench`, a fixture that makes a CameraBench again for each test. Frames are small and exposures
+short.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Quality of a volume: against a truth, and against the time spent."""
+"""Quality of a volume: compared with a ground truth, and with the time spent."""

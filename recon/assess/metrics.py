@@ -1,4 +1,4 @@
-"""Quality of a volume: against a truth (PSNR, SSIM, NRMSE), and without one (SNR and CNR of dense and empty parts)."""
+"""Quality of a volume: PSNR, SSIM and NRMSE with a ground truth; SNR and CNR without one."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from scipy import ndimage
 
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
-_BLURRED = 1.0  # voxels: of a reference, so that its noise does not decide which voxels are dense
-_SLAB = 32  # slices at a time
-_MOST = 2**21  # voxels at most that regions and their noise are computed from
-SUMMED_VALUES = 2**22  # values whose errors are summed at a time
-_RIM = 2  # voxels at the edge of a region, where its surroundings blur into it
+_BLURRED = 1.0  # voxels; blur of a reference, so that its noise does not decide which voxels are dense
+_SLAB = 32  # number of slices at a time
+_MOST = 2**21  # largest number of voxels from which regions and their noise are computed
+SUMMED_VALUES = 2**22  # number of values whose errors are summed at a time
+_RIM = 2  # voxels at the edge of a region, into which the surroundings are blurred
 
 Array = NDArray[np.floating]
 
 
 def _same_shape(truth: Array, volume: Array) -> None:
     if truth.shape != volume.shape or truth.size == 0:
-        raise ValueError(f"truth has shape {truth.shape}, the volume {volume.shape}; they must be equal")
+        raise ValueError(
+            f"the ground truth has shape {truth.shape}, the volume {volume.shape}; both must have the same shape"
+        )
 
 
 def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
@@ -29,12 +31,14 @@ def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
 
     Args:
         truth, volume: the same shape, any number of dimensions.
-        peak: None: the maximum of the truth.
+        peak: None: the maximum of the ground truth.
     """
     _same_shape(truth, volume)
     top = float(truth.max()) if peak is None else peak
     if not top > 0:
-        raise ValueError(f"the peak must be positive, got {top}; give one where the truth has no positive value")
+        raise ValueError(
+            f"the peak must be positive, got {top}; state the peak if the ground truth has no positive value"
+        )
     error = _squared_error(truth, volume) / truth.size
     return float(10 * np.log10(top**2 / error)) if error else float("inf")
 
@@ -46,18 +50,18 @@ def _squared_error(truth: Array, volume: Array) -> float:
 
 
 def nrmse(truth: Array, volume: Array) -> float:
-    """Root mean squared error over the root mean square of the truth: ‖volume - truth‖ / ‖truth‖."""
+    """Root mean squared error divided by the root mean square of the ground truth: ‖volume - truth‖ / ‖truth‖."""
     _same_shape(truth, volume)
     norm = np.sqrt(_squared_error(np.broadcast_to(truth.dtype.type(0), truth.shape), truth))
     if norm == 0:
-        raise ValueError("the truth is zero everywhere: a relative error is not defined")
+        raise ValueError("a relative error is not defined, because the ground truth is zero everywhere")
     return float(np.sqrt(_squared_error(truth, volume)) / norm)
 
 
 def _data_range(truth: Array, data_range: float | None) -> float:
     span = float(truth.max() - truth.min()) if data_range is None else data_range
     if not span > 0:
-        raise ValueError(f"the data range must be positive, got {span}; give one where the truth is constant")
+        raise ValueError(f"the data range must be positive, got {span}; state it if the ground truth is constant")
     return span
 
 
@@ -70,7 +74,7 @@ def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[
         return image
 
     c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
-    # Subtract the means first: E[x²] - E[x]² of values far from zero would be rounding noise.
+    # Subtract the means first, because E[x²] - E[x]² of values far from zero would be rounding noise.
     base_x, base_y = x.mean(), y.mean()
     x, y = x - base_x, y - base_y
     mean_x, mean_y = blur(x), blur(y)
@@ -89,8 +93,8 @@ def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[
 def ssim2d(truth: Array, image: Array, data_range: float | None = None) -> float:
     """Mean structural similarity of two images (Wang et al. 2004, eq. 13), 1 for equal ones.
 
-    Gaussian window of 11 x 11 with σ = 1.5, K1 = 0.01, K2 = 0.03, variances without Bessel's correction, the mean over
-    windows that lie inside the image. Along an axis shorter than the window the image is mirrored.
+    Gaussian window of 11 x 11 with σ = 1.5, K1 = 0.01, K2 = 0.03, variances without Bessel's correction, and the mean
+    over windows inside the image. If an axis is shorter than the window, the image is mirrored along it.
 
     Args:
         truth, image: [row, col].
@@ -110,7 +114,7 @@ def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> floa
 
     Args:
         truth, volume: [z, y, x].
-        data_range: one for all slices; None: maximum - minimum of the whole truth.
+        data_range: the same for all slices; None: maximum - minimum of the whole ground truth.
     """
     _same_shape(truth, volume)
     if truth.ndim != 3:
@@ -130,10 +134,10 @@ def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> floa
 
 
 def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
-    """SSIM with each slice as one window: its mean, variance and covariance (Wang et al. 2004, eq. 13).
+    """SSIM with each slice as one window, from its mean, variance and covariance (Wang et al. 2004, eq. 13).
 
     Args:
-        truth, volume: [z, y, x]; the range of the data is that of the whole truth.
+        truth, volume: [z, y, x]; the data range is that of the whole ground truth.
     """
     _same_shape(truth, volume)
     span = _data_range(truth, None)
@@ -144,14 +148,14 @@ def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
         for first, second in zip(np.moveaxis(truth, across, 0), np.moveaxis(volume, across, 0), strict=True):
             x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
             covariance = ((x - x.mean()) * (y - y.mean())).mean()
-            light = (2 * x.mean() * y.mean() + c1) / (x.mean() ** 2 + y.mean() ** 2 + c1)
-            by_slice.append(light * (2 * covariance + c2) / (x.var() + y.var() + c2))
+            luminance = (2 * x.mean() * y.mean() + c1) / (x.mean() ** 2 + y.mean() ** 2 + c1)
+            by_slice.append(luminance * (2 * covariance + c2) / (x.var() + y.var() + c2))
         means.append(np.mean(by_slice))
     return float(np.mean(means))
 
 
 def sampled(volume: Array) -> Array:
-    """Every k-th voxel along each axis, as a view, so that a large volume has at most 2^21 of them; else all."""
+    """Every k-th voxel along each axis (a numpy view), so that at most 2^21 voxels remain."""
     steps = [1, 1, 1]
     while np.prod([-(-n // step) for n, step in zip(volume.shape, steps, strict=True)]) > _MOST:
         steps[int(np.argmax(np.divide(volume.shape, steps)))] += 1
@@ -159,13 +163,13 @@ def sampled(volume: Array) -> Array:
 
 
 def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
-    """The largest box inside the cylinder that every view sees, minus a margin: (z, y, x) slices.
+    """The largest box inside the cylinder that every projection sees, minus a margin: (z, y, x) slices.
 
-    The side is 2 r cos 45° for a circle of radius r = half the smaller of ny and nx. The margin is a fraction of the
-    side, and of the height, taken off at each end.
+    The side is 2 r cos 45° for a circle with the radius r, half the smaller of ny and nx. The margin is a fraction of
+    the side, and of the height, that is removed at each end.
     """
     if not 0 <= margin < 0.5:
-        raise ValueError(f"the margin is a fraction of the side, 0 to 0.5, got {margin}")
+        raise ValueError(f"the margin must be a fraction of the side length, 0 to 0.5, got {margin}")
     nz, ny, nx = shape
     side = min(ny, nx) * np.cos(np.pi / 4)
     halves = (nz / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin))
@@ -178,19 +182,19 @@ def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[
 def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
 
-    Of all ways to part the values in two, it takes the one with the least squares within the parts (Otsu 1979, IEEE
-    Trans. Syst. Man Cybern. 9, 62). Lloyd's iterations may end in another.
+    It divides the values into the two parts with the smallest sum of squares within the parts (Otsu 1979, IEEE Trans.
+    Syst. Man Cybern. 9, 62). Lloyd's iterations might end in another division.
 
     Args:
         volume: [z, y, x], with enough contrast to separate the two regions. The mask also serves for other volumes of
         the same sample.
-        seed: of the sample of voxels.
+        seed: seed for the sample of voxels.
 
     Returns:
         int8 [z, y, x]: 1 dense, 0 empty, -1 outside the cuboid (not used).
 
     Raises:
-        ValueError: where all voxels have the same value or some are not finite.
+        ValueError: all voxels have the same value, or some are not finite.
     """
     box = inscribed_cuboid(volume.shape)
     values = volume[box]
@@ -200,7 +204,9 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
     sample = np.asarray(values[some], np.float64).ravel()
     if np.ptp(sample) == 0:
-        raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
+        raise ValueError(
+            f"all voxels have the value {sample[0]:g}, so there are no two regions that a threshold could separate"
+        )
     threshold = _between_two_means(sample)
     mask = np.full(volume.shape, -1, np.int8)
     mask[box] = values > threshold
@@ -208,9 +214,9 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
 
 
 def _between_two_means(values: NDArray[np.float64]) -> float:
-    """The middle between the means of the two parts of the values with the least squares within them."""
+    """The threshold: the middle between the means of the two parts with the smallest sum of squares within them."""
     rising = np.sort(values)
-    lower = np.arange(1, rising.size)  # values in the lower part, by the place of the cut
+    lower = np.arange(1, rising.size)  # number of values in the lower part, for each position of the cut
     below = np.cumsum(rising)[:-1] / lower
     above = (rising.sum() - below * lower) / (rising.size - lower)
     best = int(np.argmax(lower * (rising.size - lower) * (above - below) ** 2))
@@ -218,18 +224,19 @@ def _between_two_means(values: NDArray[np.float64]) -> float:
 
 
 def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a volume, without their rims, to assess any volume of the same sample.
+    """Dense and empty regions of a volume, without their rims, for assessing any volume of the same sample.
 
-    Those of `kmeans_mask` of the reference blurred by a voxel, less two voxels at each edge between them. So neither
-    the reference's noise nor where exactly its edges lie decides: references of one sample, with noise, streaks or an
-    axis off by a pixel, give a volume the same SNR and CNR to some 0.3 dB. Regions too thin for that lose one voxel.
+    They are those of `kmeans_mask` for the reference blurred by a voxel, without two voxels at each edge between them.
+    So neither the noise of the reference nor the exact position of its edges matters. References of one sample with
+    noise, streaks or an axis that is wrong by a pixel give the same SNR and CNR within about 0.3 dB. Regions that are
+    too thin for two voxels lose one voxel.
 
     Args:
         reference: [z, y, x].
-        seed: as of `kmeans_mask`.
+        seed: as in `kmeans_mask`.
 
     Returns:
-        As `kmeans_mask`, -1 at rims, too; None where a region has no interior, or the reference no contrast.
+        As `kmeans_mask`, with -1 also at rims; None if a region has no interior, or the reference has no contrast.
     """
     try:
         mask = kmeans_mask(ndimage.gaussian_filter(np.asarray(reference, np.float32), _BLURRED), seed)
@@ -239,7 +246,7 @@ def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None
     for rim in range(_RIM, 0, -1):
         inner = np.full(mask.shape, -1, np.int8)
         for kind in (0, 1):
-            # What lies outside the cuboid is no edge of a region.
+            # The border of the cuboid does not count as an edge of a region.
             near_other = ndimage.binary_dilation(mask == 1 - kind, cross, rim)
             inner[(mask == kind) & ~near_other] = kind
         if all((inner == kind).any() for kind in (0, 1)):
@@ -250,21 +257,23 @@ def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None
 def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[float, float]:
     """Signal-to-noise and contrast-to-noise ratio in dB: 20 log₁₀(μ / σ_b) and 20 log₁₀(|μ - μ_b| / σ_b).
 
-    μ is the mean of the dense region, μ_b and σ_b mean and standard deviation of the empty one. inf where σ_b is 0,
-    -inf where the numerator is not positive.
+    μ is the mean of the dense region; μ_b and σ_b are mean and standard deviation of the empty region. The result is
+    inf if σ_b is 0, and -inf if the numerator is not positive.
 
     Args:
         volume: [z, y, x].
         mask: 1 (True) dense, 0 (False) empty, -1 not used; see `kmeans_mask`.
 
     Raises:
-        ValueError: where shapes differ, a region has no voxels, or some of its voxels are not finite.
+        ValueError: the shapes differ, a region has no voxels, or some of its voxels are not finite.
     """
     if volume.shape != mask.shape:
-        raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
+        raise ValueError(f"the volume and the mask must have the same shape, got {volume.shape} and {mask.shape}")
     dense, empty = (volume[mask == kind] for kind in (1, 0))
     if not dense.size or not empty.size:
-        raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
+        raise ValueError(
+            f"the mask marks {dense.size} dense and {empty.size} empty voxels; at least one of each is needed"
+        )
     with np.errstate(invalid="ignore"):
         mean, base = (float(each.mean(dtype=np.float64)) for each in (dense, empty))
         spread = float(empty.std(dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Lengths of fits, presets, and times as text."""
+"""Numbers of steps and Gaussians for the quality presets, and times as text."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from recon.base.choices import Quality
 
 MOST_STEPS = 1000
-"""Of a fit within a time: further ones fit the noise, on four measured and simulated scans."""
+"""Largest number of steps of a fit with a time limit. In four measured and simulated scans, more steps fit the
+noise."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of a fit for one of the quality levels.
+    """Settings of a fit for one quality preset.
 
     Attributes:
-        share: Gaussians at the start, relative to the default number for the volume.
+        share: number of Gaussians at the start, relative to the default number for the volume.
     """
 
     steps: int
@@ -27,10 +28,10 @@ PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Prese
 
 
 def parse_budget(text: str) -> float:
-    """Parse "30s", "2m", "1.5h" or a bare number to seconds.
+    """Convert "30s", "2m", "1.5h" or a plain number to seconds.
 
     Raises:
-        ValueError: for anything else, and for a time that is not positive and finite.
+        ValueError: the text has another form, or the time is not positive and finite.
     """
     units = {"s": 1.0, "m": 60.0, "h": 3600.0}
     number = text.strip()
@@ -40,12 +41,12 @@ def parse_budget(text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not (math.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"{text!r} is not a time: expected a positive number with s, m or h, such as 30s, 2m or 1h")
+        raise ValueError(f"{text!r} is not a time; write a positive number with s, m or h, such as 30s, 2m or 1h")
     return seconds
 
 
 def duration_text(seconds: float) -> str:
-    """A time as text: s, min or h."""
+    """A time as text in s, min or h."""
     if seconds < 100:
         return f"{seconds:.3g} s"
     return f"{seconds / 60:.3g} min" if seconds < 6000 else f"{seconds / 3600:.3g} h"

@@ -1,1 +1,1 @@
-"""Values that all of recon shares: geometry, grid and volume, views, masks, ray model."""
+"""Values that all of recon shares: geometry, grid, volume, projections, masks and the ray model."""

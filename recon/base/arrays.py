@@ -1,5 +1,4 @@
-"""Types of arrays that signatures share, masked and frozen arrays, the spread of values by their median, binning of
-views."""
+"""Array types for signatures, masked and read-only arrays, standard deviations by medians, and binning of images."""
 
 from __future__ import annotations
 
@@ -18,9 +17,9 @@ MEDIAN = 0.6745  # of |x|, for a normal variable x with standard deviation 1
 
 
 def without_mask(values: Any) -> Any:
-    """Numbers of which some are masked, of an array or of those in a list or tuple, as floats that are NaN there.
+    """Masked values become NaN: for a masked array, or for masked arrays in a list or tuple.
 
-    All other values are returned as they are.
+    The numbers become floats. Values without a mask are returned unchanged.
     """
     several = values if isinstance(values, list | tuple) else (values,)
     masked = any(isinstance(each, np.ma.MaskedArray) and np.ma.getmaskarray(each).any() for each in several)
@@ -36,15 +35,16 @@ def frozen(values: F64) -> F64:
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of the normal distribution with this median of absolute values; 0 if none is finite."""
+    """Standard deviation of the normal distribution with this median of absolute values; 0 if no value is finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
 
 
 def some_values(values: NDArray[Any], about: int) -> NDArray[Any]:
-    """About so many of the values, from all places along the last axis.
+    """About `about` of the values, taken from all positions along the last axis.
 
-    With a step that shares a factor with its length, a sample of 183³ voxels showed three of 183 slices.
+    The step shares no factor with the length of that axis. With a shared factor, a sample of 183³ voxels came from only
+    three of the 183 slices.
     """
     step = max(1, values.size // about)
     while math.gcd(step, values.shape[-1]) > 1 and values.shape[-1] < values.size:
@@ -55,15 +55,17 @@ def some_values(values: NDArray[Any], about: int) -> NDArray[Any]:
 def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Means of factor x factor line integrals [view, row, col]; trailing pixels that do not fill a bin are dropped.
 
-    Where line integrals differ within a bin, their mean is slightly larger than the line integral of the mean
-    transmission. The correction can bin counts instead (`--bin`).
+    If line integrals differ within a bin, their mean is slightly larger than the line integral of the mean
+    transmission. The correction can bin the counts instead (`--bin`).
 
     Raises:
-        ValueError: for a factor below 1, or larger than the detector.
+        ValueError: the factor is below 1 or larger than the detector.
     """
     n, rows, cols = projections.shape
     if not 1 <= factor <= min(rows, cols):
-        raise ValueError(f"bin factor must be between 1 and {min(rows, cols)} for {rows} x {cols} pixels, got {factor}")
+        raise ValueError(
+            f"the bin factor must be between 1 and {min(rows, cols)} for {rows} x {cols} pixels, got {factor}"
+        )
     if factor == 1:
         return projections
     rows, cols = rows // factor, cols // factor
@@ -72,6 +74,6 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
 
 
 def factor_within(shape: tuple[int, int], voxels: int) -> int:
-    """Factor by which views [row, col] must be binned so that their volume has at most so many voxels."""
+    """Factor by which projections [row, col] must be binned so that their volume has at most `voxels` voxels."""
     rows, cols = shape
     return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= voxels), rows)

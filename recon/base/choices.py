@@ -1,4 +1,4 @@
-"""Choices and figures that options name. They load without computing modules, so that help is quick."""
+"""Names and defaults that command-line options show. No module that computes is imported, so that help is quick."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 from recon.base.kernel import Kernel
 
-AUTO = "auto"  # Name of the choice among methods, `recon.Auto`
+AUTO = "auto"  # name of the automatic choice of a method, `recon.Auto`
 
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
@@ -17,19 +17,19 @@ Rings = Literal["none", "auto", "sort", "vo"]
 FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv", "published"]
 
-KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
+KERNEL = Kernel.COMPACT  # default radial profile of the Gaussians of a fit
 
 FEW_PHOTONS = 100
-"""Photons in a pixel of the open beam; with fewer, counts are better than logarithms."""
+"""Photons per pixel in the open beam. With fewer, fitting the counts is better than fitting their logarithm."""
 
 SPOT_ERRORS = 8.0
-"""Standard deviations by which a bright spot is brighter, by default; noise exceeds them once in 10¹⁵ pixels."""
+"""Default threshold for zingers, in standard deviations above the neighbours. Noise exceeds it once in 10¹⁵ pixels."""
 
 
 def refuse_unknown_device(device: str) -> None:
     """Raises ValueError for a device that is neither "cpu" nor a CUDA device."""
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ValueError(
-            f"device {device!r} was asked for; methods compute on 'cpu' or on 'cuda', the current CUDA device. Name "
-            f"one of these. CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
+            f"device must be 'cpu' or 'cuda', got {device!r}. 'cuda' is the current CUDA device. To choose another "
+            "one, set CUDA_VISIBLE_DEVICES before Python starts"
         )

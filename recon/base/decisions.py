@@ -1,4 +1,4 @@
-"""Decisions: what a method derives from its data, kept so that other slabs of the same scan use it."""
+"""Decisions: values that a method derives from its data, stored so that all slabs of a scan use the same ones."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ T = TypeVar("T")
 
 
 class MaterialPrior(NamedTuple):
-    """Few materials that voxels are pulled to, and how.
+    """Discrete levels of the sample, and how strongly voxels are pulled towards them (discrete tomography).
 
     Attributes:
-        levels: densities of the materials, ascending; none: voxels are not pulled.
+        levels: densities of the materials, ascending; empty: voxels are not pulled.
         weights: shares of the materials in the sample.
-        tv_share: weight of total variation beside the pull, over that without one.
-        pull: c of the step c (z - x), where a step of the views is one.
+        tv_share: weight of total variation together with the pull, divided by the weight without it.
+        pull: the factor c of the step c (z - x) towards the levels z; the step that fits the projections has the factor
+            1.
     """
 
     levels: tuple[float, ...] = ()
@@ -35,9 +36,9 @@ class Prior(NamedTuple):
 
     Attributes:
         weight: of total variation, μ of min ½||A x - p||² + μ TV(x).
-        strength: last threshold of sparse patches; 0: it was not sought.
-        patches: these predict views held out better than total variation alone.
-        materials: that voxels are pulled to; None: they were not sought.
+        strength: last threshold of the patch-based denoiser (PnP-DCT); 0: PnP-DCT was not tried.
+        patches: PnP-DCT predicts held-out projections better than total variation alone.
+        materials: discrete levels that voxels are pulled to; None: levels were not searched for.
     """
 
     weight: float
@@ -55,14 +56,14 @@ class Prior(NamedTuple):
 class Decisions:
     """The decisions that a run makes from its data, by name and in order.
 
-    A weight of total variation, a step or a restart that follows from sums over a whole volume would differ from slab
-    to slab, and show as a seam. So one slab decides, and the others follow: `Decisions(seed, first.made)`. Decisions
-    that `made` does not hold are then made.
+    A weight of total variation, a step or a restart depends on sums over a whole volume. If each slab computed its own,
+    they would differ and the volume would show a seam. So one slab decides, and the others follow: `Decisions(seed,
+    first.made)`. A decision that is missing in `made` is made then.
 
     Attributes:
-        made: so far, by name; plain numbers and lists of them.
-        prior: of the volume, in the units of the scan, where it was chosen before; None: the method decides.
-        settings: what the volume's record says beside the settings of its method.
+        made: the decisions so far, by name: plain numbers and lists of numbers.
+        prior: the prior of the volume in the units of the scan, if it was chosen before; None: the method chooses it.
+        settings: values for the record of the volume, in addition to the settings of its method.
     """
 
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
@@ -73,7 +74,7 @@ class Decisions:
         self._followed = followed or {}
 
     def __call__(self, name: str, decide: Callable[[], T]) -> T:
-        """The next decision of this name: the earlier one if it was made, otherwise the result of `decide`."""
+        """The next decision with this name: the stored one if there is one, otherwise the result of `decide`."""
         before, made = self._followed.get(name, ()), self.made.setdefault(name, [])
         made.append(before[len(made)] if len(made) < len(before) else decide())
         value: T = made[-1]
@@ -81,16 +82,16 @@ class Decisions:
 
 
 class Stop:
-    """A request to end a run with its result so far; the run asks it between steps.
+    """Tells a run whether to end early and keep its result so far. The run calls it between steps.
 
     Args:
-        asks: True ends the work, and it is not asked again.
-        deadline: when the work ends by itself, by `now`, in s; inf: never.
+        asks: function that returns True to end the work; after that it is not called again.
+        deadline: time at which the work ends by itself, in s of the clock `now`; inf: never.
         now: the clock.
 
     Attributes:
-        stopped: somebody asked for the end; the deadline alone does not count, because it was planned. Of one
-            made by `by` the deadline of the first counts as asked for.
+        stopped: True if somebody asked for the end. The own deadline does not count, because it was planned. For a
+            request made with `by`, the deadline of the first request counts as asked for.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class Stop:
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether a stop left some of the `planned` steps or iterations undone; 0: no number is planned."""
+        """Whether a stop left some of the `planned` steps or iterations undone; `planned` 0: no number was planned."""
         return self.stopped and not 0 < planned <= done
 
 

@@ -1,6 +1,6 @@
-"""Declared types: whether a value is what a field or an argument declares, and the sentence that refuses it.
+"""Declared types: checks that a value has the type its field or argument declares, and the message if it has not.
 
-Of an array only that it is one is looked at: the functions that take it name the shape and the numbers they expect.
+For an array only the type is checked. The functions that take the array check its shape and its values.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from recon.base.arrays import without_mask
 from recon.base.registry import unknown
 
-_SCALARS = {complex, bytes, str}  # of ArrayLike, beside types of numpy's own
-_NUMBERS = "ArrayLike"  # stands for its members
+_SCALARS = {complex, bytes, str}  # members of ArrayLike that are not numpy types
+_NUMBERS = "ArrayLike"  # short for all its members
 _LONGEST = 80  # characters of a value in a sentence
 _WORDS: Mapping[Any, str] = {
     bool: "True or False",
@@ -39,7 +39,7 @@ _WORDS: Mapping[Any, str] = {
 
 
 class _Unresolved:
-    """Stands for a type that is imported for the type checker alone; every value is of it."""
+    """Stands for a type that only the type checker imports; every value passes."""
 
     def __class_getitem__(cls, parameters: object) -> type[_Unresolved]:
         return cls
@@ -61,16 +61,16 @@ def types_of(owner: Any) -> Mapping[str, Any]:
 
 
 def is_number(value: object) -> bool:
-    """Whether the value is a real number, or an array without axes that holds one, as an .npz gives it.
+    """Whether the value is a real number, or an array without axes that contains one (numpy reads it so from .npz).
 
-    True and False are none.
+    True and False do not count as numbers.
     """
     value = plain(value)
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def plain(value: Any) -> Any:
-    """The number or truth value in an array without axes, or of numpy; other values unchanged."""
+    """The plain Python number or bool in a numpy scalar or an array without axes; other values unchanged."""
     return value.item() if isinstance(value, np.ndarray | np.bool_) and value.shape == () else value
 
 
@@ -81,10 +81,10 @@ def is_of_type(value: Any, kind: Any) -> bool:
 
 
 def _alternatives(kind: Any) -> list[Any]:
-    """The members of a union, with those of `ArrayLike` as one; a list of the type itself for others."""
+    """The members of a union, with `ArrayLike` as one member; for another type a list with this type."""
     if get_origin(kind) not in (Union, UnionType):
         return [kind]
-    # numpy names ArrayLike by `type` from Python 3.12 on
+    # from Python 3.12 on, numpy defines ArrayLike with a `type` statement
     members = [part for each in get_args(kind) for part in get_args(getattr(each, "__value__", None)) or [each]]
     if not set(members) >= _SCALARS:
         return members
@@ -113,7 +113,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _is_sequence(value: Any) -> bool:
-    """Also an array, which is no `Sequence`."""
+    """Whether the value is a sequence or an array (an array does not count as a `Sequence` in Python)."""
     return hasattr(value, "__len__") and hasattr(value, "__getitem__") and not isinstance(value, str | bytes | Mapping)
 
 
@@ -157,7 +157,7 @@ def _word(kind: Any) -> str:
 
 
 def refusal(name: str, value: Any, kind: Any) -> str:
-    """The sentence that refuses a value of the wrong type; without a full stop."""
+    """The message for a value of the wrong type; without a full stop."""
     alternatives = _alternatives(kind)
     names = [member for each in alternatives if get_origin(each) is Literal for member in get_args(each)]
     names += [
@@ -180,10 +180,10 @@ def shown(value: object) -> str:
 
 
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Raise ValueError for an argument of another type than the function declares, or a number beyond its bounds.
+    """Raise ValueError if an argument has another type than the function declares, or a number is out of bounds.
 
-    So it does for masked values: numpy computes with what lies below a mask. A function that can leave them out calls
-    `without_mask` before.
+    It also raises for masked values, because numpy computes with the numbers below a mask. A function that can leave
+    masked values out calls `without_mask` first.
 
     Args:
         values: by name, such as `locals()` in the function's first line.
@@ -192,25 +192,26 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     for name, value in values.items():
         if without_mask(value) is not value:
             raise ValueError(
-                f"{name} has masked values, which this function cannot leave out: give an array without those views, "
-                "or one in which they are filled"
+                f"{name} has masked values, and this function cannot leave them out. Remove the projections with "
+                "masked values, or fill the masked values first"
             )
         if name in declared and not is_of_type(value, declared[name]):
             raise ValueError(refusal(name, value, declared[name]))
 
 
 class Checked:
-    """A settings class, as a dataclass: its values are checked against what its fields declare."""
+    """Base class of settings (dataclasses): checks every value against the declaration of its field."""
 
     def __post_init__(self) -> None:
         check_settings(self)
 
 
 def check_settings(settings: Any) -> None:
-    """Raise ValueError for a value of a dataclass that its field does not declare: of another type, a name that is not
-    among those of a Literal, or a number beyond the field's bounds.
+    """Raise ValueError if a value of a dataclass does not match the declaration of its field.
 
-    An array without axes, as an .npz gives a number, becomes the number.
+    That is a value of another type, a name that its Literal does not contain, or a number out of the field's bounds.
+
+    An array without axes becomes the number in it; numpy reads a number from .npz as such an array.
     """
     values = {each.name: plain(getattr(settings, each.name)) for each in fields(settings) if each.init}
     check_arguments(type(settings), values)

@@ -1,9 +1,9 @@
-"""Error law: how the error of a volume falls with further views, and the gain in dB that follows for each kind.
+"""Error model: how the error of a volume falls with more projections, and the expected improvement in PSNR (dB).
 
-The mean square error of a volume of n views has three parts, which are stated as shares of it. `offset` is a constant
-in the middle of the volume, by an unknown density beside the field, and falls only with offset views. `noise` falls
-with the light, also at the same angles. The third part, the remaining share, is by gaps between the angles. The last
-two together fall as n^-exponent with views at new angles.
+The mean square error of a volume from n projections has three parts, given as shares of it. `offset` is a constant
+error in the middle of the volume. It comes from unknown density outside the field of view, and only laterally offset
+projections reduce it. `noise` falls with the number of photons, also at the same angles. The remaining share comes from
+gaps between the angles. With projections at new angles, the last two parts together fall as n^-exponent.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ import math
 from dataclasses import dataclass
 
 BELOW = 0.5
-"""Over the mean: a gain is taken to lie so far below it, at most, and beyond it where a law is known. A convention."""
+"""For the low end of a gain's range, exponent and noise share are lowered by at most this share of themselves.
+
+For the high end they may be raised by more. The value is a convention.
+"""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """A predicted gain in dB of PSNR, and the ends of its range (docs/performance.md says how often they hold)."""
+    """A predicted improvement in PSNR (dB) and its range (docs/performance.md says how often the range holds)."""
 
     mean: float
     low: float
@@ -25,19 +28,23 @@ class Gain:
 
     @property
     def at_most(self) -> float:
-        """The gain to assume before it is given up: the mean, or the high end if the law is unsure by half or more."""
+        """The gain to assume before further projections are given up.
+
+        It is the mean, or the high end if the exponent is uncertain by half or more.
+        """
         return self.mean if self.high <= (1 + BELOW) * self.mean * (1 + 1e-9) else self.high
 
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """The error of a volume of `n_views`, as measured without a truth; see the module.
+    """Error model of a volume from `n_views` projections, measured without ground truth; see the module.
 
     Attributes:
-        n_views: of the volume.
-        exponent: of the fall of the mean square error with the number of views.
-        exponent_error: the exponent is taken to lie within twice this, though not below half of itself, and both shares
-            within the same part of themselves, which gives the range of a gain. See `recon.voxels.measured_law`.
+        n_views: number of projections of the volume.
+        exponent: exponent with which the mean square error falls with the number of projections.
+        exponent_error: uncertainty of the exponent, which gives the range of a gain. The exponent is assumed to lie
+            within twice this value, but not below half of the exponent. Both shares are assumed to have the same
+            relative uncertainty. See `recon.voxels.measured_law`.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
@@ -48,9 +55,15 @@ class ErrorLaw:
     offset: float = 0.0
 
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
-        """Gain in dB of PSNR by further views: at new angles, at the same angles again, and by offset views."""
+        """Improvement in PSNR (dB) from more projections.
 
-        def decibels(factor: float) -> float:  # with the exponent and the shares times this factor
+        Args:
+            views: number of projections at new angles.
+            again: number of repeated projections at the same angles.
+            wide: also laterally offset projections.
+        """
+
+        def decibels(factor: float) -> float:  # with the exponent and the shares multiplied by this factor
             noise = min(factor * self.noise, 1 - self.offset)
             offset = self.offset * (max(1 - factor, 0) if wide else 1)
             gaps_and_noise = 1 - noise - self.offset + noise * self.n_views / (self.n_views + again)

@@ -1,6 +1,6 @@
-"""Findings: what pydantic finds wrong in the plain values of a file, as sentences with the value and what is legal.
+"""Findings: turns pydantic's errors about the values of a file into messages with the value and what is legal.
 
-The sentences of configurations and scenes are the same; the legal keys and values are read from the JSON schema.
+Configurations and scenes have the same messages. The legal keys and values are read from the JSON schema.
 """
 
 from __future__ import annotations
@@ -16,14 +16,19 @@ from recon.base.setting import Setting
 
 KeyPath = tuple[str | int, ...]
 Schema = Mapping[str, Any]
-_OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
-_BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}  # in JSON schemas
-_MANY = 2  # unknown keys of a group: more are those of another kind
+_OF_VALIDATOR = "Value error, "  # pydantic puts this before the message of our own validators
+_BOUNDS = {
+    "gt": "exclusiveMinimum",
+    "ge": "minimum",
+    "lt": "exclusiveMaximum",
+    "le": "maximum",
+}  # names in JSON schemas
+_MANY = 2  # with more unknown keys than this in a group, the keys are taken to belong to another kind
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: the path of the key that it is about, and a sentence without a full stop."""
+    """An error in a file: the path of the key, and a message without a full stop."""
 
     key: KeyPath
     sentence: str
@@ -37,15 +42,15 @@ def faults_of(
     former: Mapping[str, str] = MappingProxyType({}),
     advice: str = "",
 ) -> list[Fault]:
-    """The faults in the order of the model's keys; one per key.
+    """The errors in the order of the model's keys, one per key.
 
     Args:
-        findings: as of `pydantic.ValidationError.errors`.
+        findings: the list from `pydantic.ValidationError.errors`.
         data: the plain values.
-        schema: JSON schema of what they should be.
-        where: path of the whole, before that of each key; "" at the top of a file.
-        former: by path, what does the same as a key that there is no more.
-        advice: where a group has the keys of another kind.
+        schema: JSON schema of the legal values.
+        where: path that is put before the path of each key; "" at the top of a file.
+        former: by path of a removed key, a sentence on what does the same now.
+        advice: sentence for a group that has the keys of another kind.
     """
     faults: dict[KeyPath, Fault] = {}
     for finding in findings:
@@ -68,29 +73,32 @@ def faults_of(
             sentence = _of_unknown(path, name, data, schema, former, advice)
         else:
             sentence = _of_value(path, name or "the configuration", data, schema, missing)
-        if all(fault.sentence != sentence for fault in faults.values()):  # one for all keys of a real device
+        if all(fault.sentence != sentence for fault in faults.values()):  # one message for all keys of a real device
             faults.setdefault(path, Fault(key, sentence))
-    # A list with a wrong item may also seem too short.
+    # pydantic may also report a list with a wrong item as too short
     lists = {path for path in faults if isinstance(_value(data, path), list)}
     items = {path[:-1] for path in faults if path}
     return [fault for path, fault in faults.items() if path not in lists & items]
 
 
 def _of_unknown(path: KeyPath, name: str, data: Any, schema: Schema, former: Mapping[str, str], advice: str) -> str:
-    """On a key that its group does not know."""
+    """The message about a key that its group does not know."""
     if name in former:
-        return f"{name} is no longer a key; leave it out. {former[name]}"
+        return f"{name} no longer exists; remove it. {former[name]}"
     if str(path[-1]) in ADD_ONS:
         return f"{name} {add_on_missing(str(path[-1]))}"
     keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
     others = [key for key in _value(data, path[:-1]) if key not in keys]
     if advice and len(others) > _MANY:
-        return f"{name.rpartition('.')[0]}: {', '.join(others)} are no keys of this kind; leave them out. {advice}"
+        return (
+            f"{name.rpartition('.')[0]}: remove {', '.join(others)}, because this kind does not have these keys. "
+            f"{advice}"
+        )
     return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
 
 
 def _of_value(path: KeyPath, name: str, data: Any, schema: Schema, missing: bool) -> str:
-    """On a value that is missing, or not legal."""
+    """The message about a value that is missing or not legal."""
     branches = declared_at(schema, path, data)
     choices = [str(choice) for branch in branches for choice in _choices(branch)]
     words = [_words(branch) for branch in branches if not _choices(branch)]
@@ -104,11 +112,11 @@ def _of_value(path: KeyPath, name: str, data: Any, schema: Schema, missing: bool
 def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
     """The key path in the file: pydantic's location without the names of union members."""
     path: list[str | int] = []
-    for at, part in enumerate(loc):
+    for index, part in enumerate(loc):
         if _has(data, part):
             data = data[part]
             path.append(part)
-        elif missing and at == len(loc) - 1:
+        elif missing and index == len(loc) - 1:
             path.append(part)
     return tuple(path)
 
@@ -126,7 +134,7 @@ def _value(data: Any, path: KeyPath) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """The value as YAML writes it in a line, in quotes where it is text."""
+    """The value as YAML writes it on one line; text is in quotes."""
     text = repr(value) if isinstance(value, str) else _in_yaml(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -142,7 +150,7 @@ def _in_yaml(value: Any) -> str:
 
 
 def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
-    """The schemas for the value at `path`, by the kinds and schemes that the data choose."""
+    """The schemas for the value at `path`, for the kinds and schemes that the data select."""
     branches = _branches(schema, data, schema)
     for part in path:
         data = data[part] if _has(data, part) else None
@@ -152,7 +160,7 @@ def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
 
 
 def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
-    """The alternatives of a node, with references resolved; only the one whose tag the data name, if they do."""
+    """The alternatives of a node, with references resolved. If the data name a tag, only the alternative with it."""
     while "$ref" in node:
         node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
     alternatives = node.get("anyOf") or node.get("oneOf")

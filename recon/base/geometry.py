@@ -1,6 +1,7 @@
-"""Geometry: the rays of every view, as one immutable value.
+"""Geometry: the rays of all projections, as one immutable value.
 
-Convention (fixed for the whole project): the object stands still and the view turns. For a view at angle θ
+Convention (fixed for the whole project): the object stands still, and the projection direction turns. For a projection
+(view) at angle θ
 
     u = x cos θ + y sin θ        columns grow with u
     v = z                        rows grow with v (the rotation axis is z)
@@ -13,13 +14,14 @@ default.
 Cone beam: the source lies at -sod * d, the detector sdd away from it. A point at depth w = sod + x·d falls on column
 axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
 
-A real set-up departs from this in three ways, each given for every view. `tilt` leans the rotation axis along the beam
-(laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector. The sources of a
-cone may stand anywhere: then `centres` displace the view's axes, and x - centre takes the place of x.
-`recon.base.vectors` makes a geometry of vectors of each view.
+A real set-up may differ from this in three ways, each with a value for every projection. `tilt` tilts the rotation axis
+along the beam (laminography), `roll` rotates the detector about the beam, `shifts` displace the image on the detector.
+The sources of a cone may be anywhere: then `centres` displace the axes of a projection, and x - centre replaces x.
+`recon.base.vectors` makes a geometry from vectors for each projection.
 
-Two more follow from the exposure. `width` says what a pixel sees beside its central ray. `skew` says how far the stage
-turns from the readout of one row to the next (rolling shutter): row j sees the angle θ + j skew.
+Two more values describe the exposure. `width` says over which rays a pixel averages, in addition to its central ray.
+`skew` is the angle that the stage turns from the readout of one row to the next (rolling shutter): row j has the angle
+θ + j skew.
 """
 
 from __future__ import annotations
@@ -40,31 +42,31 @@ from recon.base.greys import fan, html
 from recon.base.placement import LONGEST, Where, checked_angles, placed_views
 from recon.base.ray_width import NO_WIDTH, RayWidth
 
-_OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
-_SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
-_MAGNIFIED = 1e6  # far beyond any; a voxel stays in the range of float32
-_OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
+_OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field of view is on one side only
+_SHORT_OF_SOURCE = 0.7  # share of sod; the corners of a box with this half width do not reach the source
+_MAGNIFIED = 1e6  # far above any real one; a voxel stays in the range of float32
+_OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each projection
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Geometry of a set of views; construct it with `Geometry.parallel`, `Geometry.cone` or `Geometry.fan`.
+    """Geometry of a set of projections; construct it with `Geometry.parallel`, `Geometry.cone` or `Geometry.fan`.
 
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: detector pixel in mm: at the sample for a parallel beam (1.0 = work in pixels), on the detector
-            for a cone.
-        axis_col, axis_row: where the rotation axis and the height z = 0 fall on the detector (a cone: its central ray).
-            In pixels from 0 at the centre of the first column, row.
+        pixel_pitch: size of a detector pixel in mm. For a parallel beam at the sample (1.0: lengths are in pixels), for
+            a cone on the detector.
+        axis_col, axis_row: position of the rotation axis and of the height z = 0 on the detector (for a cone: of the
+            central ray). In pixels, 0 at the centre of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
-        shifts: float64 [view, 2], displacement of each view in pixels (col, row).
-        roll: float64 [view], radians; the detector turned about the beam: its columns run along u cos + v sin.
-        tilt: float64 [view], radians; the rotation axis leaning along the beam: rows then run along v cos + d sin.
-        width: of every ray; see `seen_with`.
-        skew: radians from one row to the next, of a parallel beam; `angles` are those of the first row.
-        centres: float64 [view, 3], (x, y, z) in mm, of a cone: the point that stands `sod` behind the source along the
-            view's beam. Left out: the origin.
+        shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
+        roll: float64 [view], radians; rotation of the detector about the beam: its columns run along u cos + v sin.
+        tilt: float64 [view], radians; tilt of the rotation axis along the beam: rows then run along v cos + d sin.
+        width: width of all rays; see `seen_with`.
+        skew: radians from one row to the next (parallel beam only); `angles` are those of the first row.
+        centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point at the distance `sod` from the source
+            along the beam of the projection. Left out: the origin.
     """
 
     angles: F64
@@ -87,13 +89,13 @@ class Geometry:
             object.__setattr__(self, "centres", frozen(np.zeros((self.angles.size, 3))))
         elif not self.is_cone or self.width.arc:
             raise ValueError(
-                "centres need a cone beam whose stage does not turn during the exposure (no arc). Displace the views "
-                "of a parallel beam by shifts"
+                "centres need a cone beam, and a stage that does not turn during the exposure (no arc). For a "
+                "parallel beam, give shifts instead"
             )
         if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
             raise ValueError(
-                f"skew must be finite, and 0 unless the beam is parallel and no view is rolled or tilted; got "
-                f"{self.skew:.3g} rad a row"
+                "skew must be finite. It must be 0 for a cone beam, and if a projection is rolled or tilted. Got "
+                f"{self.skew:.3g} rad per row"
             )
 
     @classmethod
@@ -111,7 +113,8 @@ class Geometry:
             where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
 
         Raises:
-            ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
+            ValueError: there are no angles, an angle is not finite, the detector is empty, or the pitch is not
+                positive.
         """
         check_arguments(cls.parallel, locals())
         return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=math.inf, sdd=math.inf)
@@ -126,20 +129,22 @@ class Geometry:
         sdd: float,
         **where: Unpack[Where],
     ) -> Geometry:
-        """Cone beam from a point `sod` mm before the rotation axis onto a flat detector `sdd` mm behind the source.
+        """Cone beam from a point source to a flat detector: `sod` mm to the rotation axis, `sdd` mm to the detector.
 
         Args:
-            pixel_pitch: mm, in the plane of the detector; at the rotation axis a pixel is sod / sdd of it.
+            pixel_pitch: mm, in the plane of the detector; at the rotation axis a pixel is smaller by the factor sod /
+                sdd.
             where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
 
         Raises:
-            ValueError: as `parallel`, and for distances that are not finite with 0 < sod <= sdd.
+            ValueError: as for `parallel`, or the distances are not finite with 0 < sod <= sdd.
         """
         check_arguments(cls.cone, locals())
         if not 0 < sod <= sdd <= LONGEST or sdd > _MAGNIFIED * sod:
             raise ValueError(
-                f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}; at most "
-                f"{LONGEST:g} mm, from where rays are parallel, and a magnification of {_MAGNIFIED:g}"
+                f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got sod {sod} and sdd {sdd}. The "
+                f"largest distance is {LONGEST:g} mm (beyond it, use a parallel beam), the largest magnification "
+                f"{_MAGNIFIED:g}"
             )
         return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=float(sod), sdd=float(sdd))
 
@@ -155,7 +160,7 @@ class Geometry:
         axis_col: float | None = None,
         shifts: ArrayLike | None = None,
     ) -> Geometry:
-        """Fan beam onto a flat line of `cols` pixels: a cone of one row, in the plane of the source.
+        """Fan beam to a flat line of `cols` pixels: a cone beam with one detector row, in the plane of the source.
 
         Args:
             shifts: [view], pixels along the line.
@@ -165,7 +170,10 @@ class Geometry:
         """
         check_arguments(cls.fan, locals())
         if shifts is not None and np.shape(shifts) != np.shape(np.atleast_1d(angles)):
-            raise ValueError(f"shifts must be one number a view [{np.size(angles)}], got shape {np.shape(shifts)}")
+            raise ValueError(
+                f"shifts must hold one number for each projection, shape [{np.size(angles)}], got shape "
+                f"{np.shape(shifts)}"
+            )
         moved = None if shifts is None else np.stack([np.asarray(shifts, np.float64), np.zeros(np.size(angles))], 1)
         return cls.cone(angles, (1, cols), pixel_pitch, sod, sdd, axis_col=axis_col, axis_row=0.0, shifts=moved)
 
@@ -179,65 +187,66 @@ class Geometry:
 
     @cached_property
     def is_fan(self) -> bool:
-        """All rays of the cone run in the plane of its source across the rotation axis: one straight row."""
+        """Whether the beam is a fan: one straight row, whose rays lie in the plane of the source across the axis."""
         level = self.detector_shape[0] == 1 and not (self.axis_row + self.shifts[:, 1]).any()
         return self.is_cone and self.is_straight and level
 
     @cached_property
     def is_straight(self) -> bool:
-        """Rows run along u and columns along the rotation axis: no roll, tilt or centres (views may be shifted)."""
+        """Whether there is no roll, tilt or centre: rows run along u, columns along the axis (shifts are allowed)."""
         return not (self.roll.any() or self.tilt.any() or self.centres.any())
 
     @property
     def rows_show_slices(self) -> bool:
-        """Each detector row shows one slice in all views: a parallel beam, straight, not shifted along the axis."""
+        """Whether each detector row shows one slice in all projections: parallel, straight, no shift along the axis."""
         return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
 
     @property
     def climbs(self) -> bool:
-        """Whether views step along the rotation axis by half the detector's rows or more, as in a helix.
+        """Whether the projections move along the rotation axis by half the detector's rows or more, as in a helix.
 
-        By the middle half of them, which climbs half as far: single views that stand apart make no climb.
+        It is measured on the middle half of the projections, which moves half as far, so that single displaced
+        projections do not count.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
 
     @property
     def lean(self) -> float:
-        """Largest displacement by roll and tilt, from row to row, of a point of the field: mm at the rotation axis."""
+        """Largest displacement of a point of the field from row to row by roll and tilt, in mm at the rotation axis."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
         return self.reach * float(across.max())
 
     @property
     def period(self) -> float:
-        """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
+        """Angle in radians after which projections repeat the same rays: π for a centred parallel beam, otherwise 2π.
 
-        2π holds for a cone, and for an axis that leans along the beam by more than half a pixel over the field. It also
-        holds for an axis more than a tenth of the field off the detector's middle: views half a turn apart then see
-        different parts.
+        It is 2π for a cone, and if the axis is tilted along the beam by more than half a pixel over the field of view.
+        It is also 2π if the axis is off the detector's middle by more than a twentieth of the detector's width, because
+        opposite projections then see different parts of the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
 
     @property
     def unseen_cone(self) -> float:
-        """Half angle, in radians, of the cone of wave vectors about the rotation axis that no view measures.
+        """Half angle in radians of the cone of wave vectors about the rotation axis that no projection measures.
 
-        It is the least lean of the axis along the beam; 0 where that is at most half a pixel over the field.
+        It is the smallest tilt of the axis along the beam; 0 if that is at most half a pixel over the field of view.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
 
     @property
     def is_off_middle(self) -> bool:
-        """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
+        """Whether the axis is off the detector's middle by more than a twentieth of its width (half acquisition)."""
         cols = self.detector_shape[1]
         axis = (self.axis_col + self.offsets[:, 0])[self.is_centred]
         return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
 
     @property
     def is_centred(self) -> NDArray[np.bool_]:
-        """[view] which views are no offset views: those show the sample stepped aside by more than half a field."""
+        """[view] True for ordinary projections, False if offset laterally by more than half the detector width."""
         aside = self.shifts[:, 0]
         usual = np.sort(aside)[(aside.size - 1) // 2]
         return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)
@@ -270,9 +279,10 @@ class Geometry:
 
     @property
     def reach(self) -> float:
-        """mm from the rotation axis to the farthest column edge of any view, measured at the axis.
+        """mm from the rotation axis to the farthest column edge of any projection, measured at the axis.
 
-        Rolled views count as straight ones, offset views do not. For a wide cone the value is limited to 0.7 sod.
+        Rolled projections count as if they were straight; laterally offset ones do not count. For a wide cone the value
+        is limited to 0.7 sod.
         """
         cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.is_centred]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
@@ -280,13 +290,13 @@ class Geometry:
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest z in mm, at the rotation axis, that any view sees; tilted views count as straight ones."""
+        """Lowest and highest z in mm, at the rotation axis, that any projection sees; tilt is ignored."""
         rows, axis = self.detector_shape[0], self.axis_row + self.offsets[:, 1]
         low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
         return float(low * self.sample_pitch), float(high * self.sample_pitch)
 
     def axes(self, view: int) -> F64:
-        """Unit vectors [3, 3] of one view in the object's frame: along the columns, along the rows, along the beam."""
+        """Unit vectors [3, 3] of one projection in the object's frame: along columns, along rows, along the beam."""
         c, s = math.cos(self.angles[view]), math.sin(self.angles[view])
         ct, st = math.cos(self.tilt[view]), math.sin(self.tilt[view])
         cr, sr = math.cos(self.roll[view]), math.sin(self.roll[view])
@@ -300,7 +310,7 @@ class Geometry:
         )
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) of the origin of the object's frame, or of the view's centre, in one view."""
+        """Pixel (col, row) of the origin of the object's frame in one projection, or of its centre if it has one."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:
@@ -315,7 +325,7 @@ class Geometry:
         )
 
     def _repr_html_(self) -> str:
-        """For a notebook: directions of the views, and where the axis falls on the detector."""
+        """HTML for a notebook: the projection directions, and the position of the axis on the detector."""
         centre = (self.axis_col + 0.5) / self.detector_shape[1]
         return html("Geometry", fan(self.angles, centre), {"views": repr(self)[9:-1]})
 
@@ -323,80 +333,85 @@ class Geometry:
         """The same geometry with only `views`, in that order.
 
         Raises:
-            ValueError: for no views.
+            ValueError: `views` is empty.
         """
         chosen = np.atleast_1d(np.arange(self.n_views)[views])
         if chosen.size == 0:
-            raise ValueError("no views are selected")
+            raise ValueError("no projections are selected; give at least one")
         some: dict[str, Any] = {name: frozen(getattr(self, name)[chosen]) for name in _OF_VIEWS}
         return replace(self, **some)
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same set-up at other angles (radians), with the shift, roll and tilt common to all views.
+        """The same set-up at other angles (radians), with the shift, roll and tilt that all projections share.
 
         Raises:
-            ValueError: for bad angles, or if shift, roll, tilt or centre differ between views: new ones are not known.
+            ValueError: the angles are not valid, or shift, roll, tilt or centre differ between projections, so that the
+                values at new angles are unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
             if widest > 0:
                 raise ValueError(
-                    f"{name} differ from view to view (by up to {widest:.3g}), so those at other angles are not "
-                    f"known. Give a geometry whose views share one value, or one that holds the other views"
+                    f"{name} differ between the projections (by up to {widest:.3g}), so the values at other angles "
+                    "are unknown. Use a geometry in which all projections have the same value, or one that contains "
+                    "the other angles"
                 )
         theta = frozen(checked_angles(angles))
         return replace(self.select(np.zeros(theta.size, np.int64)), angles=theta)
 
     def followed_by(self, other: Geometry) -> Geometry:
-        """The views of this geometry, then those of another one of the same set-up."""
+        """The projections of this geometry, followed by those of another geometry of the same set-up."""
         both: dict[str, Any] = {
             name: frozen(np.concatenate((getattr(self, name), getattr(other, name)))) for name in _OF_VIEWS
         }
         return replace(self, **both)
 
     def straightened(self) -> Geometry:
-        """The same views without roll, tilt and centres."""
+        """The same projections without roll, tilt and centres."""
         none = frozen(np.zeros(self.n_views))
         return replace(self, roll=none, tilt=none, centres=frozen(np.zeros((self.n_views, 3))))
 
     def scaled(self, factor: float) -> Geometry:
-        """The same geometry with all lengths multiplied by `factor`, as in another unit."""
+        """The same geometry with all lengths multiplied by `factor`, for example to change the unit."""
         lengths = {name: factor * getattr(self, name) for name in ("pixel_pitch", "sod", "sdd")}
         return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same views with rays of a width, and a skew from row to row (rolling shutter).
+        """The same projections with a ray width, and a skew from row to row (rolling shutter).
 
         Raises:
-            ValueError: a skew that is not finite, or of a cone, or of rolled or tilted views: slices of the volume then
-                belong to no row.
+            ValueError: the skew is not finite, or it is not 0 for a cone beam or for rolled or tilted projections,
+                because a slice of the volume then does not belong to one row.
         """
         return replace(self, width=width, skew=float(skew))
 
     def about(self, centres: ArrayLike) -> Geometry:
-        """The same views of a cone with other centres, [view, 3] in mm; see `centres`.
+        """The same projections of a cone beam with other centres, [view, 3] in mm; see `centres`.
 
         Raises:
-            ValueError: not finite, another shape, or of a parallel beam.
+            ValueError: the centres are not finite or have another shape, or the beam is parallel.
         """
         points = np.asarray(centres, np.float64)
         if points.shape != (self.n_views, 3) or not np.isfinite(points).all():
-            raise ValueError(f"centres must be finite mm (x, y, z) [{self.n_views}, 3], got shape {points.shape}")
+            raise ValueError(
+                f"centres must be finite (x, y, z) in mm with shape [{self.n_views}, 3], got shape {points.shape}"
+            )
         return replace(self, centres=frozen(points))
 
     def at_row(self, row: float) -> Geometry:
-        """The same geometry without skew: all rows at the angle of this one."""
+        """The same geometry without skew: all rows have the angle of row `row`."""
         return replace(self, angles=frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
 
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own. The
-        central ray of a cone keeps its place, and so does the point that views are rolled and tilted about.
+        For a parallel beam, v is then measured from the middle of these rows, so that a slab is a scan of its own. The
+        central ray of a cone stays at its position, and so does the point about which projections are rolled and
+        tilted.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
-            raise ValueError(f"rows {start}:{stop} do not lie in 0:{rows}")
+            raise ValueError(f"rows {start}:{stop} are outside the detector, which has rows 0:{rows}")
         off_middle = self.axis_row - (rows - 1) / 2
         keeps = self.is_cone or not self.is_straight
         axis_row = self.axis_row - start if keeps else off_middle + (stop - start - 1) / 2
@@ -406,13 +421,13 @@ class Geometry:
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
 
-        As with `rows`, v of a straight parallel beam is then measured from the middle of the rows left.
+        As in `rows`, v of a straight parallel beam is then measured from the middle of the remaining rows.
         """
         if operator.index(factor) < 1:
-            raise ValueError(f"bin factor must be >= 1, got {factor}")
+            raise ValueError(f"the bin factor must be 1 or more, got {factor}")
         rows, cols = (n // factor for n in self.detector_shape)
         if rows < 1 or cols < 1:
-            raise ValueError(f"bin factor {factor} is larger than the detector {self.detector_shape}")
+            raise ValueError(f"the bin factor {factor} is larger than the detector, {self.detector_shape} (rows, cols)")
         whole = self.rows(0, rows * factor)
         return replace(
             whole,
@@ -428,23 +443,24 @@ class Geometry:
 
 
 def unseen_axis(axis_cols: ArrayLike, cols: int) -> str:
-    """The sentence on a rotation axis outside the detector's columns in all views; empty where a view shows it.
+    """The message about a rotation axis outside the detector in all projections; empty if a projection shows the axis.
 
-    Without any view of it, what lies about the axis is not measured, and the field is a ring of any size.
+    If no projection shows the axis, the region around it is not measured, and the field of view is a ring.
     """
     axes = np.atleast_1d(np.asarray(axis_cols, np.float64))
     sentence = (
-        f"The rotation axis, column {axes[0]:g}, lies outside the detector's columns 0 to {cols - 1}: no view shows "
-        "what lies about it. Columns count from 0 at the centre of the first column that was given: of a cropped or "
-        "binned detector, give the axis less the columns cropped before it, in binned columns."
+        f"The rotation axis, column {axes[0]:g}, is outside the detector's columns 0 to {cols - 1}, so no projection "
+        "shows the sample near the axis. Columns count from 0 at the centre of the first column of the given images. "
+        "For cropped images, subtract the columns that were cropped before the axis; for binned images, give the "
+        "axis in binned columns."
     )
     return "" if ((axes >= -0.5) & (axes <= cols - 0.5)).any() else sentence
 
 
 def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
-    """Raise ValueError unless the values are [view, row, col] of the geometry's views."""
+    """Raise ValueError unless the values have the shape [view, row, col] of the geometry."""
     if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):
-        raise ValueError(f"{name} have shape {shape}, the geometry says {expected} [view, row, col]")
+        raise ValueError(f"{name} must have shape {expected} [view, row, col] to match the geometry, got {shape}")
 
 
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:

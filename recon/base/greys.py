@@ -1,4 +1,4 @@
-"""Grey windows that separate the classes of a volume (air, matrix, dense matter), and pictures for a notebook."""
+"""Grey windows that separate the classes of a volume (air, matrix, dense material), and pictures for notebooks."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import some_values
 
-_SAMPLE = 200_000  # values that are looked at
-_SPLIT = 0.7  # share of the variance that two classes explain; halves of one normal distribution explain 0.64
-_LEAST = 2e-4  # share of the values that a class has at least
+_SAMPLE = 200_000  # number of values in the sample
+_SPLIT = (
+    0.7  # share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
+)
+_LEAST = 2e-4  # smallest share of the values in a class
 _MOST = 8  # classes
-_FREQUENT = 0.03  # share of all matter
-_METAL, _RARER = 4.0, 0.75  # times as dense as the matter below it, and as frequent: white, or that matter is black
-_WEAK = 0.6  # of the end of the window of matter
-_BEYOND = 0.1  # of the window, below air and above the densest class shown
+_FREQUENT = 0.03  # share of all material
+# A class that is this many times as dense as the class below it, and this much rarer, is shown white. Otherwise the
+# class below would be black.
+_METAL, _RARER = 4.0, 0.75
+_WEAK = 0.6  # share of the upper end of the material window
+_BEYOND = 0.1  # share of the window, added below air and above the densest class shown
 _DARKER, _BRIGHTER = 2.0, 98.0  # percentiles of a class that still belong to the window
 _ALL = (0.05, 99.95)
 
@@ -27,23 +31,23 @@ _ALL = (0.05, 99.95)
 def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
     """A sample of the finite values, ascending, split into classes by thresholds.
 
-    A class is parted where two of its parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man
-    Cybern. 9, 62), and each of these likewise.
+    A class is divided if two parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man Cybern. 9, 62). Each
+    part is divided in the same way.
     """
     flat = np.sort(some_values(np.asarray(values), _SAMPLE))
     flat = flat[np.isfinite(flat)].astype(np.float64)
     least = max(4, round(_LEAST * flat.size))
     classes, splits = [flat], [_split(flat, least)]
     while len(classes) < _MOST and max(gain for gain, _ in splits) > 0:
-        at = max(range(len(splits)), key=lambda k: splits[k][0])
-        place = splits[at][1]
-        parts = [classes[at][:place], classes[at][place:]]
-        classes[at : at + 1], splits[at : at + 1] = parts, [_split(part, least) for part in parts]
+        best = max(range(len(splits)), key=lambda k: splits[k][0])
+        place = splits[best][1]
+        parts = [classes[best][:place], classes[best][place:]]
+        classes[best : best + 1], splits[best : best + 1] = parts, [_split(part, least) for part in parts]
     return classes
 
 
 def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
-    """The sum of squares that two classes explain, and the values in the lower one; 0: they are one class."""
+    """The sum of squares that two classes explain, and the number of values in the lower class; 0: one class."""
     n = ascending.size
     places = least + np.flatnonzero(ascending[least : n - least + 1] > ascending[least - 1 : n - least])
     if n < 2 * least or not places.size:
@@ -59,21 +63,21 @@ def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
 def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]:
     """Grey windows (low, high) of a volume by name, the preferred one first.
 
-    "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen, "weak",
-    where it differs, to the least dense class, or, where that is a pin of metal alone, to the rest of the values.
-    "all" holds all values but the last half per mille at each end.
+    "matter" reaches from air to the densest class with which the class below it is still bright enough to be seen.
+    "weak" reaches to the least dense class (or, if that class is only a metal pin, to the rest of the values); it is
+    left out if it equals "matter". "all" contains all values except half a per mille at each end.
     """
     classes = [each for each in class_levels(values) if each.size]
     if not classes:
         return {"matter": (0.0, 1.0), "all": (0.0, 1.0)}
-    frequent = _FREQUENT * sum(each.size for each in classes[1:])  # the others are edges between matter
-    matter = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
-    levels, sizes = [float(np.median(each)) for each in matter], [each.size for each in matter]
+    frequent = _FREQUENT * sum(each.size for each in classes[1:])  # rarer classes are edges between materials
+    materials = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
+    levels, sizes = [float(np.median(each)) for each in materials], [each.size for each in materials]
     far = len(levels) > 2 and levels[-1] - levels[0] > _METAL * (levels[-2] - levels[0])
     top = len(levels) - 1 - (far and sizes[-1] < _RARER * sum(sizes[1:-1]))
 
     def window(top: int) -> tuple[float, float]:
-        low, high = float(np.percentile(matter[0], _DARKER)), float(np.percentile(matter[top], _BRIGHTER))
+        low, high = float(np.percentile(materials[0], _DARKER)), float(np.percentile(materials[top], _BRIGHTER))
         if top > 0:
             low = max(low, levels[0] - _BEYOND * (high - levels[0]))
         return apart(low, high + _BEYOND * (high - levels[top]))
@@ -86,12 +90,12 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
 
 
 def matter_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
-    """The window of matter of all these values together, see `grey_windows`."""
+    """The window "matter" of all these values together, see `grey_windows`."""
     return grey_windows(np.concatenate([np.ravel(array) for array in arrays]))["matter"]
 
 
 def apart(low: float, high: float) -> tuple[float, float]:
-    """The ends of a range, kept apart where all values are equal."""
+    """The ends of a range, moved apart if all values are equal."""
     return low, max(high, low + 1e-6 * max(abs(low), 1e-3))
 
 
@@ -141,11 +145,11 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
 
 
 def fan(angles: NDArray[np.float64], centre: float) -> U8:
-    """Directions of the rays of views, as dark lines through the rotation axis; x to the right, y downwards.
+    """Directions of the projections, drawn as dark lines through the rotation axis; x to the right, y downwards.
 
     Args:
         angles: [view] radians.
-        centre: where the axis falls on the detector, from 0 at its left to 1 at its right edge; drawn below.
+        centre: position of the axis on the detector, 0 at its left edge, 1 at its right edge; drawn below.
     """
     half, side = _SIDE // 4, _SIDE // 2
     sheet = np.full((side + 12, side), 255, np.uint8)

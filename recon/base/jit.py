@@ -1,4 +1,4 @@
-"""njit: numba's decorator, loaded at a kernel's first call, so that commands without kernels start sooner."""
+"""njit: numba's decorator, which imports numba at the first call of a kernel, so that other commands start sooner."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from recon.base.registry import loaded
 
 
 def thread_count() -> int:
-    """Threads that numba uses, by NUMBA_NUM_THREADS."""
+    """Number of threads that numba uses, from NUMBA_NUM_THREADS."""
     return int(loaded("numba").config.NUMBA_NUM_THREADS)
 
 

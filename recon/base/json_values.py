@@ -1,4 +1,4 @@
-"""What JSON has in place of values for which it has no type."""
+"""Converts values that JSON has no type for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """What JSON has in place of a value without a type there: arrays are lists, mappings objects, the rest is text."""
+    """The JSON form of a value that JSON has no type for: arrays become lists, mappings objects, all others text."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return dict(value) if isinstance(value, Mapping) else str(value)

@@ -1,4 +1,4 @@
-"""Kernel, Truncation and RayModel: profile of the Gaussians, where it is cut off, and its integral along a ray."""
+"""Kernel, Truncation and RayModel: the profile of a Gaussian, where it is cut off, and its integral along a ray."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ class Kernel(StrEnum):
         gaussian       exp(-q / 2)
         compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
 
-    R gives the compact kernel the second moment of the Gaussian, so that a covariance means the same with both. Its
-    line integral is of the same form with exponent m + 1/2, a polynomial at m = 3/2. Nothing has to be truncated. ∫ (1
-    - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its shadow is steeper at the edge and has no tail,
-    which suits matter with sharp edges.
+    R is chosen so that the compact kernel has the same second moment as the Gaussian; a covariance then means the same
+    for both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for
+    m = 3/2. Nothing has to be truncated. ∫ (1
+    - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its projection is steeper at the edge and has no
+      tail, which suits samples with sharp edges.
     """
 
     GAUSSIAN = "gaussian"
@@ -32,16 +33,19 @@ class Kernel(StrEnum):
 
     @classmethod
     def of_exponent(cls, exponent: float) -> Kernel:
-        """The kernel of this exponent, infinite for a Gaussian, as files hold it.
+        """The kernel with this exponent (infinite for a Gaussian), as stored in files.
 
         Raises:
-            ValueError: no kernel has this exponent.
+            ValueError: there is no kernel with this exponent.
         """
         for kernel in cls:
             if kernel.exponent == exponent:
                 return kernel
         known = ", ".join(f"{kernel.exponent:g} ({kernel})" for kernel in cls)
-        raise ValueError(f"no kernel has exponent {exponent:g}; known are {known}. A newer version may have written it")
+        raise ValueError(
+            f"unknown kernel exponent {exponent:g}; known exponents are {known}. A newer version of splatline may "
+            "have written it"
+        )
 
     @property
     def is_compact(self) -> bool:
@@ -49,7 +53,7 @@ class Kernel(StrEnum):
 
     @property
     def exponent(self) -> float:
-        """Exponent m of a compact kernel; infinite for a Gaussian, which is its limit."""
+        """Exponent m of a compact kernel; infinite for a Gaussian, which is the limit."""
         return 1.5 if self.is_compact else math.inf
 
     @property
@@ -67,21 +71,21 @@ class Kernel(StrEnum):
 
     @property
     def affine_terms(self) -> tuple[float, float, float, float]:
-        """Factors of βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint, see `cpu.footprints`."""
+        """Factors of βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint, see `kernels.cpu.footprints`."""
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:
-        """Radius in standard deviations at which it is cut off: a Gaussian at `sigmas`, a compact kernel at its end."""
+        """Cut-off radius in standard deviations: `sigmas` for a Gaussian, the end of a compact kernel."""
         return self.radius if self.is_compact else sigmas
 
 
 @dataclass(frozen=True)
 class Truncation:
-    """Where a Gaussian is cut off: at the smaller of two distances from its centre.
+    """Where a Gaussian is cut off: the smaller of two distances from its centre.
 
     Attributes:
-        sigmas: number of standard deviations (3.5 leaves 0.2 % of a projected Gaussian outside).
-        faint: fraction of the density unit (times the field of view for a projection) below which it is cut off.
+        sigmas: number of standard deviations (with 3.5, 0.2 % of a projected Gaussian is outside).
+        faint: it is cut off below this fraction of the density unit (in a projection: times the field of view).
     """
 
     sigmas: float = 3.5
@@ -99,12 +103,12 @@ class RayModel:
     """How the line integral of a Gaussian along a ray is computed.
 
     Attributes:
-        exact_above: in a cone, Gaussians with a larger error of the affine footprint are integrated exactly along each
-            ray. The error is relative L2, estimated, see recon.kernels.cpu.footprints. inf: none, 0: all. The
-            footprints of a parallel beam are exact.
+        exact_above: in a cone, a Gaussian is integrated exactly along each ray if the error of its affine footprint is
+            larger than this. The error is an estimated relative L2 error, see recon.kernels.cpu.footprints. inf: no
+            Gaussian, 0: all. In a parallel beam, footprints are exact.
         rectified: False gives the uncorrected footprints of 3DGS, as in X-Gaussian (see Zha et al. 2024, section 4.2).
-            The weight is then density times one length for all, half the width of the field, whatever length of the ray
-            lies in the Gaussian. It serves to show the bias.
+            The weight is then density times the same length for all (half the width of the field), independent of the
+            length of the ray in the Gaussian. It is for demonstrating the bias.
     """
 
     exact_above: float = math.inf
@@ -115,18 +119,18 @@ class RayModel:
             raise ValueError(f"exact_above must be a relative error >= 0 (inf: never), got {self.exact_above}")
         if not self.rectified and self.exact_above < math.inf:
             raise ValueError(
-                "rectified=False needs exact_above=inf, because exact integrals are always rectified; "
-                f"got {self.exact_above}"
+                "rectified=False needs exact_above=inf, because exact integrals are always rectified; got "
+                f"exact_above={self.exact_above}"
             )
 
     def length(self, geometry: Geometry) -> float:
-        """mm used for the length of every ray in a Gaussian; 0 to use the true length.
+        """Length in mm that is used for every ray in a Gaussian; 0: the true length.
 
         Raises:
-            ValueError: the uncorrected factor for rays with a width, which would not keep a Gaussian's mass.
+            ValueError: the rays have a width and `rectified` is False; the mass of a Gaussian would not be conserved.
         """
         if self.rectified:
             return 0.0
         if geometry.width:
-            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified at True")
+            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified=True")
         return geometry.detector_shape[1] * geometry.sample_pitch / 2

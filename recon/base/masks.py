@@ -1,4 +1,4 @@
-"""Masked pixels: filled from their neighbours, so that bad values do not spread, and given weight 0 in a fit."""
+"""Masked pixels: filled from their neighbours, so that bad values do not spread, with weight 0 in a fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.base.jit import njit
 
 Image = NDArray[np.float32]
 Fill = tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.intp]]
-"""The ring [row, col] of each masked pixel, counted from outside; 0: not masked; and rows and columns, ring by ring."""
+"""For each pixel [row, col] its ring, counted from outside (0: not masked); rows and columns in the order of rings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class RayWeights:
     """Weights of rays [view, row, col] as a product; only the requested part is computed.
 
     Attributes:
-        factors: float32 [view, row, col] each, one at least; see numpy.broadcast_to.
+        factors: at least one array, float32 [view, row, col] after numpy.broadcast_to.
     """
 
     factors: tuple[Image, ...]
@@ -34,13 +34,13 @@ class RayWeights:
 
 
 def plan_fill(mask: Mask) -> Fill:
-    """Order in which to fill masked pixels: rings from the outside in, each the mean of neighbours filled earlier.
+    """Order in which to fill masked pixels: in rings from outside, each from neighbours that are filled earlier.
 
     Raises:
         ValueError: all pixels [row, col] are masked.
     """
     if mask.all():
-        raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
+        raise ValueError(f"all {mask.size} pixels are masked or not finite, so there are no values to fill them from")
     ring = scipy.ndimage.distance_transform_cdt(mask, "chessboard")
     r, c = np.nonzero(mask)
     order = np.argsort(ring[r, c], kind="stable")
@@ -48,9 +48,9 @@ def plan_fill(mask: Mask) -> Fill:
 
 
 def areas(mask: Mask) -> Mask:
-    """Masked pixels [row, col] within an area of 3 x 3 or more; beyond the detector's edges all counts as masked.
+    """Masked pixels [row, col] in areas of 3 x 3 or more; outside the detector everything counts as masked.
 
-    Their fill values are guesses. A single pixel or a line is interpolated well.
+    Their fill values are guesses, whereas a single pixel or a line is interpolated well.
     """
     full = np.pad(mask, 1, constant_values=True)
     return np.asarray(scipy.ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
@@ -87,10 +87,10 @@ def _fill(image, ring, r, c):  # type: ignore[no-untyped-def]
 def masked(
     projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None, largest: float = math.inf
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Projections with all values finite, and their weights.
+    """Projections in which all values are finite, and their weights.
 
-    Pixels that are not finite, or have weight 0, take the mean of their neighbours in the same view, for direct methods
-    and first volumes. Their weight is 0, so that a fit ignores them.
+    Pixels that are not finite, or have weight 0, get the mean of their neighbours in the same projection. Direct
+    methods and first volumes use this value. Their weight is 0, so that a fit ignores them.
 
     Args:
         projections: [view, row, col]; not changed.
@@ -101,7 +101,7 @@ def masked(
         Projections (the array given, if nothing is filled) and weights (None if all are 1).
 
     Raises:
-        ValueError: for weights that are negative, not finite or of another shape, or a view without a single value.
+        ValueError: weights are negative, not finite or have another shape, or a projection has no usable value.
     """
     if weight is not None:
         if weight.shape != projections.shape:
@@ -122,8 +122,8 @@ def masked(
     if empty.size:
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"{empty.size} of {len(projections)} views have no value that is {within} and has a weight "
-            f"({empty[:8].tolist()} ...); leave these views out"
+            f"{empty.size} of {len(projections)} projections contain no usable value: none that is {within} and has a "
+            f"weight (projections {empty[:8].tolist()} ...). Leave these projections out"
         )
     filled = np.array(projections, np.float32)
     known = np.ones(projections.shape, np.float32) if weight is None else np.array(weight, np.float32)
@@ -135,14 +135,15 @@ def masked(
 
 
 def usual_weight(weights: F32, data: F32) -> float:
-    """The weight of a typical ray through matter: the mean over rays with weight, each counted by its line integral.
+    """The weight of a typical ray through the sample: the mean over rays with weight, weighted by line integrals.
 
-    Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
+    Rays past the sample may have the largest weights, for example if weights follow photon numbers. With a plain mean,
+    total variation would then dominate in the sample.
     """
     top = max(float(np.percentile(some_values(data, 100_003), 99)), 0.0)
-    matter, weighed = 0.0, 0.0
+    depths, weighed = 0.0, 0.0
     for view, weight in zip(data, weights, strict=True):
         depth = np.clip(view, 0, top) * (weight > 0)
-        matter += float(depth.sum(dtype=np.float64))
+        depths += float(depth.sum(dtype=np.float64))
         weighed += float((depth * weight).sum(dtype=np.float64))
-    return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
+    return weighed / depths if depths > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))

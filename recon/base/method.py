@@ -1,4 +1,4 @@
-"""Method: the interface of every reconstruction method, and the values that go in and come out.
+"""Method: the interface of all reconstruction methods, with their input and output values.
 
 A method is a frozen dataclass of its settings, a `Method`. `recon.methods` registers it.
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Plain = str | int | float
 Clock = Callable[[], float]
-_ENDLESS = 10**6  # steps or iterations: a time ends the run long before
+_ENDLESS = 10**6  # steps or iterations; a time limit ends the run long before
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,14 @@ class Progress:
     """State of a running reconstruction, as `RunControl` reports it.
 
     Attributes:
-        step, steps: done and planned, or iterations (0: unknown, as in a fit while views still arrive).
-        seconds: since the start, by the caller's clock.
+        step, steps: number of steps or iterations done and planned (planned 0: unknown, for example in a fit during a
+            scan).
+        seconds: time since the start, by the caller's clock.
         loss: running mean of the loss, in normalised units.
-        residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
-        n_gaussians, n_views: in the model and in the data.
-        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN without such views.
-        unit: name of the steps of a direct method or of a part of the work, such as slices; loss and residual are then
+        residual: running mean of |rendered - measured| / |measured| (root mean squares) over the projections just used.
+        n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
+        held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
+        unit: name of the steps of a direct method or of a part of the work, such as slices. Loss and residual are then
             NaN.
     """
 
@@ -62,22 +63,26 @@ class Progress:
 
 
 SWEEPS_OF_TRIALS = "sweeps of trials"
-"""How `Progress.unit` of trials begins: a search goes on as long as it must, so that few scans take the most."""
+"""Beginning of `Progress.unit` during test reconstructions.
+
+The planned number is the usual one. A search continues as long as necessary, and few scans take the largest number.
+"""
 
 
 SAMPLE = "sample_radius"
-"""Name of the decision on the radius, and how the settings begin that state it."""
+"""Name of the decision on the sample radius, and prefix of its settings."""
 
 
 @dataclass(frozen=True)
 class SampleRadius:
-    """How far a sample reaches from the rotation axis, where it is wider than the field.
+    """Distance from the rotation axis to the edge of a sample that is wider than the field of view.
 
     Attributes:
-        radius: that predicts views held out best, or that was given, in mm: half the width of a square box, so that it
-            lies between that of a round sample and 0.886 of it, where areas are equal.
-        low, high: mm, from which to which radius views are predicted as well but for chance, and a step of the search.
-        density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
+        radius: mm; the radius that predicts held-out projections best, or the given one. It is half the width of a
+            square box. For a round sample it is between the true radius and 0.886 of it (a square of equal area).
+        low, high: mm, range of radii that predict held-out projections equally well within chance, plus a step of the
+            search.
+        density: relative uncertainty of the density in the middle: half of its change from `low` to `high`.
     """
 
     radius: float
@@ -87,7 +92,7 @@ class SampleRadius:
 
     @property
     def settings(self) -> dict[str, float]:
-        """The values as settings of a result."""
+        """The values in the form of settings of a result."""
         return {SAMPLE if name == "radius" else f"{SAMPLE}_{name}": value for name, value in asdict(self).items()}
 
 
@@ -96,13 +101,13 @@ class DataUse(Checked):
     """How the projections are used.
 
     Attributes:
-        weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
-            neighbours and takes all others alike.
-        held_out: numbers of the views that are not fitted; their residual is in the history.
-        times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
-            views.
-        sample_radius: how far the sample reaches from the rotation axis, in mm, where it is wider than the field; None:
-            that is measured.
+        weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere. FBP interpolates rays of weight 0
+            from their neighbours and treats all other rays equally.
+        held_out: numbers of the projections that are not fitted; their residual is in the history.
+        times: [view] time of each exposure in s, for a method that makes volumes in time; None: evenly spaced, in the
+            order of the projections.
+        sample_radius: mm from the rotation axis to the edge of a sample that is wider than the field of view; None: it
+            is measured.
     """
 
     weights: F32 | None = None
@@ -113,17 +118,19 @@ class DataUse(Checked):
 
 @dataclass(frozen=True, eq=False)
 class RunControl(Checked):
-    """How a caller watches, ends and continues a reconstruction.
+    """How a caller follows, stops and resumes a reconstruction.
 
     Attributes:
-        should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far. Direct
-            methods do not ask. Any function, or a `Stop`; methods ask `stop`, which is always there.
-        on_progress: called about ten times a second, after each iteration, or each sixteen slices of FBP.
-        on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
-        resume: the checkpoint of a fit with the same data and settings, which is continued.
-        decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
-        stop_trials: asked after each sweep of the trials that choose a weight of total variation; True ends
-            these alone. None: as `should_stop`.
+        should_stop: function that is called between steps or iterations; True ends the reconstruction with the volume
+            so far. Direct methods do not call it. Any function or a `Stop`; methods use the property `stop`, which
+            always exists.
+        on_progress: called about ten times a second, after each iteration, or after every sixteen slices of FBP.
+        on_checkpoint: called with the checkpoint of a fit every `checkpoint_every` s.
+        resume: checkpoint from which a fit with the same data and settings continues.
+        decide: stores the decisions that the method derives from its data, and may repeat those of another run; None:
+            the run decides alone.
+        stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
+            total variation; True ends only these. None: same as `should_stop`.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -137,26 +144,26 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The request that methods ask between steps: should the run end with the volume so far?"""
+        """The `Stop` that methods call between steps: should the run end with the volume so far?"""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """The request that trials ask between sweeps."""
+        """The function that test reconstructions call between iterations: should they end?"""
         return self.stop_trials or self.stop
 
     def tell(self, progress: Progress) -> None:
-        """Report the progress, where somebody listens."""
+        """Report the progress if the caller asked for it."""
         if self.on_progress is not None:
             self.on_progress(progress)
 
     def report_progress(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
-        """Report progress without a residual: of a direct method, or of a part of the work that began at `begin`."""
+        """Report progress without a residual, for a direct method or a part of the work that began at `begin`."""
         if self.on_progress is not None:
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
-        """The same control with a deadline by its clock."""
+        """The same control with a deadline in s of its clock."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 
@@ -166,12 +173,12 @@ def _never() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ReconProblem:
-    """The views and the grid of a reconstruction.
+    """The projections and the grid of a reconstruction.
 
     Attributes:
-        views: line integrals, with the weights of their rays.
-        use: what else is known of the views, with their weights.
-        wide: the grid holds a sample beyond the field.
+        views: line integrals with the weights of their rays.
+        use: how the projections are used; its weights are those of `views`.
+        wide: True if the grid contains a sample that is wider than the field of view.
     """
 
     views: Views
@@ -186,7 +193,7 @@ class ReconProblem:
 
     @property
     def projections(self) -> F32:
-        """The line integrals [view, row, col] of the views."""
+        """The line integrals [view, row, col]."""
         return self.views.data
 
     @property
@@ -199,8 +206,8 @@ class Ending:
     """How a reconstruction ended, and the step from which it was resumed.
 
     Attributes:
-        early: it was stopped, and has the volume reached by then.
-        resumed_from: file of an earlier run that it continued; empty: it began anew.
+        early: True if it was stopped; the volume is the one reached by then.
+        resumed_from: file of the earlier run that it continued; empty: it started from the beginning.
         lost_checkpoint: why the last checkpoint could not be written; empty: none was lost.
     """
 
@@ -211,26 +218,29 @@ class Ending:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A reconstructed volume, with what its method says of itself: what `Method.run` and `recon.reconstruct` return.
+    """Result of a reconstruction: the volume and what the method reports about it.
+
+    `recon.reconstruct` and `Method.run` return it.
 
     Attributes:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
         settings: every parameter that was used.
-        history: the record of the fit or the iterations, empty for a direct method.
-        gaussians: the model behind the volume of a fit, a `recon.splatting.gaussians.Gaussians`, which this module
-            must not import; None for other methods.
-        checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
-        method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
-        seconds: wall time of the reconstruction. `run` may leave it to the caller, too, as 0.
-        deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
-        series: all volumes, the first of which is `volume`; None: the method makes one.
-        at: gives the volume [z, y, x] that a view shows, by its time as in `DataUse.times`, or by the number of its
-            energy; None: the method makes one volume.
-        chosen: how a choice or a preset came to the settings; empty where they were given.
-        started_from: Gaussians at the start of a fit; 0 for other methods.
-        ending: how it ended, as its caller knows it.
-        outside: gives what the sample outside the volume adds to views, [view, row, col] for their geometry; None:
-            nothing is known to lie there.
+        history: progress of the fit or the iterations; empty for a direct method.
+        gaussians: the Gaussian model of a fit, a `recon.splatting.gaussians.Gaussians` (this module must not import
+            it); None for other methods.
+        checkpoint: state of a fit for `RunControl.resume`; see `checkpoint.arrays_of`.
+        method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave it empty for the caller to
+            fill in.
+        seconds: wall time of the reconstruction. `run` may leave it 0 for the caller to fill in.
+        deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
+        series: all volumes of a method that makes several; the first one is `volume`. None: the method makes one.
+        at: function that returns the volume [z, y, x] for the time of a projection (as in `DataUse.times`) or the
+            number of its energy; None: the method makes one volume.
+        chosen: how an automatic choice or a preset found the settings; empty if they were given.
+        started_from: number of Gaussians at the start of a fit; 0 for other methods.
+        ending: how the run ended; the caller fills it in.
+        outside: function that returns the contribution of the sample outside the volume to the projections of a
+            geometry, [view, row, col]; None: no such contribution is known.
     """
 
     volume: Volume
@@ -261,10 +271,11 @@ class Reconstruction:
         return html(f"Reconstruction by {self.method}", pixels, facts)
 
     def save(self, path: str | Path) -> None:
-        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
+        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` converts it.
 
-        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON in which NaN and infinities are
-        numbers of Python's. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
+        The file contains the arrays of `Volume.save`, and `method`, `seconds` and `settings`. `settings` is JSON that
+        also contains NaN and Infinity, as Python writes them. If there are several volumes in time, it also contains
+        `series` float32 [volume, z, y, x] and `series_s`.
         """
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
         self.volume.save(
@@ -277,15 +288,15 @@ class Reconstruction:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """What `save` wrote, or `Volume.save`, which knows neither method nor settings.
+        """Read a file of `save`, or of `Volume.save` (which stores neither method nor settings).
 
-        Sequences and arrays among the settings are lists, and what JSON has no type for is text.
+        Sequences and arrays among the settings become lists. Values that JSON has no type for become text.
 
         Raises:
-            ValueError, KeyError: the file is no .npz, or one of another program.
+            ValueError, KeyError: the file is not an .npz, or another program wrote it.
         """
         if Path(path).exists() and not is_zipfile(path):
-            raise ValueError(f"{str(path)!r} is no .npz; expected a file that save wrote")
+            raise ValueError(f"{str(path)!r} is not an .npz file; give a file that save() wrote")
         with np.load(path, allow_pickle=False) as file:
             data, edge, height = file["volume"], float(file["voxel_mm"]), float(file["slice_mm"])
             grid = Grid(data.shape, edge, tuple(file["centre_zyx_mm"]), None if height == edge else height)
@@ -299,24 +310,27 @@ class Reconstruction:
 
 
 class Method(Checked, ABC):
-    """A reconstruction method: a frozen dataclass of its settings, and what its callers ask it.
+    """A reconstruction method: a frozen dataclass of its settings, with the properties that callers need.
 
-    A method derives from one of the four kinds in `recon.base.method_kinds`, which answer for it.
+    A method derives from one of the four kinds in `recon.base.method_kinds`, which define most of these properties.
 
     Attributes:
-        name: in commands, files and events.
-        label: in reports.
-        takes: what it accepts beside views, grid and seed: device, held_out, times, checkpoints, quality, budget.
-        halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
-        error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
-        fitted: its volume is fitted to the views step by step: it has a history, and can be stopped.
-        weighs: weights of rays count; else rays of weight 0 are filled, and all others count alike.
-        needs_matter: it refuses views without matter, such as those of a slab of air.
-        knows_outside: it explains views by a box that holds all of a sample wider than the field.
-        makes_boxes: it makes any box of voxels as it makes the whole volume.
-        volumes: number of volumes that it makes.
-        least_views: of each of several volumes.
-        allow_negative: voxels below zero are kept.
+        name: name in commands, files and events.
+        label: name in reports.
+        takes: what it accepts in addition to projections, grid and seed: device, held_out, times, checkpoints, quality,
+            budget.
+        halo: number of slices around a slab that it also reconstructs, so that the edges of the slab are not visible.
+        error_bars: factors for the difference of the refits and for the gradient, see `recon.error_bars`; None: not
+            calibrated.
+        fitted: True if it fits the volume to the projections step by step; then it has a history and can be stopped.
+        weighs: True if it uses the weights of rays. If False, rays of weight 0 are interpolated and all others count
+            equally.
+        needs_matter: True if it raises an error for projections without material, such as those of a slab of air.
+        knows_outside: True if it can use a box that contains all of a sample wider than the field of view.
+        makes_boxes: True if a box of voxels that it makes is identical to that part of the whole volume.
+        volumes: number of volumes it makes.
+        least_views: smallest number of projections for each of several volumes.
+        allow_negative: True if voxels below zero are kept.
     """
 
     name: ClassVar[str]
@@ -338,51 +352,51 @@ class Method(Checked, ABC):
         """Reconstruct.
 
         Raises:
-            ValueError: the method does not take these views, settings or data.
+            ValueError: the method cannot use these projections, settings or data.
         """
 
     @abstractmethod
     def toy(self) -> Self:
-        """The same method with the least work that still runs each of its kernels."""
+        """The same method with the least work that still runs all of its kernels."""
 
     @abstractmethod
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Peak memory of `run` in bytes, without the projections, and without their weights if they are `weighted`."""
+        """Peak memory of `run` in bytes, without the projections and (if `weighted`) without their weights."""
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """[view] which of these views it uses.
+        """[view] True for the projections it uses.
 
         Raises:
-            ValueError: it takes no such views.
+            ValueError: it cannot use such projections.
         """
         return np.ones(geometry.n_views, bool)
 
     @property
     def time_limit(self) -> float | None:
-        """Seconds that end a run; None: only its work does."""
+        """Time limit of a run in seconds; None: it ends when its work is done."""
         return None
 
     @property
     def stops_early(self) -> bool:
-        """Whether views held out may end a run."""
+        """Whether held-out projections may end a run early."""
         return False
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps over the views of all trials that choose its prior, as a rule."""
+        """Usual number of iterations, over all test reconstructions that choose its regularisation weight."""
         return 0
 
     @property
     def alternatives(self) -> tuple[Method, ...]:
-        """The methods that it chooses among, the preferred one first; itself if it does not choose."""
+        """The methods from which it chooses, the preferred one first; the method itself if it does not choose."""
         return (self,)
 
     def device_of(self, problem: ReconProblem) -> str:
-        """The device on which it computes this problem."""
+        """The device on which it solves this problem."""
         return problem.device if "device" in self.takes else "cpu"
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for this share of a volume, in this share of its seconds."""
+        """The method for a part of a volume: `share` of the volume in `of_time` of its seconds."""
         return self
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
@@ -391,6 +405,6 @@ class Method(Checked, ABC):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """The settings with which so many seconds, and nothing else, end a run; none where its own length remains."""
+        """Settings with which only a time limit of `seconds` ends a run; empty if the method ends by itself."""
         lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
         return {name: value for name, value in lengths.items() if name in types_of(cls)}

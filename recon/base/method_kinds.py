@@ -1,6 +1,7 @@
-"""Kinds of reconstruction methods: direct, iterative, and series of volumes; `recon.splatting.fit_method` has fits.
+"""Kinds of reconstruction methods: direct, iterative, and series of volumes. `recon.splatting.fit_method` has fits.
 
-A method derives from one of them, which answers what its callers ask (`recon.base.method.Method`).
+A method derives from one of these classes, which defines the properties that callers need (see
+`recon.base.method.Method`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from recon.base.method import Method
 
 
 class Direct(Method):
-    """One pass over the views, such as filtered back-projection: it continues views beyond the field."""
+    """One pass over the projections, such as filtered back-projection. It extrapolates truncated projections."""
 
     fitted: ClassVar[bool] = False
     weighs: ClassVar[bool] = False
@@ -23,19 +24,19 @@ class Direct(Method):
     makes_boxes: ClassVar[bool] = True
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All but offset views, see `Geometry.is_centred`."""
+        """All projections except laterally offset ones, see `Geometry.is_centred`."""
         return geometry.is_centred
 
 
 class Iterative(Method):
-    """Steps, each of which brings the volume nearer to the views, and after each of which it can be stopped."""
+    """Iterations that bring the volume nearer to the projections; it can be stopped after each iteration."""
 
 
 class Series(Method):
-    """Several volumes at times of the scan, all at once in memory, which all views determine together.
+    """Several volumes at different times of the scan, reconstructed together from all projections, all in memory.
 
     Attributes:
-        volumes: how many; `Reconstruction.series` has all.
+        volumes: number of volumes; `Reconstruction.series` contains all of them.
     """
 
     takes: ClassVar[frozenset[str]] = frozenset({"times"})

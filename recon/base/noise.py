@@ -1,4 +1,4 @@
-"""Noise of a scan, from differences of third and fourth order along rows and columns; the level of air."""
+"""Noise of a scan, measured from third and fourth differences along rows and columns; and the air level."""
 
 from __future__ import annotations
 
@@ -7,38 +7,39 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import scipy  # whose ndimage loads at its first use: every scan imports this module
+import scipy  # every scan imports this module, so scipy.ndimage is loaded only when it is first used
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, median_deviation, some_values
 from recon.base.geometry import Geometry
 
-NOISE_VIEWS = 16  # looked at
-_LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
+NOISE_VIEWS = 16  # number of projections in which the noise is measured
+_LOW, _HIGH = 3, 4  # orders of the differences; the higher order contains finer structure
 _LARGEST_BLUR = 1.5  # pixels
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
-_EVEN = 0.02  # of a step between views
-_SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
-_CLIPPED, _ROUNDS = 4.0, 20  # standard deviations of air, rounds
-_GROWTH = 4.0  # largest deviation of air, over that of the values below its commonest value
+_EVEN = 0.02  # tolerance, as a share of the step between projections
+# values and bins of a histogram; least height of a peak, as a share of the highest
+_SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1
+_CLIPPED, _ROUNDS = 4.0, 20  # clipping in standard deviations of air; most rounds
+_GROWTH = 4.0  # largest standard deviation of air, divided by that of the values below its most frequent value
 
 
 def noise_level(images: F32) -> float:
-    """Standard deviation of the noise of a typical pixel, white or blurred after it arose.
+    """Standard deviation of the noise in a typical pixel, for white noise or noise that was blurred afterwards.
 
-    Matter changes slowly from pixel to pixel, noise does not: differences of order n both ways keep mostly noise.
-    Differences of white noise have C(2n, n) times its standard deviation. Noise that was blurred, by
+    The sample changes slowly from pixel to pixel, noise does not. So differences of order n along both axes contain
+    mostly noise. For white noise, they have C(2n, n) times its standard deviation. Noise that was blurred, by
     interpolation or in a scintillator, has less at high frequencies. So the fourth differences, divided by C(8, 4), are
     smaller than the third ones, divided by C(6, 3). Their ratio gives the width of the blur, taken as Gaussian, and so
-    the noise at all frequencies. Offsets of a pixel in all views (rings) do not count. [our own; median of
+    the noise at all frequencies. Constant offsets of a pixel (rings) do not count. [our own method; median of
     differences: Immerkær 1996, Comput. Vis. Image Underst. 64, 300]
 
-    White noise on real samples is found within a third, noise blurred by up to 0.7 pixel within a half, see
-    tests/recon/base/test_noise.py. Fine texture in almost noiseless views counts as noise.
+    On real samples, the result is within a third of the true value for white noise, and within a half for noise blurred
+    by up to 0.7 pixel (tests/recon/base/test_noise.py). In almost noiseless projections, fine texture counts as noise.
 
     Args:
-        images: [view, a, b], line integrals; NaN: does not count. An axis is not used along which fewer than five
-            pixels in succession count. Some 16 views are read.
+        images: [view, a, b], line integrals; NaN marks pixels that do not count. An axis is used only if at least five
+            successive pixels along it count. About 16 projections are read.
 
     Returns:
         The standard deviation; 0 if no axis is used.
@@ -49,7 +50,7 @@ def noise_level(images: F32) -> float:
     if low == 0:
         return 0.0
     ratios, gains = _blurs()
-    by_chance = 2 / math.sqrt(some.size)  # white noise has a ratio of 1 give or take this
+    by_chance = 2 / math.sqrt(some.size)  # tolerance: white noise has a ratio of 1 within this
     at = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / len(axes)), 1.0)))
     return low * float(gains[min(at, gains.size - 1)]) ** (len(axes) / 2)
 
@@ -60,9 +61,10 @@ def deviation_between_neighbours(values: NDArray[np.floating[Any]], order: int =
 
 
 def deviation_between_frames(frames: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of a pixel of frames [frame, row, col] from each to the next, without changes of the whole.
+    """Standard deviation of a pixel between successive frames [frame, row, col], without changes of the whole frame.
 
-    Neighbours in time share slow drift and all fixed pattern. Of a single frame, from place to place.
+    Differences of successive frames contain no slow drift and no fixed pattern. For a single frame, neighbouring pixels
+    are compared instead.
     """
     if len(frames) == 1:
         return median_deviation(frames - np.nanmedian(frames))
@@ -73,11 +75,11 @@ def deviation_between_frames(frames: NDArray[np.floating[Any]]) -> float:
 def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
     """The smaller of `noise_level` and the noise at frequencies above those of the sample's structure.
 
-    While the stage turns by an angle, a point at most R pixels off the axis moves by R times this angle at most. So a
-    sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
+    If the stage turns by an angle, a point that is at most R pixels from the axis moves by at most R times this angle.
+    So a sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
     Rattey & Lindgren 1981, IEEE Trans. Acoust. 29, 994; of a fan: Mazin & Pelc 2010, Med. Phys. 37, 2674). Noise has
-    them, however fine the sample is. Views must be straight and evenly spread over a full turn, or half a turn of a
-    parallel beam. Their number must exceed a third of the columns (half of that for half a turn), about.
+    these harmonics, however fine the sample is. The projections must be straight and evenly spread over 360°, or over
+    180° for a parallel beam. Their number must exceed about a third of the number of columns (half of that for 180°).
 
     Args:
         lines: [view, col, row]; rows with NaN are not used.
@@ -86,7 +88,7 @@ def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
 
 
 def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
-    """Standard deviation of white noise with the same power there; infinite where it cannot be told."""
+    """Standard deviation of white noise with the same power at these frequencies; infinite if it cannot be measured."""
     order = _evenly_spread(geometry)
     cols, bins = geometry.detector_shape[1], np.arange(2, 2 + _BOW_TIE_BINS)
     axis = geometry.axis_col + geometry.shifts[:, 0]
@@ -96,46 +98,47 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
         return math.inf
     rows = rows[:: -(-rows.size // _BOW_TIE_ROWS)]
     middle = round(float(axis.mean()))
-    at = np.arange(max(0, middle - half), min(cols, middle + half + 1))
-    window = np.hanning(at.size + 2)[1:-1]
-    omega = 2 * np.pi * bins / at.size
-    waves = window[:, None] * np.exp(-1j * omega * (at[:, None] - middle))
-    spectrum = np.einsum("vcr,cm->vmr", lines[order][:, at][:, :, rows], waves, optimize=True)
+    chosen = np.arange(max(0, middle - half), min(cols, middle + half + 1))
+    window = np.hanning(chosen.size + 2)[1:-1]
+    omega = 2 * np.pi * bins / chosen.size
+    waves = window[:, None] * np.exp(-1j * omega * (chosen[:, None] - middle))
+    spectrum = np.einsum("vcr,cm->vmr", lines[order][:, chosen][:, :, rows], waves, optimize=True)
     spectrum *= np.exp(1j * omega * (axis[order, None] - middle))[:, :, None]
     theta = np.unwrap(geometry.angles[order])
-    if np.ptp(theta) < 1.01 * np.pi:  # the views of the other half turn are these, mirrored
+    if np.ptp(theta) < 1.01 * np.pi:  # the projections of the other 180° are these, mirrored
         spectrum = np.concatenate((spectrum, spectrum.conj()))
     count = len(spectrum)
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
     reach = half + 0.5 + float(np.ptp(axis))
     off = reach * geometry.sample_pitch / geometry.sod
-    bound = reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
+    bound = reach / (1 - off) * (omega + 4 * np.pi / chosen.size) + 2 if off < 1 else np.full(bins.size, np.inf)
     free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
     few = power[free]
     return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf
 
 
 def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
-    """Views in the order of their angles, if these divide a full turn evenly, or half a turn of a parallel beam."""
+    """Projections in the order of their angles, if these are evenly spread over 360°, or 180° for a parallel beam."""
     theta = np.mod(geometry.angles, 2 * np.pi)
     order = np.argsort(theta, kind="stable")
     gaps = np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
-    order = np.roll(order, -1 - int(np.argmax(gaps)))  # from behind the widest gap on
+    order = np.roll(order, -1 - int(np.argmax(gaps)))  # start after the widest gap
     steps = np.mod(np.diff(theta[order]), 2 * np.pi)
     if steps.size < 3 or np.ptp(steps) > _EVEN * steps.mean():
         return None
     for period in (2 * np.pi,) if geometry.is_cone else (np.pi, 2 * np.pi):
-        for views in (order.size, order.size - 1):  # a view at the end of the turn may repeat the first
+        for views in (order.size, order.size - 1):  # the last projection of the turn may repeat the first one
             if abs(views * steps.mean() - period) < _EVEN * period / views:
                 return order[:views]
     return None
 
 
 def air_level(values: F32) -> tuple[float, float]:
-    """The level of air among the values of a volume, and its standard deviation.
+    """The air level of a volume and its standard deviation.
 
-    It begins at the lowest value that many voxels have, and repeatedly takes the values within four deviations. The
-    deviation of uneven air is at most four times that of the values below the first level.
+    It starts at the lowest value that many voxels have, and repeatedly takes the median of the values within four
+    standard deviations. If air is uneven, its standard deviation is limited to four times that of the values below the
+    first level.
     """
     values = some_values(values, _SAMPLED)
     low, high = np.percentile(values, (0.05, 99.95))
@@ -160,11 +163,12 @@ def air_level(values: F32) -> tuple[float, float]:
 
 
 def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) -> int:
-    """Index of the first maximum of this height and prominence; the middle of a level one, as scipy's `find_peaks`.
+    """Index of the first maximum with this height and prominence (the middle of a plateau), as scipy's `find_peaks`.
 
-    A curve that begins and ends at its minimum has one. scipy.signal takes a second to load.
+    A curve that begins and ends at its minimum has such a maximum. scipy.signal is not used, because it takes a second
+    to load.
     """
-    bounds = np.flatnonzero(np.diff(curve, prepend=np.nan, append=np.nan))  # of stretches of one value
+    bounds = np.flatnonzero(np.diff(curve, prepend=np.nan, append=np.nan))  # of runs of equal values
     for first, last in zip(bounds[:-1], bounds[1:] - 1, strict=True):
         top = curve[first]
         if top < height or first == 0 or last == curve.size - 1 or max(curve[first - 1], curve[last + 1]) > top:
@@ -179,7 +183,7 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
 
 
 def _long_axes(images: F32) -> list[int]:
-    """Axes along which five valid pixels lie side by side, also after differences along the axes before."""
+    """Axes along which five successive pixels are valid, also after the differences along the previous axes."""
     field, axes = images, list[int]()
     for axis in (1, 2):
         further = np.diff(field, _HIGH, axis=axis)

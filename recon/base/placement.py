@@ -1,4 +1,4 @@
-"""Placement of views: where the rotation axis falls on the detector and how each view stands, checked as stated."""
+"""Placement of projections: position of the rotation axis on the detector, and shift, roll and tilt, with checks."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from numpy.typing import ArrayLike
 from recon.base.arrays import F64, frozen
 from recon.base.declared_types import check_arguments
 
-_SHORTEST, LONGEST = 1e-12, 1e9  # mm, from far below an atom to 1000 km: between them float32 holds what is computed
+# mm, from far below an atom to 1000 km; in this range float32 can represent the results
+_SHORTEST, LONGEST = 1e-12, 1e9
 
 
 class Where(TypedDict, total=False):
-    """Position of the rotation axis on the detector, and pose of each view; as the attributes of a `Geometry`.
+    """Position of the rotation axis on the detector, and pose of each projection; as the attributes of a `Geometry`.
 
     Attributes:
-        axis_col, axis_row: None or left out: the middle of the detector, at (cols - 1) / 2; rows alike.
+        axis_col, axis_row: None or left out: the middle of the detector, (cols - 1) / 2 and (rows - 1) / 2.
         shifts: [view, 2] pixels; None or left out: none.
-        roll, tilt: radians, one for all views or [view]; left out: 0.
+        roll, tilt: radians, one value for all projections or [view]; left out: 0.
     """
 
     axis_col: float | None
@@ -33,14 +34,16 @@ class Where(TypedDict, total=False):
 def placed_views(
     angles: ArrayLike, detector_shape: tuple[int, int], pixel_pitch: float, **where: Unpack[Where]
 ) -> dict[str, Any]:
-    """What is stated of views as attributes of a `Geometry`, all but the distances of its source.
+    """The attributes of a `Geometry` for these projections, except the distances of the source.
 
     Raises:
-        TypeError: a keyword that `Where` lacks.
-        ValueError: no views, an empty detector, a pitch that is not positive, or values that are not finite.
+        TypeError: a keyword that `Where` does not have.
+        ValueError: there are no angles, the detector is empty, the pitch is not positive, or a value is not finite.
     """
     if unknown := where.keys() - Where.__annotations__.keys():
-        raise TypeError(f"a geometry has no {', '.join(sorted(unknown))}; expected {', '.join(Where.__annotations__)}")
+        raise TypeError(
+            f"unknown geometry arguments: {', '.join(sorted(unknown))}; known are {', '.join(Where.__annotations__)}"
+        )
     check_arguments(Where, where)
     axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
     theta = checked_angles(angles)
@@ -48,7 +51,7 @@ def placed_views(
     if rows < 1 or cols < 1:
         raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
     if not _SHORTEST <= pixel_pitch <= LONGEST:
-        raise ValueError(f"pixel_pitch must be a length of {_SHORTEST:g} to {LONGEST:g} mm, got {pixel_pitch}")
+        raise ValueError(f"pixel_pitch must be {_SHORTEST:g} to {LONGEST:g} mm, got {pixel_pitch}")
     col = (cols - 1) / 2 if axis_col is None else float(axis_col)
     row = (rows - 1) / 2 if axis_row is None else float(axis_row)
     for name, value in (("axis_col", col), ("axis_row", row)):
@@ -56,7 +59,9 @@ def placed_views(
             raise ValueError(f"{name} must be finite, got {value}")
     moved = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
     if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
-        raise ValueError(f"shifts must be finite pixels (col, row) [{theta.size}, 2], got shape {moved.shape}")
+        raise ValueError(
+            f"shifts must be finite pixels (col, row) with shape [{theta.size}, 2], got shape {moved.shape}"
+        )
     roll, tilt = (_checked_turns(name, where.get(name, 0.0), theta.size) for name in ("roll", "tilt"))
     return {
         "angles": frozen(theta), "detector_shape": (rows, cols), "pixel_pitch": float(pixel_pitch),
@@ -65,18 +70,21 @@ def placed_views(
 
 
 def checked_angles(angles: ArrayLike) -> F64:
-    """Angles [view] in radians. ValueError: none, or not finite."""
+    """Angles [view] in radians. ValueError if there are none or one is not finite."""
     theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
     if theta.ndim != 1 or theta.size == 0:
-        raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
+        raise ValueError(f"angles must be a list of at least one angle in radians, got shape {theta.shape}")
     if not np.isfinite(theta).all():
         bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
-        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
+        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (projections {bad} ...)")
     return theta
 
 
 def _checked_turns(name: str, turns: Any, views: int) -> F64:
     given = np.asarray(turns, np.float64)
     if given.shape not in ((), (views,)) or not np.isfinite(given).all():
-        raise ValueError(f"{name} must be finite radians, one for all views or [{views}], got {given.shape}")
+        raise ValueError(
+            f"{name} must be finite radians: one number for all projections, or an array of shape [{views}]; got "
+            f"shape {given.shape}"
+        )
     return frozen(np.broadcast_to(given, (views,)))

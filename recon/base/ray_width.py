@@ -1,4 +1,4 @@
-"""RayWidth: the rays that a pixel averages during one exposure, beside its central ray."""
+"""RayWidth: the bundle of rays around its central ray over which a pixel averages during one exposure."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from recon.base.setting import NonNegative
 
 @dataclass(frozen=True)
 class RayWidth(Checked):
-    """Spread of a pixel's signal on the detector, and turn of the stage during the exposure; 0: a single ray.
+    """Area on the detector over which a pixel averages, and rotation during the exposure; all 0: a single ray.
 
     Attributes:
-        pixel: side in pixels of the square over which a pixel averages; 1: its own area.
+        pixel: side, in pixels, of the square over which a pixel averages; 1: its own area.
         blur: standard deviation in pixels of a Gaussian blur of the detector (scintillator, optics).
-        arc: radians that the stage turns during an exposure; a view's angle is that of the middle of its exposure.
+        arc: radians that the stage turns during an exposure; the angle of a projection is that at the middle of its
+            exposure.
     """
 
     pixel: NonNegative = 0.0
@@ -27,11 +28,11 @@ class RayWidth(Checked):
 
     @property
     def variance(self) -> float:
-        """Variance of the spread along columns, and along rows, in px²."""
+        """Variance along columns and along rows of the averaged area, in px²."""
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:
-        """The same in pixels of factor x factor; a pixel's own area becomes that of the binned one."""
+        """The same width in binned pixels of factor x factor; a pixel's own area becomes that of the binned pixel."""
         return replace(self, blur=self.blur / factor)
 
 

@@ -1,7 +1,7 @@
-"""Registry: entries of one kind by name: ours, and those that other installed packages add by entry points; loaded.
+"""Registry: all entries of one kind by name: those of splatline, and those of other packages (entry points).
 
-Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check,
-effect or command; the entry point's name is the name of the addition.
+The entry points are in the group `splatline.KIND`. KIND is method, correction, reader, volume_format, stage, wire,
+camera, check, effect or command. The name of the entry point is the name of the addition.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ ADD_ONS = {
     "tango": "splatline-tango",
     **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }
-"""Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
-_LIKENESS = 0.65  # of 1: from which likeness on a name may have been meant
+"""Names that our add-on packages provide, and the package of each (the folders in `packages/` of the repository)."""
+_LIKENESS = 0.65  # similarity, 0 to 1, from which on another name is suggested
 
 T = TypeVar("T")
 
 
 def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
-    """The message for an unknown name, with the legal names and the nearest one; without a full stop.
+    """The message for an unknown name, with the legal names and the most similar one; without a full stop.
 
     Args:
-        kind: what the name is of, such as "method"; empty where the sentence goes on from that.
+        kind: what the name is for, such as "method"; empty if the caller's sentence already says it.
     """
     if str(name) in ADD_ONS:
         return f"{kind} {name!r} {add_on_missing(str(name))}".lstrip()
@@ -50,43 +50,45 @@ def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
 
 
 def add_on_missing(name: str) -> str:
-    """Why an add-on of `ADD_ONS` is not there, and what to do, as the end of a sentence without a full stop."""
+    """Why an add-on of `ADD_ONS` is missing, and what to do: the end of a sentence, without a full stop."""
     for point in entry_points_announced():
         if point.name == name:
-            why = "a warning says why it was left out"
+            why = "is installed, but could not be used: a warning gives the reason"
             try:
                 point.load()
             except (Exception, SystemExit) as error:
                 why = _one_line(f"{type(error).__name__}: {error}")
             package = ADD_ONS[name] if point.dist is None else point.dist.name
-            return f"is installed, but does not work ({point.value}: {why}): pip install --force-reinstall {package}"
-    return f"needs a package that is not installed: pip install {ADD_ONS[name]}"
+            return (
+                f"is installed, but does not load ({point.value}: {why}). Try: pip install --force-reinstall {package}"
+            )
+    return f"is in a package that is not installed. Install it with: pip install {ADD_ONS[name]}"
 
 
 def did_you_mean(name: object, legal: Iterable[str]) -> str:
-    """The nearest legal name as the end of a sentence, after a space; "" if none is near."""
+    """The most similar legal name as the end of a sentence, after a space; "" if none is similar."""
     return f" (did you mean {near}?)" if (near := nearest(name, legal)) else ""
 
 
 def nearest(name: object, legal: Iterable[str]) -> str:
-    """The legal name that was probably meant; "" if none is near."""
-    from difflib import get_close_matches  # here: only errors need it
+    """The legal name that was probably meant; "" if none is similar."""
+    from difflib import get_close_matches  # imported here, because only errors need it
 
     return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_LIKENESS)), "")
 
 
 @contextmanager
 def signals_waiting() -> Iterator[None]:
-    """Handlers of signals are called when the context ends. Python runs them in the main thread, so only it waits.
+    """Delays signal handlers until the context ends. Python runs them in the main thread, so only that one waits.
 
-    An exception of a handler in the middle of an import leaves half of a library: numba and torch then fail until
-    Python is started anew.
+    If a handler raises an exception in the middle of an import, the library is only half loaded. numba and torch then
+    fail until Python is restarted.
     """
     came = list[tuple[Any, Any]]()
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():
             handlers = {s: handler for s in signal.valid_signals() if callable(handler := signal.getsignal(s))}
-            stack.callback(lambda: [handlers[s](s, frame) for s, frame in came])  # at last
+            stack.callback(lambda: [handlers[s](s, frame) for s, frame in came])  # runs last
             for number, handler in handlers.items():
                 stack.callback(signal.signal, number, handler)
                 signal.signal(number, lambda s, frame: came.append((s, frame)))
@@ -94,14 +96,14 @@ def signals_waiting() -> Iterator[None]:
 
 
 class LibraryError(ImportError):
-    """A library of others cannot be loaded."""
+    """A third-party library cannot be loaded."""
 
 
 def loaded(module: str) -> Any:
-    """The module, as `importlib.import_module`; its first import ends before a signal is handled.
+    """The module, as from `importlib.import_module`; signals wait until its first import has ended.
 
     Raises:
-        LibraryError: the import of another project's module failed.
+        LibraryError: the module is not ours, and its import failed.
     """
     with nullcontext() if module in sys.modules else signals_waiting():
         try:
@@ -120,18 +122,19 @@ class UnknownNameError(ValueError, KeyError):
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """The entries of a kind, by name: ours first, then those of other packages in the order of their names.
+    """The entries of a kind by name: first those of splatline, then those of other packages in alphabetical order.
 
-    Other packages are asked at the first use, so that programs without it start quickly.
+    Other packages are searched at the first use, so that programs that do not use the registry start quickly.
 
     Args:
-        kind: of its entries, as above.
-        ours: our own.
-        made: makes an entry from the name and the object of an entry point; ValueError if the object does not fit.
-        reserved: names that no addition may have, beside ours.
+        kind: kind of its entries, as above.
+        ours: the entries of splatline.
+        made: function that makes an entry from the name and the object of an entry point; ValueError if the object does
+            not fit.
+        reserved: further names that no addition may have.
 
-    Raises (where a name is looked up):
-        UnknownNameError: there is none of this name; the message has all names.
+    Raises (when a name is looked up):
+        UnknownNameError: there is no entry with this name; the message lists all names.
     """
 
     def __init__(
@@ -161,25 +164,26 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def tables_in_folders(package: str, table: str) -> dict[str, Mapping[str, Any]]:
-    """The dictionaries named `table` of the folders of a package, by folder in the order of their names."""
+    """The dictionaries named `table` in the folders of a package, by folder in alphabetical order."""
     folders = sorted(name for _, name, is_folder in iter_modules(import_module(package).__path__) if is_folder)
     return {folder: getattr(import_module(f"{package}.{folder}"), table, {}) for folder in folders}
 
 
 def in_folders(package: str, table: str) -> dict[str, Any]:
-    """The dictionaries named `table` of the folders of a package, joined in the order of the folders' names."""
+    """The dictionaries named `table` in the folders of a package, merged in alphabetical order of the folders."""
     return {name: row for rows in tables_in_folders(package, table).values() for name, row in rows.items()}
 
 
 def plugins(
     kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
 ) -> dict[str, Any]:
-    """The additions of other packages to a registry, by name, in the order of the names.
+    """The additions of other packages to a registry, by name in alphabetical order.
 
     Args:
-        kind: of the registry, as above.
+        kind: kind of the registry, as above.
         taken: names that the registry has itself.
-        made: makes the registry's entry from a name and the loaded object; ValueError if the object does not fit.
+        made: function that makes the registry's entry from a name and the loaded object; ValueError if the object does
+            not fit.
 
     Warns:
         UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
@@ -190,40 +194,41 @@ def plugins(
         try:
             if point.name in taken or times[point.name] > 1:
                 by = "splatline" if point.name in taken else "another plug-in"
-                raise ValueError(f"the name is taken by {by}; expected another name")
+                raise ValueError(f"the name is already used by {by}; choose another name")
             with signals_waiting(), redirect_stdout(sys.stderr):  # stdout is for results
                 found[point.name] = made(point.name, point.load())
-        except (Exception, SystemExit) as error:  # another package's fault must not stop a scan
+        except (Exception, SystemExit) as error:  # an error in another package must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
-            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
+            reason = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
             warnings.warn(
-                f"The {kind.replace('_', ' ')} {_one_line(told)}. Mend or uninstall that package; all else works "
-                "without it.",
+                f"The {kind.replace('_', ' ')} {_one_line(reason)}. Everything else works without it. To use it, "
+                "repair that package; otherwise uninstall it.",
                 stacklevel=2,
             )
     return found
 
 
 def _one_line(text: str) -> str:
-    """The text without control characters, which would act on a terminal or begin a line of a log; not too long."""
+    """The text on one line, shortened, without control characters (they could change a terminal or a log)."""
     line = " ".join(text[:1000].split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 @cache
 def entry_points_announced() -> tuple[EntryPoint, ...]:
-    """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
+    """Entry points of all installed packages. Reading them takes a tenth of a second, once per process."""
     found = entry_points()
     return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """Numbers of iterations or steps that a comparison tries of a method.
+    """Numbers of iterations or steps with which a trade-off runs a method.
 
     Attributes:
         setting: "iterations" or "steps".
-        quick, full: of a short and of a long comparison. The first one is the baseline, about which others vary.
+        quick, full: numbers for a quick and for a full trade-off. The first number is the baseline for other
+            variations.
     """
 
     setting: Literal["iterations", "steps"]
@@ -233,14 +238,14 @@ class Lengths:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """Where the settings class of a method is, and when it is compared with others.
+    """Where to find the settings class of a method, and whether comparisons include it.
 
     Attributes:
-        module, cls: of its settings class, see `recon.base.method.Method`.
-        streams: it has `stream`, so that its volume can grow while views arrive.
-        compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
-        several: what its volumes are of, where it makes several.
-        lengths: that a trade-off tries; None: the default.
+        module, cls: module and name of the settings class, see `recon.base.method.Method`.
+        streams: True if it has `stream`, so that it can reconstruct during a scan.
+        compared: True if a trade-off includes it by default; False for methods that take many times as long.
+        several: what distinguishes its volumes, if it makes several.
+        lengths: numbers of iterations or steps that a trade-off tries; None: the default.
     """
 
     module: str

@@ -1,10 +1,10 @@
-"""Setting: the declaration of a value, beside its type and its default: its meaning, unit and legal range.
+"""Setting: declares the meaning, unit and legal range of a value, next to its type and default.
 
     exposure: Annotated[float, Setting("Of a view.", unit="s", gt=0, le=1e6)] = 0.1
 
-Fields of methods, of drivers' settings, of checks, of a scene and of a configuration are declared so, and arguments of
-functions. `recon.base.declared_types` and `CheckedSettings` refuse other values; pydantic reads a file by them, and
-makes its schema.
+The fields of methods, driver settings, checks, scenes and configurations are declared in this way, and so are arguments
+of functions. `recon.base.declared_types` and `CheckedSettings` raise an error for other values. pydantic uses the
+declarations to read a file and to make its schema.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from numbers import Real
 from typing import Annotated, Any
 
 _FACTORS = {**dict.fromkeys(("deg", "deg_s", "deg_s2"), math.radians(1)), "mb": 1e6}
-"""Units of a configuration whose values are in radians or bytes inside -> that of 1."""
+"""Factor from a unit in a configuration to the unit inside the program (radians, bytes)."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a field or an argument declares of its value.
+    """Declaration of the value of a field or an argument.
 
     Attributes:
-        default: in the unit of a configuration; `...`, or MISSING of dataclasses: it must be given.
-        doc: its meaning, if the name does not tell.
-        unit: in which a configuration writes it, which ends the name of its key; "" without one. Bounds are in it.
-        gt, ge, lt, le: bounds of a number, which is finite.
-        min_length, max_length: of a text or a list.
-        pattern: of a text.
-        problem: says what is wrong with a value; "" where nothing is. None: nothing can be.
+        default: default in the unit of a configuration; `...`, or MISSING of dataclasses: the value is required.
+        doc: meaning of the value, if the name does not say it.
+        unit: unit in a configuration and at the end of its key; "": no unit. Default and bounds are in this unit.
+        gt, ge, lt, le: bounds of a number; a number must be finite.
+        min_length, max_length: bounds for the length of a text or a list.
+        pattern: regular expression that a text must match.
+        problem: function that returns what is wrong with a value, "" if nothing is. None: no further check.
     """
 
     doc: str = ""
@@ -50,12 +50,12 @@ class Setting:
 
     @property
     def bounds(self) -> Mapping[str, Any]:
-        """The bounds that there are, by name."""
+        """The bounds that are set, by name."""
         return {name: bound for name in _WITHIN if (bound := getattr(self, name)) is not None}
 
     @property
     def words(self) -> str:
-        """The bounds in a sentence, such as `> 0 and <= 5`: the words of configurations, options and Python."""
+        """The bounds as text, such as `> 0 and <= 5`, for messages about configurations, options and arguments."""
         return self._text(self.bounds)
 
     @staticmethod
@@ -64,7 +64,7 @@ class Setting:
         return " and ".join(f"{_WORDS[name]} {each}" for name, each in shown.items())
 
     def fault(self, value: Any) -> str:
-        """What is wrong with the value of a field; "" where nothing is."""
+        """What is wrong with the value of a field; "" if nothing is."""
         if isinstance(value, Real) and not -math.inf < float(value) < math.inf:
             return "expected a finite number"
         if value is None:
@@ -75,22 +75,22 @@ class Setting:
         return "" if self.problem is None else self.problem(value)
 
     def key_of(self, field: str) -> str:
-        """The key by which a configuration writes a field."""
+        """The key of a field in a configuration."""
         return f"{field}_{self.unit}" if self.unit else field
 
     def inside(self, value: Any) -> Any:
-        """A value of a configuration in the unit of the field."""
+        """A value of a configuration, converted to the unit of the field."""
         if value is None or self.unit not in _FACTORS:
             return value
         return value * 1_000_000 if self.unit == "mb" else math.radians(value)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
-        """The schema of the type with these bounds, also where it may be None."""
+        """The schema of the type with these bounds; also for a type that allows None."""
         schema = handler(source)
         (schema["schema"] if schema["type"] == "nullable" else schema).update(self.bounds)
         if self.problem is None:
             return schema
-        from pydantic_core import core_schema  # here: only who reads a file needs it
+        from pydantic_core import core_schema  # imported here, because only reading a file needs it
 
         return core_schema.no_info_after_validator_function(self._checked, schema)
 
@@ -116,7 +116,7 @@ _WORDS = {
     "gt": ">", "ge": ">=", "lt": "<", "le": "<=", "min_length": "a length of at least",
     "max_length": "a length of at most", "pattern": "text of the form",
 }  # fmt: skip
-_SETTING = "setting"  # the key of the metadata of a field
+_SETTING = "setting"  # key in the metadata of a field
 
 Natural = Annotated[int, Setting(ge=0)]
 Count = Annotated[int, Setting(ge=1)]
@@ -125,22 +125,22 @@ Positive = Annotated[float, Setting(gt=0)]
 
 
 def setting(default: Any = ..., doc: str = "", **rest: Any) -> Any:
-    """The field of a dataclass, or of a section of a configuration, that declares its value; `rest` as of `Setting`."""
+    """A field, with declaration, of a dataclass or of a section of a configuration; `rest` as for `Setting`."""
     made = Setting(doc, default, **rest)
     inside = dataclasses.MISSING if default is ... else made.inside(default)
     return dataclasses.field(default=inside, metadata={_SETTING: made, "description": doc or None, **made.bounds})
 
 
 def settings_of(owner: Any) -> Mapping[str, Setting]:
-    """What the fields of a dataclass declare, by name."""
+    """The declarations of the fields of a dataclass, by name."""
     return {each.name: each.metadata.get(_SETTING, Setting(default=each.default)) for each in dataclasses.fields(owner)}
 
 
 class CheckedSettings:
-    """Settings, as a dataclass, whose fields are within the bounds that they declare.
+    """Base class of settings (dataclasses) that checks the bounds of all fields.
 
     Raises:
-        ValueError: one is not.
+        ValueError: a field is out of its bounds.
     """
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Slabs: consecutive slices of a volume, and the rows and angles of the views that show them."""
+"""Slabs: consecutive slices of a volume, with the detector rows and angles that show them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 
 _ON_A_ROW = 1e-6  # rows
-_TURN = 0.25  # px at the edge of the field that a skew may turn a band of slices; each band costs its samples anew
+# px at the edge of the field of view; a skew may turn a band of slices by this much. Each band repeats the setup work
+_TURN = 0.25
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class Slab:
     """A slab and its halo.
 
     Attributes:
-        own: slices of the volume that this slab gives.
-        slices: these and the halo beside them, which are reconstructed.
-        fade: slices on either side of the edge between two slabs, over which one fades into the other.
+        own: slices of the volume that this slab provides.
+        slices: all slices that are reconstructed: `own` and the halo on both sides.
+        fade: number of slices on either side of the border between two slabs over which one fades into the other.
     """
 
     own: slice
@@ -32,27 +33,28 @@ class Slab:
 
     @property
     def share(self) -> NDArray[np.float32]:
-        """[slice]: weight of each reconstructed slice in the volume; the weights of all slabs add up to 1."""
-        at, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
-        share = np.ones(at.size)
+        """[slice] weight of each reconstructed slice in the volume; the weights of all slabs add up to 1."""
+        middles, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
+        share = np.ones(middles.size)
         if self.slices.start < self.own.start:
-            share *= np.clip((at - self.own.start) / width + 0.5, 0, 1)
+            share *= np.clip((middles - self.own.start) / width + 0.5, 0, 1)
         if self.own.stop < self.slices.stop:
-            share *= np.clip((self.own.stop - at) / width + 0.5, 0, 1)
+            share *= np.clip((self.own.stop - middles) / width + 0.5, 0, 1)
         return share.astype(np.float32)
 
 
 def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
-    """Slabs of `height` slices each (the last may have fewer), with a halo towards further slices."""
+    """Slabs of `height` slices each (the last one may have fewer), with a halo towards neighbouring slabs."""
     parts = (slice(first, min(first + height, slices)) for first in range(0, slices, height))
     fade = min(halo, height) // 2
     return [Slab(own, slice(max(own.start - halo, 0), min(own.stop + halo, slices)), fade) for own in parts]
 
 
 def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
-    """The detector rows that show these slices of the whole volume, their geometry, and the slices' grid in it.
+    """The detector rows that show these slices of the whole volume, the geometry of the rows, and the slices' grid.
 
-    For a parallel beam, straight. Shifted views also see slices outside this grid at the edges of the rows.
+    For a parallel beam without roll and tilt. Rows at the edge of a shifted projection also show slices outside this
+    grid.
     """
     z = grid.coordinates()[0][slices] / geometry.pixel_pitch + geometry.axis_row
     shifts, last = geometry.shifts[:, 1], geometry.detector_shape[0] - 1
@@ -66,9 +68,10 @@ def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geome
 
 
 def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
-    """Slices of the grid whose rows see one angle, to an eighth of a pixel, with their views without skew.
+    """Bands of slices whose rows have the same angle (within an eighth of a pixel), each with its geometry without
+    skew.
 
-    Views that are shifted along the axis count as unshifted.
+    Shifts along the axis are ignored.
     """
     nz = grid.shape[0]
     if not geometry.skew:
@@ -81,7 +84,7 @@ def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
 
 
 def slices_of(grid: Grid, slices: slice) -> Grid:
-    """The grid of these slices, at their place in the whole grid."""
+    """The grid of these slices, at their position in the whole grid."""
     off = ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
     centre = (grid.centre[0] + off, *grid.centre[1:])
     return replace(

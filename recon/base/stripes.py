@@ -1,4 +1,4 @@
-"""Pixels that answer unlike their neighbours in all views, whose stripes in sinograms become rings in volumes."""
+"""Detector pixels whose sensitivity differs from their neighbours. They make stripes in sinograms, rings in volumes."""
 
 from __future__ import annotations
 
@@ -13,29 +13,34 @@ from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 
 _BLOCKS, _BLOCK = 8, 5
-_RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
-_SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40  # standard deviations; columns with one on the other side of the axis
-NARROWEST = 64  # columns; in 40 columns the methods that remove stripes add more than they remove
-_SEEN = 3.5  # `Steadiness.score` from which on there are stripes: 0.3 to 2.7 without, 4.4 and 5.3 in two real scans
-_ONE_SIDED = 0.5  # of pixels' answers the odd part equals the even one; layers of the sample have hardly any
-_STEADY_BLOCKS, _STEADY_BLOCK = 8, 8  # contiguous blocks of views, and views of the smallest one
-AT_AXIS = 4.0  # Columns on either side: a body this small on the axis looks like a ring
+_RING_VIEWS, _NEIGHBOURS = 20, 9  # projections; pixels along a row
+# two limits in standard deviations; least number of columns that have a mirrored one
+_SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40
+NARROWEST = 64  # columns; with 40 columns, the methods that remove stripes add larger errors than they remove
+# `Steadiness.score` from which on there are stripes. Scans without stripes have 0.3 to 2.7, two real scans 4.4 and 5.3
+_SEEN = 3.5
+# least ratio of the odd to the even part. For pixel sensitivities both are equal; sample layers have hardly an odd part
+_ONE_SIDED = 0.5
+_STEADY_BLOCKS, _STEADY_BLOCK = 8, 8  # contiguous blocks of projections; projections of the smallest block
+AT_AXIS = 4.0  # columns on either side of the axis; a body this small on the axis looks like a ring
 _FEWEST_MIRRORED = 20  # mirrored columns
 
 
 def ring_offsets(residual: F32, geometry: Geometry) -> F32:
-    """Offsets of single pixels [row, col] that are constant over all views and cause rings in a volume.
+    """Offsets of single pixels [row, col] that are constant over all projections and cause rings in a volume.
 
-    It is the median of the residual over the views, less its neighbourhood along the row. The wall of a can around the
-    axis stays in all views, too, in all rows alike (-1.1 dB on a battery), and on both sides of the axis. So of what
-    rows have in common only that counts which the other side lacks, see `without_layers`. Offsets below three standard
-    errors of their scatter between blocks of neighbouring angles count by the share that gains have in them, as columns
-    differ from those on the other side (Wiener). With few views noise cannot be separated from the sample: then all are
-    0. What a model leaves of the sample changes with the angle: blocks of views taken in another order would agree on
-    it, and parts of the sample would count as rings (-0.5 dB).
+    An offset is the median of the residual over the projections, minus its neighbourhood along the row. The wall of a
+    can around the axis is also constant over all projections, but it is the same in all rows and on both sides of the
+    axis. Counting it as an offset costs 1.1 dB on a battery. So a part that all rows share counts only if the other
+    side of the axis does not show it, see `without_layers`. Offsets below three standard errors (from the scatter
+    between blocks of neighbouring angles) are multiplied by the share of pixel sensitivity in them, estimated by
+    comparing columns with those on the other side (Wiener filter). With few projections, noise cannot be separated from
+    the sample; then all offsets are 0. The part of the sample that a model does not explain changes with the angle. The
+    blocks must be contiguous in angle, because blocks in another order would agree on that part, and it would count as
+    rings (-0.5 dB).
 
     Args:
-        residual: views less a model's views, [view, row, col].
+        residual: projections minus the projections of a model, [view, row, col].
     """
     n, rows, cols = residual.shape
     axis_col = geometry.axis_col
@@ -63,21 +68,21 @@ def _fine(image: F32) -> F32:
 
 
 def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
-    """Values [..., col] of the columns on the other side of the axis, by cubic splines; NaN where there are none."""
-    from scipy.interpolate import make_interp_spline  # a quarter of a second
+    """Values [..., col] at the mirrored columns on the other side of the axis (cubic splines); NaN outside."""
+    from scipy.interpolate import make_interp_spline  # loading takes a quarter of a second
 
     cols = values.shape[-1]
-    at = 2 * axis_col - np.arange(cols)
+    mirror = 2 * axis_col - np.arange(cols)
     spline = make_interp_spline(np.arange(cols), values, 3, axis=-1)
-    return np.where((at >= 0) & (at <= cols - 1), spline(np.clip(at, 0, cols - 1)), np.nan)
+    return np.where((mirror >= 0) & (mirror <= cols - 1), spline(np.clip(mirror, 0, cols - 1)), np.nan)
 
 
 def without_layers(stripes: F32, axis_col: float) -> F32:
-    """Stripes [row, col] minus what the columns on the other side of the axis also show.
+    """Stripes [row, col] minus the part that the columns on the other side of the axis also show.
 
-    Where both sides have more in common than twice the standard deviation of what is one-sided, it belongs to layers of
-    the sample around the axis: of 800 pairs of independent columns, one has. Columns without one on the other side stay
-    as they are.
+    If the part that both sides share is more than twice the standard deviation of the one-sided part, it belongs to
+    layers of the sample around the axis. By chance this happens for one in 800 pairs of independent columns. Columns
+    without a mirrored one are not changed.
     """
     across = mirrored(stripes, axis_col)
     seen = np.isfinite(across[0])
@@ -92,15 +97,16 @@ def without_layers(stripes: F32, axis_col: float) -> F32:
 
 @dataclass(frozen=True)
 class Steadiness:
-    """What is constant over all views in the columns of a sinogram, as standard deviations of fine differences.
+    """The part of a sinogram's columns that is constant over all projections, as standard deviations.
 
-    A layer of the sample around the axis stays in its columns, too, but in those on both sides of the axis alike. The
-    answer of a pixel knows nothing of the pixel on the other side. So stripes are odd about the axis as much as they
-    are even, and only those of the sample are even alone.
+    The standard deviations are of fine differences between columns. A layer of the sample around the axis is also
+    constant in its columns, but it is the same on both sides of the axis. The sensitivity of a pixel is independent of
+    the pixel on the other side. So stripes from pixels have an odd part (about the axis) as large as their even part.
+    Stripes from the sample have only an even part.
 
     Attributes:
-        odd, even: parts of the mean over blocks of views.
-        noise: of the odd part, by how it differs between the blocks.
+        odd, even: odd and even part of the mean over blocks of projections.
+        noise: noise of the odd part, from its differences between the blocks.
     """
 
     odd: float
@@ -114,12 +120,12 @@ class Steadiness:
 
     @property
     def stripes(self) -> bool:
-        """Whether the pixels respond unequally."""
+        """Whether the sensitivities of the pixels differ."""
         return self.score > _SEEN and self.odd > _ONE_SIDED * self.even
 
 
 def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
-    """How constant and how asymmetric the columns of sinograms are; None if too few columns have a mirrored one.
+    """How constant and how asymmetric the columns of sinograms are; None if too few columns have a mirrored column.
 
     Args:
         sinograms: [view, row, col] in the order of the angles.
@@ -140,7 +146,7 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
 
 
 def _fine_columns(sinogram: F32) -> NDArray[np.floating]:
-    """[col] median difference of a column from the four beside it, without slow changes along the row."""
+    """[col] median difference of a column from its four neighbours, without slow changes along the row."""
     x = np.pad(sinogram, ((0, 0), (2, 2)), mode="edge")
     off = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
     return np.asarray(np.convolve(off, (-0.5, 1, -0.5), mode="same"))

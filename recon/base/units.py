@@ -1,4 +1,4 @@
-"""Units: warns of degrees given for radians, and of counts or transmission given for line integrals."""
+"""Units: warns if angles are in degrees instead of radians, or projections are counts or transmission."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from recon.base.arrays import median_deviation, some_values
 from recon.base.views import spread
 
 HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
-_TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
-_FEWEST = 5  # with fewer views there is no warning
-_ROUND = 0.01  # of a turn or half of one, within which angles go round it
-_OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels
-_LOOKED_AT = 2**16  # values
-_VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # of a scan, in which transmission is looked for
-_LEVEL = 0.15  # by so much the beam of transmission may differ from 1, and from view to view
-_NOT_ABOVE = 0.03  # of the beam: by so much nine values in ten are not above it
-_EDGE = 32  # of the columns are an edge
+_TURNS = 10  # fewer turns are plausible in radians, unless all angles are whole numbers
+_FEWEST = 5  # with fewer projections there is no warning
+_ROUND = 0.01  # tolerance, as a share of the turn or half turn
+_OPAQUE = 15.0  # line integral; exp(-15) of the intensity is less than any detector measures in nine of ten pixels
+_LOOKED_AT = 2**16  # number of values in the sample
+_VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # size of the sample in which transmission is searched for
+_LEVEL = 0.15  # tolerance of the beam level in transmission: from 1, and between projections
+_NOT_ABOVE = 0.03  # share of the beam; nine values in ten are at most this much above it
+_EDGE = 32  # an edge is one in this many columns
 _SIGMAS = 3.0
 
 
@@ -27,7 +27,7 @@ def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
     """Whether angles [view] given as radians look like degrees.
 
     They do if all are whole numbers, or if they span 180 or 360. They also do if they span more than ten turns and are
-    round to two digits. Before a scan has `ended` its span says nothing: one of many turns passes 180 rad.
+    rounded to two digits. Before a scan has `ended`, the span is not used, because a scan of many turns passes 180 rad.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -44,27 +44,27 @@ def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
 
 
 def gone_round(angles: NDArray[np.floating], turn: float) -> float:
-    """Half a `turn`, or one, which distinct angles [view] go round, with or without the last of them; else 0."""
+    """Half a `turn` or a `turn`, if distinct angles [view] cover it (with or without the last angle); otherwise 0."""
     span = float(np.ptp(angles)) if angles.size >= _FEWEST else 0.0
     spans = span, span + span / max(angles.size - 1, 1)
     return next((part for part in (turn / 2, turn) if min(abs(each / part - 1) for each in spans) < _ROUND), 0.0)
 
 
 def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:
-    """Give a UserWarning if angles look like degrees; it names the line that called the asking function."""
+    """Give a UserWarning if angles look like degrees. It names the line that called the calling function."""
     if look_like_degrees(angles, ended):
         warnings.warn(
-            f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
+            f"angles must be in radians. These reach {np.abs(angles).max():.5g} and look like degrees: give "
             "np.deg2rad(angles)",
             stacklevel=3,
         )
 
 
 def look_like_counts(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like counts, by a sample of them.
+    """Whether values [view, row, col] given as line integrals look like counts. A sample of the values is tested.
 
-    They do if nine in ten are too large for any detector to measure the remaining light. If all are whole numbers, half
-    of them suffice.
+    They do if nine in ten values are so large that no detector could measure the remaining intensity. If all values are
+    whole numbers, half of them suffice.
     """
     some = some_values(projections, _LOOKED_AT)
     some = some[np.isfinite(some)]
@@ -74,13 +74,14 @@ def look_like_counts(projections: NDArray[np.floating]) -> bool:
 
 
 def look_like_transmission(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like transmission, by a sample of them.
+    """Whether values [view, row, col] given as line integrals look like transmission. A sample of them is tested.
 
-    Beside the sample, line integrals are 0 and transmission is 1; where the sample is, line integrals rise and
-    transmission falls. So it is transmission if half of the left and right edges of the views have a level near 1 and
-    are flat, nine values in ten are not above it, none lies much below 0, and the middle of the views does. Line
-    integrals of a sample within the field never do so. Of one that fills the field, edges of about 1 with less matter
-    between them are those of a tube seen from within, whose profile falls all the way from the edge: it is not flat.
+    In air, line integrals are 0 and transmission is 1. In the sample, line integrals are higher and transmission is
+    lower. So the values are transmission if five conditions hold: half of the left and right edges have a level near 1;
+    these edges are flat; nine values in ten are not above that level; no value is much below 0; and the middle is below
+    the level. Line integrals of a sample within the field of view never meet these conditions. If a sample fills the
+    field of view, edges of about 1 with less material between them belong to a tube seen from inside. Its profile falls
+    all the way from the edge, so it is not flat.
     """
     if projections.ndim != 3 or projections.shape[0] < 2 or not projections.shape[1] or projections.shape[2] < 16:
         return False
@@ -96,7 +97,7 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
         return False
     edges, within = edges[seen], within[seen]
     levels, beside = (np.nanmedian(part, axis=(1, 2)) for part in (edges, within))
-    air = levels + beside >= np.median(levels + beside)  # a sample may reach the others
+    air = levels + beside >= np.median(levels + beside)  # the sample may reach the other edges
     beam = float(np.median(levels[air]))
     scatter = edges[air] - levels[air, None, None]
     noise = median_deviation(scatter)
@@ -107,8 +108,9 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
         return False
     fall = beam - float(np.nanmean(middle))
     step = float(np.mean(levels[air] - beside[air]))
-    uncertain = 2 * noise / np.sqrt(np.isfinite(edges[air]).sum())  # of a difference of two medians of the edges
-    flat = fall / _EDGE  # a profile that is convex falls twice as much from the edge to the columns beside it
+    # twice the standard error of the difference of two medians at the edges
+    uncertain = 2 * noise / np.sqrt(np.isfinite(edges[air]).sum())
+    flat = fall / _EDGE  # a convex profile falls twice as much from the edge to the next columns
     return bool(step < flat and flat > max(_SIGMAS * uncertain, 1e-4 * beam))
 
 
@@ -116,17 +118,18 @@ def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 
     """Give a UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
 
     Args:
-        stacklevel: of the warning; 3 names the line that called the asking function.
+        stacklevel: stacklevel of the warning; 3 names the line that called the calling function.
     """
     if look_like_counts(projections):
         warnings.warn(
-            f"projections have a median of {np.nanmedian(projections[:1]):.4g}: they look like counts. Line integrals "
-            "are -log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
+            "projections must be line integrals. These look like counts (median "
+            f"{np.nanmedian(projections[:1]):.4g}). Convert them with -log((counts - dark) / (flat - dark)), see "
+            "recon.correct, or give recon.Counts",
             stacklevel=stacklevel,
         )
     elif look_like_transmission(projections):
         warnings.warn(
-            "projections are about 1 at the edges of the views and fall where the sample is: they look like "
-            "transmission. Line integrals are its logarithm, -np.log(transmission), and rise there",
+            "projections must be line integrals. These look like transmission: they are about 1 at the left and "
+            "right edges and lower in the sample. Give -np.log(transmission)",
             stacklevel=stacklevel,
         )

@@ -1,7 +1,7 @@
-"""Vectors of each view: source or ray, detector, columns and rows, as ASTRA and what builds on it state a geometry.
+"""Vectors for each projection (source or ray, detector, columns, rows), as ASTRA and programs based on it use them.
 
-One row a view, lengths in one unit, (x, y, z) about the middle of the volume (ASTRA Toolbox, 3D geometries,
-`parallel3d_vec` and `cone_vec`):
+Each projection is one row. All lengths have the same unit; (x, y, z) count from the middle of the volume (ASTRA
+Toolbox, 3D geometries, `parallel3d_vec` and `cone_vec`):
 
     ray or source   direction of the parallel beam, or place of the source
     d               middle of the detector
@@ -22,34 +22,36 @@ from recon.base.geometry import Geometry
 from recon.base.placement import Where
 
 TOLERANCE = 0.1
-"""Pixels by which a corner of the detector may lie off the one that the vectors state."""
+"""Largest distance, in pixels, of a detector corner from the corner that the vectors state."""
 
-_PARALLEL = 1e-6  # of u, or v: what is left of the other one
-_CLEAN = 1e-9  # rad, pixels, or of the distance to the source: what is less is rounding
+_PARALLEL = 1e-6  # share of u or v that remains of the other vector; below it, the two count as parallel
+_CLEAN = 1e-9  # rad, pixels, or share of the distance to the source; smaller values are rounding errors
 
 
 def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, cone: bool) -> Geometry:
-    """The geometry of views described by vectors: any direction of a parallel beam, any source of a cone beam.
+    """The geometry of projections that are described by vectors: parallel beams in any direction, cones from any
+    source.
 
-    Detectors have square pixels of one size. That of a parallel beam stands across the beam; that of a cone has one
-    distance from its source in all views, and need not face the origin.
+    The detector pixels are squares of one size. For a parallel beam, the detector is perpendicular to the beam. For a
+    cone, its distance from the source is the same in all projections, and it need not face the origin.
 
     Args:
         vectors: float [view, 12], in mm; see the module.
         detector_shape: (rows, cols) in pixels.
-        cone: the first three are the source; else the direction of the beam, either way along it.
+        cone: True: the first three values are the source. False: they are the direction of the beam (with either sign).
 
     Raises:
-        ValueError: vectors that are not finite [view, 12], or a view that is no such detector within `TOLERANCE`.
+        ValueError: the vectors are not finite [view, 12], or a projection does not match such a detector within
+            `TOLERANCE`.
     """
     check_arguments(geometry_of_vectors, locals())
     given = np.asarray(vectors, np.float64)
     rows, cols = detector_shape
     if given.ndim != 2 or given.shape[1] != 12 or not len(given):
-        raise ValueError(f"vectors have shape {given.shape}; expected [view, 12]: ray or source, d, u and v")
+        raise ValueError(f"vectors must have shape [view, 12] (ray direction or source, d, u, v), got {given.shape}")
     if not np.isfinite(given).all():
         bad = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
-        raise ValueError(f"the vectors of view {bad} are not finite: {given[bad].tolist()}")
+        raise ValueError(f"the vectors of projection {bad} are not finite: {given[bad].tolist()}")
     first, middle, u, v = given.reshape(-1, 4, 3).transpose(1, 0, 2)
     if not cone:
         u, v = (_across(vector, first) for vector in (u, v))
@@ -58,24 +60,24 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     sizes = (_dot(u, along_cols) + _dot(v, along_rows)) / 2
     distances = _distances(middle - first, beam) if cone else np.ones(len(given))
     sdd = float(np.median(distances))
-    apart = (sdd / distances)[:, None]  # what a detector at the common distance has in place of 1
+    apart = (sdd / distances)[:, None]  # factor to a detector at the common distance
     pitch = float(np.median(sizes * apart[:, 0]))
     _require_pixels(u * apart, v * apart, frame, pitch, (rows, cols))
-    foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # its pixel is that of the origin
-    at = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
-    at += (cols - 1) / 2, (rows - 1) / 2
-    axis_col, axis_row = np.median(at, axis=0)
+    foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # the origin is projected to this point
+    pixels = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
+    pixels += (cols - 1) / 2, (rows - 1) / 2
+    axis_col, axis_row = np.median(pixels, axis=0)
     theta, roll, tilt = _angles(*frame)
     where = Where(
-        axis_col=axis_col, axis_row=axis_row, shifts=_clean(at - (axis_col, axis_row)), roll=roll, tilt=tilt
+        axis_col=axis_col, axis_row=axis_row, shifts=_clean(pixels - (axis_col, axis_row)), roll=roll, tilt=tilt
     )  # fmt: skip
     if not cone:
         return Geometry.parallel(theta, (rows, cols), pixel_pitch=pitch, **where)
     sod = float(np.median(-_dot(first, beam)))
     if not 0 < sod <= sdd * (1 + _CLEAN):
         raise ValueError(
-            f"the middle of the volume lies {sod:.6g} mm from the sources, whose detectors lie at {sdd:.6g}: expected "
-            "it in between. Measure all vectors from a point of the sample"
+            f"the middle of the volume must lie between the sources and their detectors. It is {sod:.6g} mm from the "
+            f"sources, and the detectors are at {sdd:.6g} mm. Measure all vectors from a point in the sample"
         )
     centres = first + sod * beam
     centres[np.abs(centres).max(axis=1) < _CLEAN * sod] = 0
@@ -83,14 +85,17 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
 
 
 def vectors_of(geometry: Geometry) -> F64:
-    """The vectors [view, 12] of a geometry, in mm; for a parallel beam the first three are its direction.
+    """The vectors [view, 12] of a geometry in mm; for a parallel beam the first three are the direction.
 
     Raises:
-        ValueError: rows that were read one after the other, each at an angle of its own.
+        ValueError: the geometry has a skew (rolling shutter), so that each row has its own angle.
     """
     check_arguments(vectors_of, locals())
     if geometry.skew:
-        raise ValueError("vectors hold one angle a view, but these views have a skew: an angle for each row")
+        raise ValueError(
+            "vectors hold one angle for each projection, but these projections have a skew, which gives each row its "
+            "own angle"
+        )
     rows, cols = geometry.detector_shape
     axes = np.array([geometry.axes(view) for view in range(geometry.n_views)])
     along_cols, along_rows, beam = axes.transpose(1, 0, 2)
@@ -112,39 +117,42 @@ def _clean(values: F64) -> F64:
 
 
 def _across(vectors: F64, rays: F64) -> F64:
-    """The parts of vectors across the rays of a parallel beam."""
+    """The components of vectors perpendicular to the rays of a parallel beam."""
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     if not lengths.all():
-        raise ValueError(f"view {int(np.flatnonzero(lengths == 0)[0])}: the direction of the beam is zero")
+        raise ValueError(f"projection {int(np.flatnonzero(lengths == 0)[0])}: the direction of the beam is zero")
     along = rays / lengths
     return vectors - _dot(vectors, along)[:, None] * along
 
 
 def _frame(u: F64, v: F64) -> tuple[F64, F64, F64]:
-    """The orthonormal pair nearest to each (u, v), by their polar decomposition, and the beam onto such a detector."""
+    """The orthonormal pair nearest to each (u, v) (polar decomposition), and the beam perpendicular to them."""
     left, sizes, right = np.linalg.svd(np.stack((u, v), axis=2), full_matrices=False)
     flat = sizes[:, 1] <= _PARALLEL * sizes[:, 0]
     if flat.any():
         view = int(np.flatnonzero(flat)[0])
-        raise ValueError(f"view {view}: u and v are zero, parallel, or along the beam: {u[view]} and {v[view]}")
+        raise ValueError(
+            f"projection {view}: u and v must be different directions across the beam. One is zero, they are "
+            f"parallel, or one is along the beam: {u[view]} and {v[view]}"
+        )
     along_cols, along_rows = (left @ right).transpose(2, 0, 1)
     return along_cols, along_rows, np.cross(along_rows, along_cols)
 
 
 def _distances(to_detector: F64, beam: F64) -> F64:
-    """mm from the sources of a cone to their detectors."""
+    """Distances in mm from the sources of a cone to their detectors."""
     distances = _dot(to_detector, beam)
     if (distances <= 0).any():
         raise ValueError(
-            f"view {int(np.flatnonzero(distances <= 0)[0])}: u, v and the direction from source to detector "
-            "have the wrong handedness, as in a mirrored image. Where rows count from the top, reverse the rows and v "
-            "of all views"
+            f"projection {int(np.flatnonzero(distances <= 0)[0])}: u, v and the direction from source to detector "
+            "have the wrong handedness, as in a mirrored image. If rows count from the top, reverse the rows and v "
+            "of all projections"
         )
     return distances
 
 
 def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, shape: tuple[int, int]) -> None:
-    """ValueError where a detector's corners differ by more than `TOLERANCE` from those of square pixels of `size`."""
+    """ValueError if the corners of a detector differ by more than `TOLERANCE` from those of square pixels of `size`."""
     by_col, by_row = ((vector - size * unit) / size for vector, unit in zip((u, v), frame, strict=False))
     rows, cols = shape
     corners = [by_col * cols / 2 + sign * by_row * rows / 2 for sign in (1, -1)]
@@ -152,15 +160,17 @@ def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, sh
     view = int(np.argmax(off))
     if off[view] > TOLERANCE:
         raise ValueError(
-            f"view {view}: its detector pixels are not square, or not of {size:.6g} as in the other views: a corner is "
-            f"off by {off[view]:.3g} pixels, and {TOLERANCE} are allowed. Resample the views to one detector"
+            f"projection {view}: the detector pixels must be squares of {size:.6g} as in the other projections. A "
+            f"corner of the detector is off by {off[view]:.3g} pixels, and {TOLERANCE} are allowed. Resample the "
+            "projections to one detector"
         )
 
 
 def _angles(along_cols: F64, along_rows: F64, beam: F64) -> tuple[F64, F64, F64]:
-    """Angle, roll and tilt of each view, as of `Geometry.axes`."""
+    """Angle, roll and tilt of each projection, as in `Geometry.axes`."""
     tilt = -np.arcsin(np.clip(beam[:, 2], -1, 1))
-    upright = np.hypot(beam[:, 0], beam[:, 1]) < 1e-12  # along the axis: roll and angle turn alike
+    # beam along the rotation axis: roll and angle have the same effect
+    upright = np.hypot(beam[:, 0], beam[:, 1]) < 1e-12
     theta = np.where(upright, np.arctan2(along_cols[:, 1], along_cols[:, 0]), np.arctan2(-beam[:, 0], beam[:, 1]))
     c, s = np.cos(theta), np.sin(theta)
     level = np.stack((c, s, np.zeros_like(c)), 1)

@@ -1,4 +1,4 @@
-"""Views: line integrals with their geometry and the weights of their rays, and parts of them."""
+"""Views: projections (line integrals) with their geometry and ray weights, and how to select parts of them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from recon.base.geometry import Geometry
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Line integrals with their geometry and the weights of their rays.
+    """Projections (line integrals) with their geometry and ray weights.
 
     Attributes:
         data: float32 [view, row, col]; values that are not finite are allowed.
-        geometry: of these views.
-        weights: of each ray [view, row, col], 0 or more; None: one for all.
+        geometry: geometry of these projections.
+        weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere.
     """
 
     data: F32
@@ -27,37 +27,37 @@ class Views:
     weights: F32 | None = None
 
     def select(self, chosen: NDArray[np.integer]) -> Views:
-        """These views alone, in this order."""
+        """Only the chosen projections, in this order."""
         weights = None if self.weights is None else self.weights[chosen]
         return Views(self.data[chosen], self.geometry.select(chosen), weights)
 
     def rows(self, rows: slice) -> Views:
-        """These detector rows of all views, see `Geometry.rows`."""
+        """Only these detector rows of all projections, see `Geometry.rows`."""
         weights = None if self.weights is None else np.ascontiguousarray(self.weights[:, rows])
         data = np.ascontiguousarray(self.data[:, rows])
         return Views(data, self.geometry.rows(rows.start, rows.stop), weights)
 
     def masked(self) -> Views:
-        """All values finite, those that were not without weight, see `masks.masked`.
+        """The projections with all values finite; values that were not finite get weight 0, see `masks.masked`.
 
         Raises:
             ValueError: as `masked`.
         """
-        from recon.base.masks import masked  # here: help loads this module, and no scipy
+        from recon.base.masks import masked  # imported here, because help loads this module and must not load scipy
 
         data, weights = masked(self.data, self.weights)
         return self if data is self.data and weights is self.weights else replace(self, data=data, weights=weights)
 
     def weighed(self, factor: F32 | Mask) -> Views:
-        """The views with the weights of rays times a factor, of a shape that goes with [view, row, col]."""
+        """The projections with their weights multiplied by a factor that broadcasts to [view, row, col]."""
         ones = np.broadcast_to(np.float32(1), self.data.shape) if self.weights is None else self.weights
         return replace(self, weights=np.multiply(ones, factor, dtype=np.float32))
 
     def binned(self, factor: int, geometry: Geometry | None = None) -> Views:
-        """Views with factor x factor pixels joined: their weighted means, with their mean weight.
+        """The projections binned by factor x factor pixels: weighted means, with the mean weights.
 
         Args:
-            geometry: of the joined pixels; None: `Geometry.binned`.
+            geometry: geometry of the binned pixels; None: `Geometry.binned`.
         """
         if factor == 1:
             return self
@@ -68,7 +68,7 @@ class Views:
         return Views(np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), views, known)
 
     def split(self, one_in: int = ONE_IN) -> tuple[Views, Views]:
-        """The views to reconstruct from, and one in `one_in` held out, see `split_views`."""
+        """The projections to reconstruct from, and one in `one_in` held out, see `split_views`."""
         seen, unseen = split_views(self.geometry, one_in)
         return self.select(seen), self.select(unseen)
 
@@ -76,10 +76,10 @@ class Views:
 def split_views(
     geometry: Geometry, one_in: int = ONE_IN, period: float | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle.
+    """Numbers of the projections to reconstruct from, and of one in `one_in` held out, evenly spread in angle.
 
     Args:
-        period: radians after which angles are the same; None: that of the geometry, which depends on the axis.
+        period: radians after which projections repeat; None: the period of the geometry, which depends on the axis.
     """
     order = np.argsort(np.mod(geometry.angles, period or geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])

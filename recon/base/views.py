@@ -1,4 +1,4 @@
-"""Selections of views: by a short form such as all, fixed:90, sector:30-150:60 or every:4, and evenly spread ones."""
+"""Selections of projections: by a text such as all, fixed:90, sector:30-150:60 or every:4, or evenly spread."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ _COUNT = re.compile(r"\d+")
 
 
 def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = np.pi) -> NDArray[np.int64]:
-    """Indices of the selected views, ascending, without repetition.
+    """Indices of the selected projections, ascending, without repetition.
 
-    - `all`: every view.
-    - `fixed:N`: N views spread evenly in angle. Views one `period` apart see the same rays and count as one angle, as
-      long as N angles are left.
-    - `sector:A-B[:N]`: views with A <= angle <= B degrees (modulo 360); of these, N spread evenly.
-    - `random:N[:seed]`: N views drawn without replacement.
-    - `first:N`: the N views taken first.
-    - `every:K`: one of K views, in the order taken.
+    - `all`: all projections.
+    - `fixed:N`: N projections evenly spread in angle. Projections one `period` apart see the same rays. They count as
+      one angle, as long as at least N angles are left.
+    - `sector:A-B[:N]`: projections with A <= angle <= B degrees (modulo 360); with N, only N of these, evenly spread.
+    - `random:N[:seed]`: N projections drawn without replacement.
+    - `first:N`: the first N projections of the scan.
+    - `every:K`: every K-th projection, in the order taken.
 
     Args:
         angles: [view], radians, in the order taken.
-        seed: for `random:N` without a seed in the text.
-        period: radians after which views see the same rays, see `Geometry.period`; by default those of a parallel beam
-            with the axis in the middle.
+        seed: seed for `random:N` if the text contains none.
+        period: radians after which projections see the same rays, see `Geometry.period`. The default is for a parallel
+            beam with the axis in the middle.
 
     Raises:
-        ValueError: for a selection that is not one of these forms, or that asks for more views than there are; for
-            angles that are not finite.
+        ValueError: the selection does not have one of these forms or asks for more projections than there are, or an
+            angle is not finite.
     """
     theta = np.asarray(angles, np.float64)
     if not np.isfinite(theta).all():
         raise ValueError(
-            f"views {np.flatnonzero(~np.isfinite(theta))[:8].tolist()} have no angle; leave them out first"
+            f"projections {np.flatnonzero(~np.isfinite(theta))[:8].tolist()} have no angle; leave them out first"
         )
     views = np.arange(theta.size)
     name, _, rest = spec.strip().partition(":")
@@ -58,14 +58,16 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
     if name == "sector" and (match := _SECTOR.fullmatch(rest)):
         return _sector(theta, float(match[1]), float(match[2]), match[3], spec, period)
     raise ValueError(
-        f"unknown selection of views {spec!r}; use one of: {FORMS}; of a scan file, --frames none=30:38+61:62 leaves "
-        "these frames out"
+        f"unknown selection of projections {spec!r}. Use one of: {FORMS}. To leave out frames of a scan file, use for "
+        "example --frames none=30:38+61:62"
     )
 
 
 def _enough(n: int, available: int, spec: str) -> int:
     if not 1 <= n <= available:
-        raise ValueError(f"{spec!r} asks for {n} views; give a number from 1 to {available}")
+        raise ValueError(
+            f"{spec!r} asks for {n} projections, and {available} are available; give a number from 1 to {available}"
+        )
     return n
 
 
@@ -73,14 +75,17 @@ def _sector(
     theta: NDArray[np.float64], low: float, high: float, count: str | None, spec: str, period: float
 ) -> NDArray[np.int64]:
     if not high > low:
-        raise ValueError(f"{spec!r}: the sector must end after it begins, {high:g} is not above {low:g} degrees")
-    slack = 1e-6  # degrees, so that a view at an end of the sector is inside
+        raise ValueError(
+            f"{spec!r}: the sector must end at a larger angle than it begins, but {high:g} is not above {low:g} degrees"
+        )
+    slack = 1e-6  # degrees, so that a projection at an end of the sector is inside
     from_low = np.mod(np.rad2deg(theta) - low + slack, 360)
     inside = np.flatnonzero(from_low <= high - low + 2 * slack)
     if not inside.size:
         degrees = np.rad2deg(theta)
         raise ValueError(
-            f"{spec!r} holds no view; the {theta.size} views lie at {degrees.min():.2f} to {degrees.max():.2f} degrees"
+            f"{spec!r} contains no projection; the {theta.size} projections are at {degrees.min():.2f} to "
+            f"{degrees.max():.2f} degrees"
         )
     if count is None:
         return inside
@@ -88,23 +93,24 @@ def _sector(
 
 
 def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
-    """n of the views, spread evenly over the distinct angles within a period, or over all if these are too few."""
+    """n of the projections, evenly spread over the distinct angles in a period, or over all if these are too few."""
     once = np.sort(np.mod(theta[views], period))
     gaps = np.diff(once, append=once[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
-    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first view
+    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first projection
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
-    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # the earliest view at each angle
+    # the earliest projection at each angle
+    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order
     return np.sort(views[distinct[np.arange(n) * distinct.size // n]])
 
 
 def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most `n` of the frames, evenly spread; of a full turn half as many, each with the opposite one.
+    """At most `n` of the frames, evenly spread. For a 360° scan, half as many, each with its opposite projection.
 
     Args:
         angles: [frame], radians.
-        frames: [frame], their rows in the file.
+        frames: [frame], their indices in the file.
     """
     every = np.arange(angles.size)
     if angles.size <= n:
@@ -126,16 +132,17 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 def used_and_kept_back(
     n_views: int, held_out: tuple[int, ...], early_stop: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of the views that a fit sees, and of those held out, ascending.
+    """Numbers of the projections that a fit uses, and of the held-out ones, ascending.
 
     Raises:
-        ValueError: numbers that name no view, or all of them; none where `early_stop` needs some.
+        ValueError: a number is not that of a projection, all projections are held out, or none is and `early_stop`
+            needs some.
     """
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
-        raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
+        raise ValueError(f"held_out must be projection numbers 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
     if kept_back.size >= n_views:
-        raise ValueError(f"all {n_views} views are held out: none is left for the fit")
+        raise ValueError(f"all {n_views} projections are held out, so none is left for the fit; hold out fewer")
     if early_stop and not kept_back.size:
-        raise ValueError("early_stop needs held-out views, and there are none")
+        raise ValueError("early_stop needs held-out projections; state some with held_out")
     return np.setdiff1d(np.arange(n_views), kept_back), kept_back

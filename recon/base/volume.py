@@ -1,4 +1,4 @@
-"""Grid, Volume and VolumeSeries: a box of voxels in the object's frame, and the attenuation in it."""
+"""Grid, Volume and VolumeSeries: a box of voxels in the object's frame, and the attenuation in its voxels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 
 COARSEST = 4.0
-"""Pixels a voxel of a fit's box, at most. Without: fits of coarser volumes start from blurred matter; not measured."""
+"""Largest voxel edge of a fit, in pixels. With coarser voxels, a fit would start from a blurred sample (not
+measured)."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Grid:
 
     Attributes:
         shape: (nz, ny, nx) in voxels; z runs along the rotation axis.
-        voxel_size: edge in mm along x and y, and along z without a slice_pitch.
+        voxel_size: edge in mm along x and y, and along z if there is no slice_pitch.
         centre: (z, y, x) of the box's centre in mm; the rotation axis is x = y = 0.
         slice_pitch: edge in mm along z; None: voxels are cubes.
     """
@@ -45,19 +46,21 @@ class Grid:
                 raise ValueError(f"{name} must be a positive length in mm, got {edge}")
         if len(self.centre) != 3 or not np.isfinite(self.centre).all():
             raise ValueError(f"centre must be three finite lengths (z, y, x) in mm, got {self.centre}")
-        # A shape from a list or an array is the same box.
+        # a shape given as a list or an array makes an equal grid
         object.__setattr__(self, "shape", tuple(operator.index(n) for n in self.shape))
         object.__setattr__(self, "centre", tuple(float(c) for c in self.centre))
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
-        """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis, at the height that views see.
+        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis, at their
+        height.
 
-        With shifted views it covers every position that is seen by at least half as many views as the position seen
-        most often: small alignment shifts change nothing, views that step up and down give all heights.
+        If projections are shifted, it covers every position that is seen by at least half as many projections as the
+        most frequently seen position. So small alignment shifts change nothing, and projections that step up and down
+        give all heights.
 
-        If the axis stands off the detector's middle (`Geometry.is_off_middle`), the box holds the field of a full turn
-        of such views, as in `of_field`. Matter that views see but that has no voxel would be put into others.
+        If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
+        360° scan, as in `of_field`. Material that projections see but that has no voxel would appear in other voxels.
         """
         check_arguments(cls.matching, locals())
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
@@ -68,27 +71,27 @@ class Grid:
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
-        """A box around the rotation axis that holds all that any view sees, wherever the axis lies on the detector.
+        """A box around the rotation axis that contains everything that any projection sees, for any axis position.
 
-        It spans what shifted views see, also for an axis outside the detector; rolled and tilted views count as
-        straight ones. The field of a cone is measured at the rotation axis, the usual convention. Matter nearer the
-        source is magnified more, and only few views see it. The box of a wide cone ends before its source.
+        It includes what shifted projections see, also if the axis is outside the detector. Roll and tilt are ignored.
+        As usual, the field of view of a cone is measured at the rotation axis. Material nearer to the source is
+        magnified more, and only few projections see it. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
         nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error adds no voxel
-        if geometry.is_cone:  # the corners, and half a voxel beyond, do not reach the source
+        if geometry.is_cone:  # the corners plus half a voxel must not reach the source
             nx = max(1, min(nx, math.floor(math.sqrt(2) * geometry.source_distance / voxel_size - 1 - 1e-6)))
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
-        """The box that a fit covers: the whole field, in voxels of the requested size.
+        """The box that a fit covers: the whole field of view, in voxels of the requested size.
 
-        `wider`: it reaches as far as the requested one, which holds a sample beyond the field.
+        `wider`: it is as wide as the requested box, which contains a sample wider than the field of view.
 
-        The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
-        from which a fit can start.
+        The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
+        start from a volume coarser than four pixels.
         """
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
@@ -96,15 +99,20 @@ class Grid:
         return field.reaching(float(np.abs(wanted.edges[:, :2]).max()), geometry) if wider else field
 
     def widened(self, by: float, geometry: Geometry) -> Grid:
-        """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
+        """The box of the field of view, widened by the factor `by`.
+
+        For a cone beam it is limited to the width at which its corners reach the source.
+        """
         nz, nx, _ = self.shape
         most = math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6
         across = max(nx, math.floor(min(by * nx, most)))
         return replace(self, shape=(nz, across, across))
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
-        """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis, or
-        until its corners reach the source of a cone."""
+        """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis.
+
+        For a cone beam it stops before its corners reach the source.
+        """
         most = geometry.source_distance / math.sqrt(2) - self.voxel_size
         half = np.asarray(self.shape[1:]) * self.voxel_size / 2
         below, above = (
@@ -118,11 +126,12 @@ class Grid:
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
 
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
-        """The box with whole slices added until it holds the rays of a cone, which climb or sink to its corners."""
+        """The box with whole slices added until it contains all rays of a cone, which rise or fall to its corners."""
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
-        row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch  # what a row climbs on that way
+        # how far a row's rays rise on this distance
+        row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch
         (low, high), (bottom, top) = geometry.heights, self.edges[:, 2]
-        axis = geometry.axis_row + geometry.shifts[:, 1]  # rays climb from their source, which moves with `centres`
+        axis = geometry.axis_row + geometry.shifts[:, 1]  # rays rise from their source, which moves with `centres`
         first, last = abs(-0.5 - axis.max()), abs(geometry.detector_shape[0] - 0.5 - axis.min())
         wanted = bottom - low + row * first, high + row * last - top
         below, above = (max(0, math.ceil(each / edge - 1e-6)) for each in wanted)
@@ -148,7 +157,7 @@ class Grid:
         return z, y, x
 
     def part(self, z: slice, y: slice, x: slice) -> Grid:
-        """The box of these voxels, slices with first and end."""
+        """The box of these voxels; each slice must have a start and a stop."""
         slices = (z, y, x)
         centre = tuple(
             first + (part.start + part.stop - 1) / 2 * edge
@@ -166,10 +175,11 @@ class Grid:
 
 
 def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
-    """Extent in pixels of shifted views along columns (0) or rows (1), and its middle from that of an unshifted view.
+    """Extent in pixels of shifted projections along columns (0) or rows (1), and the distance of its middle.
 
-    Positions seen by fewer than half as many views as the position seen most often are left out; but where views climb
-    by half the detector's rows or more, all that are seen are kept.
+    The distance is from the middle of an unshifted projection. Positions that fewer than half as many projections see
+    as the most frequently seen position are left out. If projections move along the axis by half the detector's rows or
+    more, all positions are kept.
     """
     size = geometry.detector_shape[1 - axis]
     first = -geometry.offsets[:, axis]
@@ -185,7 +195,7 @@ def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel where the pitch is 1)."""
+    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel if the pitch is 1)."""
 
     data: NDArray[np.float32]
     grid: Grid
@@ -193,30 +203,35 @@ class Volume:
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
             raise ValueError(refusal("grid", self.grid, Grid))
-        shape = getattr(self.data, "shape", None)  # of an array, or of a dataset that is sliced along z
+        # shape of an array, or of a dataset that is read slice by slice along z
+        shape = getattr(self.data, "shape", None)
         if shape != self.grid.shape:
-            raise ValueError(f"data must be an array of its grid's shape {self.grid.shape} [z, y, x], got {shape}")
+            raise ValueError(
+                f"data must be an array with the shape of its grid, {self.grid.shape} [z, y, x], got {shape}"
+            )
 
     def __repr__(self) -> str:
         size, edge = " x ".join(map(str, self.grid.shape)), self.grid.voxel_size
         return f"Volume({size} voxels [z, y, x] of {edge:.4g})"
 
     def save(self, path: str | Path, **facts: object) -> None:
-        """Write it to the new file `path`, an .npz; `beamline export` takes it further.
+        """Write the volume to the new file `path`, an .npz; `beamline export` converts it.
 
         Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z), `centre_zyx_mm`, and
-        `facts`. Written as a whole or not at all.
+        `facts`. The file is written completely or not at all.
 
         Raises:
-            ValueError: another suffix.
-            FileExistsError: nothing is overwritten.
+            ValueError: the suffix is not .npz.
+            FileExistsError: the file exists; it is not overwritten.
         """
         check_arguments(self.save, {"path": path})
         path, grid = Path(path), self.grid
         if path.suffix != ".npz":
-            raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")
+            raise ValueError(
+                f"save() writes .npz files only, got {str(path)!r}. Use `beamline export` for other formats"
+            )
         if os.path.lexists(path):
-            raise FileExistsError(f"{path} exists and is not overwritten; name another file")
+            raise FileExistsError(f"{path} already exists, and save() does not overwrite files; give another name")
         partial = path.with_name(f".{path.name}.partial.npz")
         places: dict[str, object] = {
             "voxel_mm": grid.voxel_size, "slice_mm": grid.spacing[0], "centre_zyx_mm": grid.centre
@@ -228,7 +243,7 @@ class Volume:
             partial.unlink(missing_ok=True)
 
     def _repr_html_(self) -> str:
-        """For a notebook: the middle slices across z, y and x."""
+        """HTML for a notebook: the middle slices across z, y and x."""
         pixels, (low, high) = middle_slices(self.data)
         z, y, x = (n // 2 for n in self.grid.shape)
         shown = f"z = {z}, y = {y}, x = {x}; black {low:.4g}, white {high:.4g}"
@@ -237,13 +252,13 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class VolumeSeries:
-    """Volumes that all views determine together: of a sample that changes.
+    """Volumes of a changing sample at several times, reconstructed together from all projections.
 
     Attributes:
-        seconds: float64 [volume], from the first view on.
+        seconds: float64 [volume], time from the first projection in s.
         data: float32 [volume, z, y, x], or a dataset of a file.
-        residual: what they leave of the views, each view with the mixture that it shows, over the views (root mean
-            squares); NaN as read from a file, whose metrics have it.
+        residual: residual of the projections, each compared with its mixture of volumes, divided by the projections
+            (root mean squares); NaN if read from a file, whose metrics contain it.
     """
 
     seconds: NDArray[np.float64]
@@ -257,19 +272,19 @@ class VolumeSeries:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A short name of each volume: its time."""
+        """A short label for each volume: its time."""
         return tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
-        """The volumes one by one; each reads its voxels only when it is sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(self.n)]
+        """The volumes; each one reads its voxels only when it is sliced along z."""
+        return [_VolumeAt(self.data, index) for index in range(self.n)]
 
 
 class _VolumeAt:
-    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
+    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is read in slices along z."""
 
-    def __init__(self, data: Any, at: int) -> None:
-        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
+    def __init__(self, data: Any, index: int) -> None:
+        self._data, self._at, self.shape, self.dtype = data, index, data.shape[1:], data.dtype
 
     def __getitem__(self, z: slice) -> NDArray[np.float32]:
         return np.asarray(self._data[self._at, z])

@@ -1,8 +1,8 @@
-"""Beam hardening: line integrals of many energies turned into those of a thin layer's attenuation, for one material.
+"""Beam-hardening correction for a sample of one material: line integrals as the attenuation of a thin layer gives them.
 
-A beam of several energies loses the soft ones first, so line integrals grow more slowly than thickness. Bodies are
-darker inside (cupping), and between dense parts are streaks. For one material the relation is a curve, which is
-inverted (Herman 1979, Phys. Med. Biol. 24, 81).
+A beam of several energies loses the low energies first, so line integrals grow more slowly than thickness. In the
+volume, bodies are darker inside (cupping), and there are streaks between dense parts. For one material the relation is
+a curve, which is inverted (Herman 1979, Phys. Med. Biol. 24, 81).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from recon.base.arrays import F32, F64
 
 _NODES = 2048
 _FEWEST_RAYS, _MOST_RAYS = 100, 5000
-_LEAST_EXPLAINED = 0.9  # share of the variance of line integrals that thickness explains, for a sample of one material
+# least share of the variance of line integrals that thickness explains in a sample of one material
+_LEAST_EXPLAINED = 0.9
 
 
 class NoCurveError(ValueError):
@@ -29,7 +30,7 @@ class Curve:
 
     Attributes:
         measured: float64 [node], ascending from 0.
-        corrected: float64 [node], ascending from 0. Below 0 the curve goes on along its first piece, at the end
+        corrected: float64 [node], ascending from 0. Below 0 the curve continues along its first piece, beyond the end
             along its last.
     """
 
@@ -39,7 +40,7 @@ class Curve:
     def __post_init__(self) -> None:
         rising = (np.diff(self.measured) > 0).all() and (np.diff(self.corrected) > 0).all()
         if self.measured.shape != self.corrected.shape or self.measured.size < 2 or not rising:
-            raise ValueError("a curve needs two nodes or more, measured and corrected ascending")
+            raise ValueError("a curve needs at least two nodes, with ascending measured and corrected values")
 
     def linearise(self, views: F32, weights: F32 | None = None) -> None:
         """Replace line integrals of any shape, and their inverse variances, by corrected ones, in place."""
@@ -56,8 +57,8 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
     """The hardening curve of a material whose attenuation is `attenuations`, in any unit, at the energies of a beam.
 
     Args:
-        weights: shares of the light detected at these energies, of any sum.
-        highest: measured line integral at the curve's end, at least.
+        weights: relative intensities detected at these energies (not normalised).
+        highest: the curve reaches at least this measured line integral.
     """
     mu, w = np.asarray(attenuations, np.float64), np.asarray(weights, np.float64)
     mu = mu / (mu @ w / w.sum())
@@ -67,14 +68,14 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The curve of two energies that fits line integrals over paths through the material best.
+    """The two-energy curve that fits line integrals against path lengths in the material best.
 
     (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) It always rises, with a falling slope.
 
     Args:
         measured: line integrals.
-        paths: lengths of the rays inside the material, in any unit; 0 for rays beside it, which must be air.
-        highest: as of `curve_of_spectrum`.
+        paths: lengths of the rays inside the material, in any unit; 0 for rays that miss it, which must be air.
+        highest: as in `curve_of_spectrum`.
 
     Returns:
         The curve, and the share of the line integrals' variance that it explains.
@@ -86,7 +87,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     few = slice(None, None, max(1, p.size // _MOST_RAYS))
     p, length = p[few], length[few]
     if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:
-        raise NoCurveError(f"{inside} rays through the material are too few")
+        raise NoCurveError(f"too few rays go through the material: {inside}, and {_FEWEST_RAYS} are needed")
     slope = float(p @ length / (length @ length))
 
     def of(soft: float, hard: float, share: float) -> F64:
@@ -95,7 +96,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     def residuals(x: F64) -> F64:
         return np.asarray(of(x[0] + x[1], x[0], x[2]) - p)
 
-    from scipy.optimize import least_squares  # half a second
+    from scipy.optimize import least_squares  # loading takes half a second
 
     bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
     solution = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
@@ -103,7 +104,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
-            f"thickness explains {max(explained, 0):.0%} of the line integrals, of one material it would be "
-            f"{_LEAST_EXPLAINED:.0%} and more"
+            f"the sample seems to have several materials: its thickness explains only {max(explained, 0):.0%} of the "
+            f"variance of the line integrals, and for one material it explains at least {_LEAST_EXPLAINED:.0%}"
         )
     return curve_of_spectrum((hard + more, hard), (share, 1 - share), highest), explained

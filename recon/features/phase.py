@@ -1,4 +1,4 @@
-"""Phase: turns the bright rims of a propagated wave into contrast, by the filter for a single distance."""
+"""Phase retrieval: Paganin's filter for a single distance, and the search for its length."""
 
 from __future__ import annotations
 
@@ -23,30 +23,32 @@ from recon.voxels.held_out import LEAST_VIEWS, predicted_views
 from recon.voxels.methods import EarlyTv
 from recon.voxels.voxel_problem import NORM
 
-_REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
+_REACH = 4.0  # in units of the length; beyond it, the influence of a pixel is below exp(-4)
 TRIAL_ROWS, TRIAL_COPIES = 8, 10
-"""Rows that a search for the length sees, and the copies of their views and volumes that it holds, float32."""
+"""Number of rows in a search for the length, and float32 copies of their projections and volumes in memory."""
 LEAST_DROP = 0.1
-"""Share by which a filter that nobody asked for must lower the residual of views held out. One of 8 % takes half the
-depth of a tooth's thin cracks. Simulated cathodes that gain 4 to 11 dB have 14 % and more, two that were looked at
-afterwards 13.5 and 13.9 %."""
-_FIRST, _LONGEST = 1.0, 64.0  # squares of lengths, in pixels: where the search begins, and the largest
-_ERRORS = 3.0  # standard errors by which a filter must predict better than none
-_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial by `EarlyTv`
+"""A filter that the user did not ask for must lower the residual in held-out projections by this share.
+
+A filter that lowers it by 8 % removes half the depth of the thin cracks of a tooth. Simulated cathodes that gain 4 to
+11 dB have 14 % and more; two that were examined afterwards have 13.5 and 13.9 %.
+"""
+_FIRST, _LONGEST = 1.0, 64.0  # squared lengths in pixels²: start of the search, and largest
+_ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
+_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a test reconstruction with `EarlyTv`
 
 
 @dataclass(frozen=True)
 class Paganin:
-    """Line integrals of a sample of one material, from its intensity at one distance behind it.
+    """Paganin's phase filter for a sample of one material, from the intensity at one distance behind it.
 
-    The transmission's transform is divided by 1 + (2 pi f length)², f in cycles a pixel (Paganin et al. 2002, J.
-    Microsc. 206, 33, equation 12). The frame's edges are mirrors. It lowers the noise most if absorption is weak;
-    detail finer than its length is lost to noise.
+    The Fourier transform of the transmission is divided by 1 + (2 pi f length)², with f in cycles per pixel (Paganin et
+    al. 2002, J. Microsc. 206, 33, equation 12). The frame is mirrored at its edges. The filter lowers the noise most if
+    absorption is weak. Detail finer than the length is lost in noise.
 
     Attributes:
         length: sqrt(distance delta / mu), in pixels, see `length_of`.
-        unsharp: (sigma in pixels, weight) of a mask that restores fine detail: it adds weight times the difference of
-        the transmission and its Gaussian blur. None: no mask.
+        unsharp: (sigma in pixels, weight) of an unsharp mask that restores fine detail: it adds weight times the
+            difference between the transmission and its Gaussian blur. None: no mask.
     """
 
     length: float
@@ -54,17 +56,17 @@ class Paganin:
 
     def __post_init__(self) -> None:
         if not 0 <= self.length < math.inf:
-            raise ValueError(f"length is in pixels, finite and 0 or more, got {self.length}")
+            raise ValueError(f"length must be finite pixels, 0 or more, got {self.length}")
         if self.unsharp is not None and not (self.unsharp[0] > 0 and 0 <= self.unsharp[1] < math.inf):
-            raise ValueError(f"unsharp is a sigma > 0 and a weight >= 0, got {self.unsharp}")
+            raise ValueError(f"unsharp must be a sigma > 0 and a weight >= 0, got {self.unsharp}")
 
     @property
     def reach(self) -> int:
-        """Distance in pixels up to which others influence a pixel."""
+        """Distance in pixels up to which other pixels influence a pixel."""
         return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
-        """Replace measured line integrals [view, row, col] by those of the sample, in place; `floor`: least light."""
+        """Replace line integrals [view, row, col] by those of the sample, in place; `floor`: least transmission."""
         f2 = _squared_frequencies(views)
         gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)
         if self.unsharp is not None:
@@ -72,18 +74,18 @@ class Paganin:
             gain *= 1 + weight * (1 - np.exp(-2 * (math.pi * sigma) ** 2 * f2))
         gain = gain.astype(np.float32)
         for view in views:
-            light = _filtered_light(view, gain)
-            np.negative(np.log(np.maximum(light, floor, out=light), out=light), out=view)
+            transmission = _filtered_transmission(view, gain)
+            np.negative(np.log(np.maximum(transmission, floor, out=transmission), out=transmission), out=view)
 
 
 def _squared_frequencies(views: F32) -> F64:
-    """[row, col] of the cosines of a mirrored frame, in cycles a pixel, squared."""
+    """[row, col] squared frequencies of the cosine transform of a frame, in (cycles per pixel)²."""
     along = [(np.arange(n) / (2 * n)) ** 2 for n in views.shape[1:]]
     return along[0][:, None] + along[1]
 
 
-def _filtered_light(view: F32, gain: NDArray[np.floating]) -> F32:
-    """The transmission of line integrals [row, col], its cosine transform times `gain`."""
+def _filtered_transmission(view: F32, gain: NDArray[np.floating]) -> F32:
+    """The transmission of line integrals [row, col], with its cosine transform multiplied by `gain`."""
     from numba import config
 
     spectrum = fft.dctn(np.exp(-view), norm="ortho", overwrite_x=True, workers=config.NUMBA_NUM_THREADS)
@@ -97,7 +99,7 @@ def length_of(delta_beta: float, distance_mm: float, energy_kev: float, pitch_mm
     Args:
         delta_beta: ratio of the decrement delta of the refractive index to its absorption beta; mu = 4 pi beta /
             wavelength.
-        distance_mm: from the sample to the detector; behind a source at sod, z sod / (sod + z) of a distance z (Fresnel
+        distance_mm: distance z from the sample to the detector; for a source at sod, use z sod / (sod + z) (Fresnel
             scaling: Paganin 2006, Coherent X-Ray Optics, appendix B).
     """
     return math.sqrt(HC / energy_kev * distance_mm * delta_beta / (4 * math.pi)) / pitch_mm
@@ -105,12 +107,12 @@ def length_of(delta_beta: float, distance_mm: float, energy_kev: float, pitch_mm
 
 @dataclass(frozen=True)
 class FilterLength:
-    """The filter's length that predicts views held out best.
+    """The length of the filter that predicts held-out projections best.
 
     Attributes:
         length: in pixels.
-        factor: one standard error of its square, as a ratio, by how views held out disagree.
-        gain: relative decrease of the residual of these views, against no filter.
+        factor: one standard error of the squared length, as a ratio, from the disagreement of held-out projections.
+        gain: relative decrease of the residual in these projections, compared with no filter.
     """
 
     length: float
@@ -121,16 +123,17 @@ class FilterLength:
 def length_by_held_out_views(
     views: F32, geometry: Geometry, floor: float, known: NDArray[np.bool_]
 ) -> FilterLength | None:
-    """The length of Paganin's filter by views held out; None where none predicts them better, or views are too few.
+    """The length of Paganin's filter from held-out projections; None if no length is better, or they are too few.
 
-    A volume of the other views, filtered, is projected, and its transmission T gets the fringes back, as
-    T - length² laplace T. So views as measured are the yardstick of every length. Filtered ones are not, since a longer
-    filter makes any views smoother.
+    A volume is reconstructed from the other, filtered projections. It is projected, and the fringes are added to its
+    transmission T again, as T - length² laplace T. So every length is compared with the projections as measured.
+    Filtered projections would not be a fair reference, because a longer filter makes any projection smoother.
 
     Args:
-        views: line integrals [view, row, col]; 8 rows are used, those with most matter, of a cone those at its middle.
-        floor: least light.
-        known: [row, col] pixels that were measured.
+        views: line integrals [view, row, col]; 8 rows are used: those with most material, for a cone those in the
+            middle.
+        floor: least transmission.
+        known: [row, col] pixels with data.
     """
     if geometry.n_views < LEAST_VIEWS:
         return None
@@ -155,7 +158,7 @@ def length_by_held_out_views(
         unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN, decide)
         norms[:] = decide.made[NORM]
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
-        off = np.stack([_filtered_light(image, fringes) for image in images]) - np.exp(-views[unseen])
+        off = np.stack([_filtered_transmission(image, fringes) for image in images]) - np.exp(-views[unseen])
         return np.sqrt(np.square(off[:, known]).mean(axis=1, dtype=np.float64))
 
     best = preferred_strength(residuals_of, _FIRST)
@@ -167,7 +170,7 @@ def length_by_held_out_views(
     if not exceeds_standard_error(none - least, _ERRORS):
         return None
     weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))
-    # Half octaves to the vertex of a parabola, by each view; whole octaves would cost 1 dB.
+    # Factors of √2, then the vertex of a parabola, for each projection; factors of 2 would cost 1 dB.
     to_vertex = (weaker - stronger) / (2 * float((weaker + stronger).mean()))
     factor = 2.0 ** float(to_vertex.std(ddof=1) / (2 * math.sqrt(to_vertex.size)))
     square, gain = at * 2.0 ** float(to_vertex.mean() / 2), 1 - float(least.mean() / none.mean())

@@ -1,7 +1,7 @@
-"""Rings: removes the stripes that pixels with unequal response make in a sinogram; in a slice they are rings.
+"""Rings: removes the stripes in sinograms (rings in slices) that come from pixels with a wrong sensitivity.
 
-A sinogram is float32 [view, col] of one detector row, line integrals in the order of their angles, where a stripe is a
-column. Stripes of views that cover little angle cannot be distinguished from the sample's edges.
+A sinogram is float32 [view, col]: the line integrals of one detector row in the order of the angles. A stripe is a
+column in it. If the projections cover a small angle, stripes cannot be distinguished from edges of the sample.
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from recon.base.declared_types import check_arguments
 from recon.base.stripes import AT_AXIS, NARROWEST, steadiness, without_layers
 from recon.base.units import warn_of_other_quantity
 
-_ROBUST = 1.4826  # as 1 / MEDIAN, rounded: volumes that were recorded have it in what `by_sorting` takes off
-_FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
+_ROBUST = 1.4826  # 1 / MEDIAN, rounded; recorded reference volumes depend on this rounding in `by_sorting`
+_FAR = 3.0  # a column that differs from its neighbours by this many standard deviations is a stripe (Vo 2018: snr 3)
 _FEWEST_VIEWS = 8
-_MOST = 0.1  # of the columns
-_EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
-_ROWS = 8  # looked at
-_COPIES = 13  # float32 copies of a sinogram
+_MOST = 0.1  # largest share of columns that may be stripes
+_EVEN = 0.4  # largest ratio of standard deviation to shift; a stripe has nearly the same shift in all projections
+_ROWS = 8  # number of rows examined
+_COPIES = 13  # float32 copies of a sinogram in memory
 
 
 def width_for(cols: int) -> int:
-    """Odd number of columns for a median: wider than small stripes and narrower than the sample. 31 for 2048, 7 for
-    160, 3 for 40."""
+    """Odd number of columns for a median, wider than small stripes and narrower than the sample.
+
+    31 for 2048 columns, 7 for 160, 3 for 40.
+    """
     return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
 
 
 def by_sorting(sinogram: F32, width: int | None = None) -> F32:
     """Remove small and medium stripes by a median across columns, after sorting the values of each column.
 
-    A stripe shifts all values of its column. Sorted, neighbouring columns look alike, so that the difference is the
+    A stripe shifts all values of its column. After sorting, neighbouring columns are similar, so the difference is the
     stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: a stripe adds about the same
-    to all views, and only that is removed; otherwise edges of metal leave black streaks across the slice]
+    to all projections, and only this part is removed; otherwise edges of metal leave black streaks across the slice]
     """
     order = np.argsort(sinogram, axis=0, kind="stable")
     ranked = np.take_along_axis(sinogram, order, axis=0)
@@ -54,10 +56,10 @@ def by_sorting(sinogram: F32, width: int | None = None) -> F32:
 
 
 def without_dead_columns(sinogram: F32) -> F32:
-    """Fill columns that hardly respond, or flicker, from their neighbours (Vo et al. 2018, algorithm 6).
+    """Fill columns that hardly respond or fluctuate from their neighbours (Vo et al. 2018, algorithm 6).
 
-    Such a column varies more or less from view to view than the median of the columns around. [our own: by the median
-    of the views, because edges of metal cross a column in a few views]
+    Such a column varies more, or less, between projections than the median of the columns around it. [our own: the
+    median over projections, because edges of metal cross a column in a few projections]
     """
     rough = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
     bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
@@ -67,9 +69,10 @@ def without_dead_columns(sinogram: F32) -> F32:
 def without_large_stripes(sinogram: F32) -> F32:
     """Shift wide or strong stripes to the level of their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
 
-    A column is changed only if its sorted values differ from those around by three times the noise of a pixel. They
-    must do so over their middle four fifths, by about as much everywhere. If a tenth of all columns do, no column is
-    changed. [our own: the second condition; without it metal near the axis counts as a stripe]
+    A column is changed only if its sorted values differ from those of the columns around it by three times the noise of
+    a pixel. They must differ over their middle four fifths, by about the same amount everywhere. If a tenth of all
+    columns meet these conditions, no column is changed. [our own: the second condition; without it, metal near the axis
+    counts as a stripe]
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
@@ -79,7 +82,7 @@ def without_large_stripes(sinogram: F32) -> F32:
     far = np.abs(shift) > _FAR * max(_noise(sinogram), median_deviation(shift))
     far &= off.std(axis=0) < _EVEN * np.abs(shift)
     if far.mean() > _MOST:
-        return sinogram  # so many columns belong to the sample
+        return sinogram  # so many columns must belong to the sample
     return sinogram - np.where(far, shift, 0).astype(np.float32)
 
 
@@ -98,16 +101,16 @@ _NAMES: Mapping[Callable[[F32], F32], str] = {
 
 
 def stripe_score(sinogram: F32) -> float:
-    """Typical difference of a column from the four beside it, over its own noise; about 1 without stripes.
+    """Typical difference of a column from its four neighbours, divided by its own noise; about 1 without stripes.
 
-    It is a median over views, without edges of the sample, which cross a column in a few views. A body on the axis
-    stays in its columns, and counts as a stripe.
+    It is a median over projections, so edges of the sample do not count, because they cross a column in a few
+    projections. A body on the axis stays in its columns and counts as a stripe.
     """
     x = sinogram
     off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
     noise = _noise(off)
     of_columns = np.median(off, axis=0)
-    rough = np.diff(of_columns, 2) / math.sqrt(6)  # a large body bends slowly from column to column
+    rough = np.diff(of_columns, 2) / math.sqrt(6)  # a large body changes slowly from column to column
     spread = _ROBUST * np.median(np.abs(rough))
     return float(spread / max(noise * math.sqrt(math.pi / 2 / len(x)), 1e-12))
 
@@ -118,7 +121,7 @@ class WithoutRings:
 
     Attributes:
         data: float32 [view, row, col], line integrals.
-        taken: float32 [row, col], mean removed part of a view.
+        taken: float32 [row, col], mean of the removed part over the projections.
         sentence: a sentence about the removal.
     """
 
@@ -136,21 +139,25 @@ def remove_rings(
     """A copy of line integrals without the stripes that cause rings, for use between `recon.correct` and a method.
 
     Args:
-        projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
+        projections: [view, row, col], in any order. Fewer than 8 projections, or with fewer than 64 columns, are not
+            changed.
         angles: [view], radians.
-        rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
-            ones, "none". "auto" looks and chooses.
+        rings: "sort": small and medium stripes (Vo et al. 2018, algorithm 3); "vo": also dead columns and large
+            stripes; "none": no removal; "auto": chosen from the data.
         axis_col: column of the rotation axis; None: the middle.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or another `rings`.
+        ValueError: shapes do not match, values are not finite, or `rings` is unknown.
     """
     check_arguments(remove_rings, locals())
     views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
     if views.ndim != 3 or theta.shape != views.shape[:1]:
-        raise ValueError(f"projections {views.shape} must be [view, row, col] for angles {theta.shape}")
+        raise ValueError(
+            f"projections must be [view, row, col] with one angle for each projection, got shapes {views.shape} and "
+            f"{theta.shape}"
+        )
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
-        raise ValueError("projections or angles hold NaN or infinite values; correct them first")
+        raise ValueError("projections or angles contain NaN or infinite values; correct them first")
     warn_of_other_quantity(views)
     return WithoutRings(views, *remove_rings_in_place(views, theta, rings, axis_col))
 
@@ -161,23 +168,23 @@ def remove_rings_in_place(
     """Remove stripes from all rows of line integrals [view, row, col], in place.
 
     Args:
-        views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
+        views: in any order. Fewer than 8 projections, or with fewer than 64 columns, are not changed.
         angles: [view], radians.
-        rings: the method. "auto" looks at some rows: it sorts where `steadiness` sees stripes, and takes out columns
+        rings: the method. "auto" examines some rows: it uses "sort" if `steadiness` finds stripes, and removes columns
             that are dead or far off.
-        axis_col: column of the rotation axis; None: the middle. What a column has in common with the one on the other
-            side of the axis stays, see `without_layers`.
+        axis_col: column of the rotation axis; None: the middle. The part that a column shares with the mirrored column
+            stays, see `without_layers`.
 
     Returns:
-        float32 [row, col], mean removed part of a view, and a sentence about it; "" for "none".
+        float32 [row, col], mean of the removed part over the projections, and a sentence about it; "" for "none".
     """
     taken = np.zeros(views.shape[1:], np.float32)
     if rings == "none":
         return taken, ""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return taken, (
-            f"Rings: {len(views)} views of {views.shape[2]} columns are too few to tell stripes from the sample (at "
-            f"least {_FEWEST_VIEWS} of {NARROWEST}); none removed."
+            f"Rings: nothing was removed. {len(views)} projections of {views.shape[2]} columns are too few to tell "
+            f"stripes from the sample (at least {_FEWEST_VIEWS} projections of {NARROWEST} columns are needed)."
         )
     order = np.argsort(angles, kind="stable")
     axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
@@ -185,7 +192,7 @@ def remove_rings_in_place(
     before = _typical_score(views[np.ix_(order, rows)])
     stages = (REMOVERS[rings],) if rings != "auto" else _stages(views[np.ix_(order, rows)], axis)
     if not stages:
-        return taken, "Rings: no stripes seen that are the detector's; none removed."
+        return taken, "Rings: nothing was removed, because the detector causes no visible stripes."
     for row in range(views.shape[1]):
         stripes = clean = views[order, row]
         for remove in stages:
@@ -196,23 +203,27 @@ def remove_rings_in_place(
         views[order, row] = clean
     after = _typical_score(views[np.ix_(order, rows)])
     how = ", ".join(_NAMES.get(remove, rings) for remove in stages)
-    return taken, f"Rings: removed by {how}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+    return taken, (
+        f"Rings: removed by {how}. The height of the stripes fell from {before:.1f} to {after:.1f} times the noise of "
+        "a column."
+    )
 
 
-_FAINTEST = 1e-5  # of the largest line integral: fainter stripes are seen in views without noise alone
+_FAINTEST = 1e-5  # share of the largest line integral; fainter stripes can only be seen in projections without noise
 
 
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
-    """A sentence if pixels respond so unequally that rings are visible, with the remedy; otherwise ""."""
+    """A warning with advice if pixel sensitivities differ so much that rings are visible; otherwise ""."""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return ""
     steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
     if steady is None or not steady.stripes or steady.odd < _FAINTEST * float(np.abs(views).max()):
         return ""
     return (
-        f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "
-        "a column; nothing was removed. --rings auto (by a filter), or of a finished scan --calibrate gains (by the "
-        "volume), removes them; where the sample has layers around the axis, compare the volumes."
+        f"Expect ring artefacts: pixel sensitivities differ by {steady.odd:.2g} in line integral, {steady.score:.1f} "
+        "times the noise of a column. Nothing was removed. Use --rings auto (a filter on the projections), or on a "
+        "finished scan --calibrate gains (measures the sensitivities with the volume). If the sample has layers "
+        "around the rotation axis, compare the volumes."
     )
 
 
@@ -225,7 +236,7 @@ def _typical_score(sinograms: F32) -> float:
 
 
 def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]:
-    """What removes the stripes of these rows [view, row, col] that are the detector's, in order."""
+    """The removal functions, in order, for the detector stripes in these rows [view, row, col]."""
     steady = steadiness(sinograms, axis_col)
     strong = (without_dead_columns, without_large_stripes)
     far_off = any(_far_off(sinograms[:, row], axis_col) for row in range(sinograms.shape[1]))
@@ -233,7 +244,7 @@ def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]
 
 
 def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
-    """Peak memory of `remove_rings_in_place` in bytes, without the views, for a detector (rows, cols)."""
+    """Peak memory of `remove_rings_in_place` in bytes, without the projections, for a detector (rows, cols)."""
     rows, cols = shape
     looked_at = views * min(rows, _ROWS) * cols
     if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:
@@ -242,12 +253,12 @@ def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
 
 
 def _noise(values: NDArray[np.floating]) -> float:
-    """Standard deviation from view to view, robustly by second differences."""
+    """Robust standard deviation between projections, from second differences."""
     return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))
 
 
 def _far_off(sinogram: F32, axis_col: float) -> bool:
-    """Whether columns are dead or far off: at most a fifth of all, none near the axis or with one on its other side."""
+    """Whether some columns are dead or far off: at most a fifth of all, not near the axis, and not mirrored."""
     cleaned = without_large_stripes(without_dead_columns(sinogram))
     changed = (cleaned != sinogram).any(axis=0).sum()
     strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
@@ -269,7 +280,7 @@ def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
 
 
 def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
-    """Bad columns filled by the line between the good ones beside them; unchanged if more than half are bad."""
+    """Bad columns filled by linear interpolation between good ones; unchanged if more than half are bad."""
     if not bad.any() or bad.mean() > 0.5:
         return sinogram
     good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)

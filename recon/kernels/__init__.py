@@ -1,4 +1,4 @@
-"""Compute kernels: cpu (numba), gpu (Triton), and the reference implementation that both are tested against.
+"""Compute kernels: cpu (numba), gpu (Triton), and the reference implementation with which both are compared in tests.
 
-Nothing here knows files, clocks or devices.
+The kernels do not use files, clocks or device settings.
 """

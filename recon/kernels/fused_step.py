@@ -1,4 +1,4 @@
-"""StepPlan, StepModel, StepInputs: what a device needs to make a whole step of a fit without the host in between."""
+"""StepPlan, StepModel, StepInputs: the data with which a device makes a complete fitting step without the host."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from recon.base.volume import Grid
 
 @dataclass(frozen=True, eq=False)
 class StepPlan:
-    """What stays the same from step to step.
+    """Values that are the same in all steps.
 
     Attributes:
-        key: two plans of one fit with equal keys are the same.
-        geometry: of the views. Only its detector and beam are read.
+        key: two plans of one fit with equal keys are equal.
+        geometry: geometry of the projections; only its detector and beam are used.
         unit: 1/mm; densities are unit * softplus(raw).
         faint, cut: see `Pass.view`.
-        views: of a step; their gradients are averaged.
-        loss: of one view.
-        weighted: pixels have weights.
-        box: of total variation, centred at 0; None: there is none.
-        box_faint: density below which Gaussians are cut off in the box.
-        moves: total variation moves centres.
-        bounds: of the four parameters.
+        views: number of projections in a step; their gradients are averaged.
+        loss: loss of one projection.
+        weighted: True if pixels have weights.
+        box: box of total variation, centred at 0; None: no total variation.
+        box_faint: Gaussians are cut off below this density in the box.
+        moves: True if total variation moves centres.
+        bounds: bounds of the four parameters.
     """
 
     key: tuple[Any, ...]
@@ -47,8 +47,11 @@ class StepPlan:
 
 @dataclass(frozen=True, eq=False)
 class StepModel:
-    """Arrays on the device that steps change in place: four of parameters, their two moments, and the statistic of
-    density control; `loss` and `residual` are the running means so far, NaN before the first step."""
+    """Arrays on the device that steps change in place.
+
+    They are the four parameter arrays, their two moments, and the statistic of density control. `loss` and `residual`
+    are the running means so far, NaN before the first step.
+    """
 
     parameters: tuple[Any, ...]
     first: tuple[Any, ...]
@@ -60,15 +63,15 @@ class StepModel:
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """What differs from step to step.
+    """Values that differ between steps.
 
     Attributes:
-        geometry: that the numbers of `views` are of.
-        images, target_maps, weights: of each of the views, on the device; weights may be None.
+        geometry: geometry to which the numbers in `views` refer.
+        images, target_maps, weights: for each of these projections, on the device; weights may be None.
         corner: centre (z, y, x) of the first voxel of the box, mm.
-        tv_weight: of the mean |difference of neighbours| in the box, in 1 / density.
-        rates: of the four parameters.
-        step: from 1 on.
+        tv_weight: weight of the mean |difference of neighbours| in the box, in 1 / density.
+        rates: learning rates of the four parameters.
+        step: number of the step, from 1.
     """
 
     geometry: Geometry
@@ -83,10 +86,10 @@ class StepInputs:
 
 
 class FusedStep(Protocol):
-    """Steps of one model by one plan, queued on a device.
+    """Steps of one model with one plan, queued on a device.
 
     Attributes:
-        model, plan: that it was made for.
+        model, plan: the model and plan it was made for.
         loss, residual: running means on the device.
     """
 
@@ -99,4 +102,4 @@ class FusedStep(Protocol):
         """Queue one step."""
 
     def settle(self) -> None:
-        """Wait until the arrays of the model hold all steps."""
+        """Wait until the arrays of the model include all steps."""

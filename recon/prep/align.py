@@ -1,9 +1,9 @@
-"""find_axis: the rotation axis from the data, with the curve of each estimate and whether it is reliable.
+"""find_axis: the rotation axis (centre of rotation) from the projections, and whether the estimate is reliable.
 
-Five methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle.
-Opposite views need a full turn. The double wedge needs views over about half a turn, and the sample in the field. The
-ends of half a turn take a wider sample, but need small steps. The centre of mass takes any sector, but needs the whole
-sample in the field and air at zero.
+There are five methods with different requirements. "pair" needs two opposite projections (180° apart) and an axis near
+the middle. "opposite views" needs a 360° scan. "double wedge" needs projections over about 180° and the sample within
+the field of view. "ends of half a turn" also works for a wider sample, but needs small steps. "centre of mass" works
+with any sector, but needs the whole sample in the field of view and an air level of zero.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from recon.prep.axis_wedge import AxisError as AxisError
 from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
-_FEWEST = 2  # columns at each edge that are too near to it for an axis
-_PAIRINGS = 32  # of views that are not opposite
+_FEWEST = 2  # columns at each edge in which no axis is accepted
+_PAIRINGS = 32  # pairings of projections that are not opposite
 _PERFECT = 1 - 1e-9
 _ALL = slice(None)
-_EDGE = 25  # one column in so many, at each edge, is too near to it for an axis
+_EDGE = 25  # one column in this many, at each edge, is too near to the edge for an axis
 
 
 def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> AxisEstimate:
-    """Axis from two views half a turn apart: p180 is p0 mirrored about the axis.
+    """Axis from two opposite projections: p180 is p0 mirrored about the axis.
 
-    The normalised correlation of p0 with the mirrored p180 is taken at every half column, then a parabola through the
-    peak. A mirror about a half column maps pixels on pixels, so nothing is interpolated. Samples wider than the field
-    are allowed: only columns that both views see are compared.
+    The normalised correlation of p0 with the mirrored p180 is computed at every half column, and a parabola is fitted
+    to its peak. A mirror about a half column maps pixels to pixels, so nothing is interpolated. The sample may be wider
+    than the field of view, because only columns that both projections see are compared.
 
     Args:
         p0, p180: float32 [row, col], line integrals.
 
     Raises:
-        ValueError: for shapes that differ or values that are not finite.
+        ValueError: the shapes differ, or values are not finite.
         AxisError: the best match lies at the edge of the candidates.
     """
     a, b = np.atleast_2d(p0).astype(np.float64), np.atleast_2d(p180).astype(np.float64)
     if a.shape != b.shape:
-        raise ValueError(f"the two views have shapes {a.shape} and {b.shape}")
+        raise ValueError(f"the two projections must have the same shape, got {a.shape} and {b.shape}")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError("the two views hold NaN or infinite values; correct them first")
+        raise ValueError("the two projections contain NaN or infinite values; correct them first")
     cols = a.shape[1]
     rows = np.unique(np.linspace(0, len(a) - 1, min(len(a), 4 * MOST_ROWS)).astype(int))
     candidates = np.arange(cols // 8 * 2, 2 * cols - 1 - cols // 8 * 2) / 2
@@ -63,21 +63,22 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> Axis
 
 
 def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
-    """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
+    """Axis from all pairs of opposite projections of a 360° scan, also if the axis is near an edge of the detector.
 
-    As `axis_from_pair`, but from the views' slopes along the columns, which share no trend if the overlap is narrow.
-    What all views show alike, as the rim of a round sample, is taken off. The sum is over up to 64 pairs and over rows
-    (the overlap of wide-field scans: Vo et al. 2021, Opt. Express 29, 17849). Few columns agree by chance, so that a
-    candidate counts by Fisher's z = artanh(correlation) √columns. The estimate is confident if its z is above the
-    largest z that any candidate has among pairs that are no opposite views (each view with that of another pair), in
-    every of up to 32 such pairings: a false alarm in 33.
+    It works as `axis_from_pair`, but with the slopes of the projections along the columns, because slopes share no
+    trend if the overlap is narrow. The part that all projections share, such as the rim of a round sample, is
+    subtracted. The sum is over up to 64 pairs and over rows (overlap in half acquisition: Vo et al. 2021, Opt. Express
+    29, 17849). A few columns can agree by chance, so a candidate is scored by Fisher's z = artanh(correlation)
+    √columns. For comparison, projections are paired with those of another pair, which are not opposite, in up to 32
+    ways. The estimate is confident if its z exceeds the largest z of any candidate in each of these pairings: one false
+    alarm in 33.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
     Raises:
-        ValueError: fewer than 8 pairs of opposite views, or values that are not finite.
+        ValueError: there are fewer than 8 pairs of opposite projections, or values are not finite.
         AxisError: the best match lies at the edge of the candidates.
     """
     a, b = _opposites(projections, angles)
@@ -93,11 +94,11 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
 
     curve = views.mismatch()
     score = score_of(curve)
-    optimum(candidates, score.max() - score)  # refuses an axis at the edge
+    optimum(candidates, score.max() - score)  # raises an error for an axis at the edge
     best = int(score.argmax())
     near = slice(best - 1, best + 2)
     value = lowest(candidates[near], curve[near])[0]
-    middle = pairs // 2 * height  # neighbouring views are alike, the two quarters of a turn are not
+    middle = pairs // 2 * height  # neighbouring projections are similar, those a quarter of a turn apart are not
     halves = [score_of(views.mismatch(part)) for part in (slice(middle), slice(middle, None))]
     apart = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
     turned = np.unique(np.linspace(1, pairs - 1, min(pairs - 1, _PAIRINGS)).astype(int))
@@ -108,22 +109,24 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
 
 
 def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
-    """Slopes along the columns [pair, row, col - 1] of some rows of views, and of opposite views, negated."""
+    """Slopes along the columns [pair, row, col - 1] of some rows of projections, and of their opposites, negated."""
     first, opposite = _opposite_pairs(np.asarray(angles, np.float64), projections.shape[2])
     if first.size < _FEWEST_PAIRS:
-        raise ValueError(f"found {first.size} pairs of views half a turn apart; at least {_FEWEST_PAIRS} are needed")
+        raise ValueError(
+            f"found {first.size} pairs of opposite projections (180° apart); at least {_FEWEST_PAIRS} are needed"
+        )
     some = np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))
     first, opposite = first[some], opposite[some]
     data = few_rows(projections[np.concatenate((first, opposite))])
     if not np.isfinite(data).all():
-        raise ValueError("the views hold NaN or infinite values; correct them first")
+        raise ValueError("the projections contain NaN or infinite values; correct them first")
     slopes = np.diff(uniform_filter1d(data, 3, axis=2), axis=2)
     slopes -= slopes.mean(axis=0)
     return slopes[: first.size], -slopes[first.size :]
 
 
 def _opposite_pairs(angles: Floats, cols: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views of half a turn, by their angles, and those that are opposite to within 2 / cols."""
+    """Projections of one half turn, and the ones opposite to them within 2 / cols."""
     theta = np.mod(angles, 2 * np.pi)
     away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
     opposite = away.argmax(axis=1)
@@ -138,21 +141,22 @@ def _rows_of(views: Floats) -> Floats:
 
 
 def mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
-    """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
+    """1 - normalised correlation of a[i] with b[2 axis - i], over all rows and the columns that both have.
 
-    It is 1 if these columns hold too little of the views' variance: air alone always matches.
+    It is 1 if these columns contain too little of the variance, because air alone always matches.
     """
     return _Mirrored.of(a, b, candidates).mismatch()
 
 
 @dataclass(frozen=True, eq=False)
 class _Mirrored:
-    """Rows [row, col] of two sets of views, and what each adds to the correlation with the other, for each candidate.
+    """Rows [row, col] of two sets of projections, prepared for their correlation at each candidate.
 
     Attributes:
-        total: i + j of the pixels compared. length: of the transforms. count: columns that both have.
-        spectra: of both sets [row, frequency]; sums, variances: of both sets over these columns [row, candidate].
-        powers: of both sets [row].
+        total: i + j of the compared pixels. length: length of the transforms. count: columns that both have.
+        spectra: spectra of both sets [row, frequency]; sums, variances: of both sets over these columns [row,
+            candidate].
+        powers: powers of both sets [row].
     """
 
     total: NDArray[np.int_]
@@ -196,7 +200,7 @@ class _Mirrored:
 
 
 def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """`wedge_curves` by pairs of opposite views.
+    """As `wedge_curves`, from pairs of opposite projections.
 
     Raises:
         ValueError: see `axis_from_opposites`.
@@ -209,24 +213,25 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
-    """The rotation axis of a scan from all views.
+    """The rotation axis (centre of rotation) of a scan, from all projections.
 
-    If all views together give no axis, and they cover the full turn, pairs of opposite views do: the axis of a wide
-    field stands near an edge of the detector. Of half a turn of a sample wider than the field, its two ends do, or a
-    pair of views half a turn apart.
+    If all projections together show no axis and the scan covers 360°, the axis is found from pairs of opposite
+    projections, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a sample wider
+    than the field of view, it is found from the two ends of the scan, or from a pair of opposite projections.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
     Returns:
-        The estimate from all views, or from opposite views, the ends or the pair if only these are confident.
+        The estimate from all projections; or from opposite projections, the ends or the pair if only one of these is
+        confident.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
 
     Warns:
-        UserWarning: where angles look like degrees, or projections like counts or transmission.
+        UserWarning: angles look like degrees, or projections look like counts or transmission.
     """
     check_arguments(find_axis, locals())
     theta, projections = np.asarray(angles, np.float64), np.asarray(projections)
@@ -244,10 +249,13 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
 
 
 def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
-    """The axis by opposite views if they show it clearly; without these by the ends of half a turn if the field cuts
-    the sample, or by a pair of views, whichever is confident; else by the ends, or none."""
+    """The axis from opposite projections if they show it clearly.
+
+    Without them it comes from the ends of the 180° scan (if the sample is wider than the field of view) or from a pair
+    of projections, whichever is confident. Otherwise it comes from the ends, or is None.
+    """
     by_ends = None
-    with suppress(ValueError):  # an AxisError is a ValueError, too
+    with suppress(ValueError):  # AxisError is a ValueError
         if _opposite_pairs(theta, projections.shape[2])[0].size >= _FEWEST_PAIRS:
             by_opposites = axis_from_opposites(projections, theta)
             return by_opposites if by_opposites.confident else None
@@ -262,12 +270,12 @@ def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate
 
 
 def closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
-    """The two views nearest to half a turn apart; None if no pair is within the tolerance (radians)."""
+    """The two projections that are nearest to 180° apart; None if no pair is within the tolerance (radians)."""
     order = np.argsort(np.mod(theta, 2 * np.pi))
     turned = np.mod(theta[order], 2 * np.pi)
     extended = np.concatenate([turned, turned + 2 * np.pi])
-    at = np.searchsorted(extended, turned + np.pi)
-    options = np.stack([np.clip(at - 1, 0, None), np.clip(at, None, extended.size - 1)])
+    index = np.searchsorted(extended, turned + np.pi)
+    options = np.stack([np.clip(index - 1, 0, None), np.clip(index, None, extended.size - 1)])
     miss = np.abs(extended[options] - turned - np.pi)
     side, first = np.unravel_index(int(miss.argmin()), miss.shape)
     if miss[side, first] > tolerance:

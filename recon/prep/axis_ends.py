@@ -1,4 +1,4 @@
-"""axis_from_ends: the rotation axis about which the last views of half a turn, mirrored, continue the first ones."""
+"""axis_from_ends: the rotation axis from the ends of a 180° scan, whose last projections mirrored precede the first."""
 
 from __future__ import annotations
 
@@ -9,41 +9,46 @@ from scipy import fft
 from recon.prep.axis_wedge import AxisEstimate, Floats, few_rows, lowest, optimum
 
 ENDS = "ends of half a turn"
-_SIDE = 4  # views on each side of the join: they show how fast each structure moves
-_FEWEST = 8 * _SIDE  # views that tell their covariance without those of a join
-_NOISE = 0.01  # of the power, in the views' covariance: what the field cuts off is not in it
-_FINER, _BLOCKS = 8, 8  # candidates a column; blocks of views, at most
-_SURE = 0.3  # columns by which the median of the joins within the scan may be off
-_CLEAR, _RIVAL = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
+_SIDE = 4  # projections on each side of the join; they show how fast each structure moves
+_FEWEST = 8 * _SIDE  # fewest projections that determine the covariance without those at a join
+# share of the power that is added to the covariance, which does not contain the part outside the field of view
+_NOISE = 0.01
+_FINER, _BLOCKS = 8, 8  # candidates per column; largest number of blocks of projections
+_SURE = 0.3  # largest error, in columns, of the median of the joins within the scan
+# the mismatch must be lower by this than at axes a 24th of the field away. Right axes had 0.48, wrong ones up to 0.3
+_CLEAR, _RIVAL = 0.4, 24
 
 
 def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
-    """Axis from the two ends of half a turn, also of a sample wider than the field.
+    """Axis from the two ends of a 180° scan; the sample may be wider than the field of view.
 
-    The last views mirrored about the axis are those before the first one. The 4 views on each side of this join count
-    as samples of a random process, whose covariance over the angle all views tell, for each frequency. The curve is
-    the likelihood of each candidate: a generalised cross-correlation (Knapp & Carter 1976, IEEE Trans. ASSP 24, 320) of
-    several views. Views within the scan join where they are; how far off that is found, by the covariance of the other
-    views, tells how far off the axis may be.
+    The last projections, mirrored about the axis, continue the scan before its first projection. The 4 projections on
+    each side of this join are treated as samples of a random process. All projections together give the covariance of
+    this process over the angle, for each frequency. The curve is the likelihood of each candidate: a generalised
+    cross-correlation (Knapp & Carter 1976, IEEE Trans. ASSP 24, 320) of several projections. To estimate the error, the
+    same is done at joins within the scan, where the right shift is known to be zero, with the covariance of the other
+    projections.
 
     Args:
         projections: float32 [view, row, col], line integrals; a few rows are enough.
-        angles: [view], radians; views up to half a turn after the first are used.
+        angles: [view], radians; projections up to 180° after the first one are used.
 
     Returns:
-        The curve is 0 where the ends fit as the median join within the scan does, with what all views share: this may
-        be matter, or noise of the flats. Confident if the median of the joins, without it, is right to 0.3 columns: 9
-        in 10 axes of packed grains in 1.5 to 3 times the field then were.
+        The curve is 0 if the ends fit as well as the median join within the scan. It includes the part that all
+        projections share, which may be the sample or noise of the flats. The estimate is confident if the median of the
+        joins, without that part, is right to 0.3 columns. Then 9 in 10 axes of packed grains in 1.5 to 3 times the
+        field of view were right.
 
     Raises:
-        ValueError: the views are not half a turn in even steps, or too few.
+        ValueError: the projections do not cover 180° in even steps, or there are too few.
         AxisError: the best axis lies at the edge of the middle half.
     """
     order, times = _half_turn(np.asarray(angles, np.float64))
     data = few_rows(projections[order])
     cols = data.shape[2]
     curve, error = np.full(_FINER * cols, np.inf), 0.0
-    totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}  # windows; those about the axes that they show:
+    # windows, and then the windows about the axes that they show
+    totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}
     for total in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in totals}:
         candidates, values, errors = _join(data, total, times)
         at = np.round(_FINER * candidates).astype(int)
@@ -57,13 +62,14 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEst
 
 
 def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Views of half a turn, in order, and the angles of the last (mirrored) and the first of them, in steps."""
+    """Projections of 180° in order, and the angles of the last (mirrored) and the first of them, in steps."""
     order = np.argsort(theta, kind="stable")
     turned = theta[order] - theta[order[0]]
     step = float(np.median(np.diff(turned)))
     order, turned = order[turned < np.pi + step / 2], turned[turned < np.pi + step / 2]
-    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2.5 * step:  # some of many: uneven
-        raise ValueError(f"the views are not half a turn in {_FEWEST} even steps or more")
+    # a subset of many projections is uneven
+    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2.5 * step:
+        raise ValueError(f"the projections do not cover 180° in {_FEWEST} or more even steps")
     return order, np.concatenate((turned[-_SIDE:] - np.pi, turned[:_SIDE])) / step
 
 
@@ -72,14 +78,14 @@ def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floa
 
     Args:
         data: [view, row, col]; `times` are those of its last and its first views.
-        total: twice the column about which the window lies.
+        total: twice the column of the centre of the window.
     """
     n, _, cols = data.shape
     total = min(max(total, cols // 2), 3 * cols // 2)
     window = data[..., max(0, total - cols + 1) : min(total, cols - 1) + 1]
     cols = window.shape[2]
     mean, taper = window.mean(axis=0), np.hanning(cols + 2)[1:-1]
-    seen = window - (mean + mean[:, ::-1]) / 2  # both ends share what is even, so that no seam is made
+    seen = window - (mean + mean[:, ::-1]) / 2  # both ends share the even part, so that it makes no seam
     seen = (seen - np.average(seen, axis=2, weights=taper)[..., None]) * taper
     length = fft.next_fast_len(2 * cols, real=True)
     spectra, late = (fft.rfft(each, length, axis=2)[..., 1:] for each in (seen, seen[-_SIDE:, :, ::-1]))
@@ -106,10 +112,11 @@ def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floa
 
 
 def _weights(pairs: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
-    """[frequency, late, early] of products of views at these `times` (steps), by the covariance of the views `used`.
+    """[frequency, late, early] weights of products of projections at these `times` (steps), from a covariance.
 
     Args:
-        pairs: [lag] of [view, frequency], products of a view with the one so many steps later.
+        pairs: [lag] of [view, frequency], products of each projection with the one `lag` steps later.
+        used: the projections from which the covariance is computed.
     """
     power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in pairs])
     apart = np.abs(times[:, None] - times)

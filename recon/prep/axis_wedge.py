@@ -1,4 +1,4 @@
-"""axis_from_sinogram: the rotation axis from all views, and the search among candidates that all methods share."""
+"""axis_from_sinogram: the rotation axis from all projections, and the search over candidates for all methods."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scipy import fft
 
 Floats = NDArray[np.float64]
 
-MOST_ROWS = 16  # Rows that are enough for 0.1 px
-FEWEST_COLS = 8  # Columns that an axis can be found from
-FEWEST_BANDS = 4  # Bands of rows that show how it leans
-AGREE = 1.0  # Two independent estimates no farther apart than this (px) are the same axis
+MOST_ROWS = 16  # this many rows are enough for 0.1 px
+FEWEST_COLS = 8  # fewest columns from which an axis can be found
+FEWEST_BANDS = 4  # fewest bands of rows from which its tilt can be found
+AGREE = 1.0  # two independent estimates that differ by no more than this (px) are the same axis
 
 
 class AxisError(ValueError):
-    """The best axis lies at the edge of the candidates or outside them, so there is no estimate."""
+    """The best axis is at the edge of the candidates or outside them, so there is no estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class AxisEstimate:
     """Estimate of the rotation axis.
 
     Attributes:
-        value: axis_col in pixels, 0 at the centre of the first column.
+        value: axis_col in pixels, counted from 0 at the centre of the first column.
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
@@ -46,7 +46,7 @@ class AxisEstimate:
 
 
 def few_rows(data: NDArray[np.floating]) -> Floats:
-    """At most 16 rows, each the mean of up to 4, which has less noise: the sum of slices is again a slice."""
+    """At most 16 rows, each the mean of up to 4 rows to reduce noise (a sum of slices is again a slice)."""
     rows = data.shape[1]
     if rows <= MOST_ROWS:
         return np.asarray(data, np.float64)
@@ -56,7 +56,7 @@ def few_rows(data: NDArray[np.floating]) -> Floats:
 
 
 def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
-    """Position of the minimum of a curve, by a parabola through three points, and the index of its lowest point."""
+    """Position of the minimum of a curve (parabola through three points), and the index of its lowest point."""
     i = int(curve.argmin())
     if not 0 < i < curve.size - 1:
         return float(candidates[i]), i
@@ -68,62 +68,67 @@ def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
 
 def axis_error(value: float, candidates: Floats, place: str) -> AxisError:
     return AxisError(
-        f"no rotation axis in columns {candidates[0]:g} to {candidates[-1]:g}: the best column is {value:.2f}, "
-        f"{place}; give the axis"
+        f"found no rotation axis in columns {candidates[0]:g} to {candidates[-1]:g}: the best column is {value:.2f}, "
+        f"{place}. State the axis"
     )
 
 
 def optimum(candidates: Floats, curve: Floats) -> tuple[float, float]:
-    """The minimum of a curve and its depth, 0 (as bad as the typical candidate) to 1 (perfect agreement).
+    """The minimum of a curve and its depth, from 0 (no better than the typical candidate) to 1 (perfect agreement).
 
     Raises:
         AxisError: the minimum lies at an end of the curve.
     """
     value, i = lowest(candidates, curve)
     if i in (0, candidates.size - 1):
-        raise axis_error(value, candidates, "at the edge")
+        raise axis_error(value, candidates, "at the edge of the search range")
     typical = float(np.median(curve))
     return value, (typical - float(curve[i])) / typical if typical > 0 else 0.0
 
 
 _MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for 0.1 px
 _STEP = 0.25  # px between candidates
-_FEWEST = 12  # views: by 5 of a sample wider than the field 45 of 46 axes called certain were wrong, of others some
-_ROUNDING = 1e-10  # of a vector's length
-_WIDEST_GAP = np.deg2rad(20)  # share of a half turn; with a wider gap the double wedge does not determine the axis
+# projections. With 5 projections of samples wider than the field, 45 of 46 confident axes were wrong; of others, some
+_FEWEST = 12
+_ROUNDING = 1e-10  # share of a vector's length
+_WIDEST_GAP = np.deg2rad(20)  # radians; with a wider gap in the half turn, the double wedge does not determine the axis
 
 
 def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats) -> AxisEstimate:
-    """Axis from all views, without a pair: for uneven, sparse and noisy scans, sectors and full turns.
+    """Axis from all projections, without a pair: for uneven, sparse and noisy scans, sectors and 360° scans.
 
-    About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
-    frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r. (Edholm, Lewitt & Lindholm 1986; used
-    for the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view
-    at θ. So the real part has even harmonics only and the imaginary part odd ones. The curve is the residual of a
-    least-squares fit of these harmonics to the views. It takes angles in any spacing and is a sum of cosines of the
-    axis, so nothing is interpolated.
+    For scans of about 180° or more it uses the double wedge. For a sample of radius r, the Fourier transform of a
+    sinogram along the columns contains at frequency ω only the angular harmonics |n| <= ω r (Edholm, Lewitt & Lindholm
+    1986; used for the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis, the projection at θ + π is
+    the mirrored projection at θ. So the real part has only even harmonics and the imaginary part only odd ones. The
+    curve is the residual of a least-squares fit of these harmonics to the projections. Angles may have any spacing. The
+    residual is a sum of cosines of the axis, so nothing is interpolated.
 
-    Less than half a turn, or a wedge that is not confident: the centre of mass of the views, fitted by
-    axis + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
+    For less than 180°, or if the wedge is not confident, it uses the centre of mass of the projections, fitted by axis
+    + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
 
     Args:
         sinogram: float32 [view, col] or [view, row, col], line integrals; a few rows are enough.
         angles: [view], radians, any order and range.
 
     Raises:
-        ValueError: for shapes that do not fit, fewer than 4 views, or values that are not finite.
-        AxisError: the best axis lies at the edge of the detector or outside it.
+        ValueError: shapes do not match, there are fewer than 4 projections, or values are not finite.
+        AxisError: the best axis is at the edge of the detector or outside it.
     """
     theta = np.asarray(angles, np.float64)
     if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
-        raise ValueError(f"sinogram {sinogram.shape} must be [view, col] or [view, row, col] for angles {theta.shape}")
+        raise ValueError(
+            "the sinogram must be [view, col] or [view, row, col] with one angle for each view, got shapes "
+            f"{sinogram.shape} and {theta.shape}"
+        )
     data = few_rows(sinogram[:, None] if sinogram.ndim == 2 else sinogram)
     if len(theta) < 4 or data.shape[2] < FEWEST_COLS:
         raise ValueError(
-            f"{len(theta)} views of {data.shape[2]} columns are too few to find an axis; 4 of {FEWEST_COLS} are needed"
+            f"too few data to find an axis: {len(theta)} projections of {data.shape[2]} columns; at least 4 "
+            f"projections of {FEWEST_COLS} columns are needed"
         )
     if not (np.isfinite(data).all() and np.isfinite(theta).all()):
-        raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
+        raise ValueError("sinogram or angles contain NaN or infinite values; correct them first")
     if not _covers_half_a_turn(theta):
         return _axis_from_mass(data, theta)
     wedge = _axis_from_wedge(data, theta)
@@ -141,20 +146,24 @@ def _axis_from_mass(data: Floats, theta: Floats) -> AxisEstimate:
     theta, profile = theta[order], data[order].mean(axis=1)
     mass = profile.sum(axis=1)
     if not (mass > 0).all():
-        raise AxisError("some views hold no mass to find an axis from; check the dark and flat correction")
+        raise AxisError(
+            "cannot find the axis, because some projections have no absorption at all; check the dark and flat "
+            "correction"
+        )
     basis = np.stack([np.ones_like(theta), np.cos(theta), np.sin(theta)], axis=1)
     centre = profile @ np.arange(cols) / mass
     covariance = np.linalg.pinv(basis.T @ basis)
     solution = covariance @ (basis.T @ centre)
     residual = centre - basis @ solution
     value, left_over = float(solution[0]), float(residual @ residual)
-    # An error of the axis adds this much a px² to the sum of squares; the curve is in units of a quarter of the field.
+    # An error of the axis adds this much per px² to the sum of squares; the curve is in units of a quarter of the
+    # field.
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
     if not candidates[0] < value < candidates[-1]:
         raise axis_error(value, candidates, "outside them")
-    # Correlated neighbouring residuals are not independent; air that is not at zero biases the axis without scatter.
+    # Residuals of neighbours are correlated. An air level that is not zero biases the axis without adding scatter.
     correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
     error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
     edge = max(2, cols // 40)
@@ -166,13 +175,13 @@ def _axis_from_mass(data: Floats, theta: Floats) -> AxisEstimate:
 
 
 def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """Candidates [n] for the axis, and the mismatch [row, n] of each row of [view, row, col] by the double wedge.
+    """Candidates [n] for the axis, and the double-wedge mismatch [row, n] of each row of [view, row, col].
 
     Raises:
-        ValueError: the views leave a gap in the half turn.
+        ValueError: the projections leave a gap in the 180°.
     """
     if not _covers_half_a_turn(theta):
-        raise ValueError("the views do not go round half a turn evenly")
+        raise ValueError("the projections are not evenly spread over 180°")
     wedge = _Wedge.of(data, theta)
     return wedge.columns, np.stack([wedge.curve(fit, wedge.power) for fit in np.moveaxis(wedge.fits, 1, 0)])
 
@@ -184,21 +193,21 @@ def _covers_half_a_turn(theta: Floats) -> bool:
 
 
 def is_cut_off(part: NDArray[np.floating]) -> bool:
-    """Whether the first or last columns of line integrals [view, row, col] are not air."""
+    """Whether the sample is truncated: the first or last columns of line integrals [view, row, col] are not air."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
 
 
 @dataclass(frozen=True, eq=False)
 class _Wedge:
-    """What harmonics leave of some views.
+    """Residuals of the fit of harmonics to some projections.
 
     Attributes:
         columns: [n], candidates for the axis.
-        bin: columns that were averaged.
+        bin: number of columns that were averaged.
         basis: [3, n, frequency], 1, cosine and sine of a candidate.
-        omega: [frequency]. fits: [3, row, frequency], see `_wedge_residuals`.
-        power: of the frequency, its weight: low ones are worse where the field cuts the sample.
+        omega: [frequency]. fits: [3, row, frequency], coefficients, see `_wedge_residuals`.
+        power: exponent of the frequency in its weight; low frequencies are worse if the sample is wider than the field.
     """
 
     columns: Floats
@@ -210,7 +219,7 @@ class _Wedge:
 
     @classmethod
     def of(cls, data: Floats, theta: Floats) -> _Wedge:
-        """Made of as many views and columns as are necessary."""
+        """The residuals from as many projections and columns as are necessary."""
         views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
         bin_ = -(-data.shape[2] // _MOST_COLS)
         cols = data.shape[2] // bin_
@@ -222,7 +231,7 @@ class _Wedge:
         return cls(candidates * bin_ + (bin_ - 1) / 2, bin_, basis, omega, fits, 2 if is_cut_off(part) else 1)
 
     def curve(self, fit: Floats, power: int) -> Floats:
-        """Mismatch [n] by coefficients [3, frequency]."""
+        """Mismatch [n] from coefficients [3, frequency]."""
         weighted = fit * self.omega**power
         return np.einsum("knw,kw->n", self.basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
@@ -238,10 +247,11 @@ def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
 
 
 def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:
-    """Orthonormal vectors [i, k], the first m of which span the first m given ones, and how much each of these adds.
+    """Orthonormal vectors [i, k], and how much each given vector adds. The first m span the first m given ones.
 
-    At most as many as there are components; zeros for a vector that adds nothing. Gram-Schmidt, twice for rounding
-    errors (Giraud et al. 2005). LAPACK's threads would spin, and take 20 times as long where others use the cores.
+    There are at most as many as components; a vector that adds nothing becomes zeros. The method is Gram-Schmidt,
+    applied twice because of rounding errors (Giraud et al. 2005). LAPACK is not used, because its threads would take 20
+    times as long while other programs use the cores.
     """
     q = vectors[: vectors.shape[1]].copy()
     lengths = np.zeros(len(q))
@@ -260,15 +270,15 @@ def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:
 
 
 def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """Frequencies ω [k], coefficients [3, row, k] of each row's residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
+    """Frequencies ω [k]; coefficients [3, row, k] of each row's residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
     views, rows, cols = data.shape
-    # Subtract air that is not at zero: it is a box fixed to the detector, symmetric about its middle.
+    # Subtract an air level that is not zero: it is a box fixed to the detector, symmetric about its middle.
     edge = max(2, cols // 40)
     left, right = (np.median(part, axis=2)[..., None] for part in (data[:, :, :edge], data[:, :, -edge:]))
     data = data - (left + (right - left) * np.linspace(0, 1, cols))
     n = fft.next_fast_len(2 * cols, real=True)
     radius = cols / 2
-    highest = min(np.pi / 2, 0.7 * views / radius)  # so that there are more views than harmonics
+    highest = min(np.pi / 2, 0.7 * views / radius)  # so that there are more projections than harmonics
     k = np.arange(1, max(3, int(highest * n / (2 * np.pi))) + 1)
     omega = 2 * np.pi * k / n
     harmonics = np.ceil(omega * radius + 2)

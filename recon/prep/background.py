@@ -1,8 +1,8 @@
-"""Background of the beam: the smooth surface that each view shows where its rays miss the sample.
+"""Background of the beam: the smooth surface that each projection shows in air (rays that miss the sample).
 
-The open beam of the views may differ from the flats: it bends, moves or fades between them. Line integrals then have a
-smooth surface beside the sample's. A volume without negative densities cannot hold its negative part, and loses weak
-matter instead.
+The open beam during the projections may differ from the flats: it changes its shape, moves or fades. The line integrals
+then contain a smooth surface in addition to the sample. A volume without negative densities cannot represent the
+negative part of this surface, and loses weakly absorbing material instead.
 """
 
 from __future__ import annotations
@@ -15,34 +15,36 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from recon.base.arrays import F32, F64, Mask, median_deviation
 from recon.base.noise import air_level
 
-HIGHEST = 3  # Order of the polynomials in column and row, at most
+HIGHEST = 3  # highest order of the polynomials in column and row
 
-LEAST_SIZE = 0.005  # Root mean square of the surfaces, in line integrals, from which on they are removed by default
+LEAST_SIZE = 0.005  # root mean square of the surfaces, in line integrals, from which on they are removed by default
 
-_SMOOTH = 1.5  # voxels; smoothing raises weak matter above the noise
-_SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter
+_SMOOTH = 1.5  # voxels; smoothing raises weakly absorbing material above the noise
+_SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around material that also count as material
 _CLIPPED = 4.0  # standard deviations
-_BLOCK = 8  # pixels a side: every other block of air is predicted from those between
-_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # share of the rays of a view; share of the views
-_WINDOWS = (45, 15, 5, 1)  # views that share a surface
-_BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # shares of the mean square that fewer views, or a higher order, must reach
-_BETTER = 0.99  # share that any surface must reach
-_LEFT = 2.0  # times the noise: if a surface leaves more, the rays are not air
-_FARTHEST = 1000.0  # largest variance of a surface over that of a constant: beyond it extrapolates
+_BLOCK = 8  # pixels per side of a block; every second block of air is predicted from the others
+_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # least share of the rays of a projection; least share of the projections
+_WINDOWS = (45, 15, 5, 1)  # numbers of projections that share a surface
+# a smaller window, or a higher order, must lower the mean square to this share
+_BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75
+_BETTER = 0.99  # any surface must lower the mean square to this share
+_LEFT = 2.0  # multiple of the noise; if the residual is larger, the rays are not air
+_FARTHEST = 1000.0  # largest variance of a surface, divided by that of a constant; beyond it, the surface extrapolates
 _ROWS_A_POWER = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A polynomial of column and row for each view.
+    """A polynomial in column and row for each projection.
 
     Attributes:
-        coefficients: float64 [view, term], of `powers`.
+        coefficients: float64 [view, term], in the order of `powers`.
         size: root mean square of the surfaces.
-        lowest, highest: of the mean surface over the views.
-        before, after: root mean square of binned air, in blocks that the surface was not fitted on.
+        lowest, highest: lowest and highest value of the mean surface.
+        before, after: root mean square of binned air before and after the correction, in blocks that were not used for
+            the fit.
         air: share of the rays that miss the sample.
-        level: mean of that air before.
+        level: mean of that air before the correction.
     """
 
     order: int
@@ -57,18 +59,18 @@ class Background:
     level: float
 
     def confirmed(self, noise: float) -> bool:
-        """Whether the surface is significant, and leaves little more than noise in air that was not fitted."""
+        """Whether the surface is significant, and air that was not used for the fit contains little more than noise."""
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
     def remove(self, views: F32, factor: int = 1) -> None:
-        """Subtract the surfaces from views [view, row, col], whose pixels are binned by a factor, in place."""
+        """Subtract the surfaces in place from projections [view, row, col] whose pixels are binned by `factor`."""
         for view, terms in zip(views, self.coefficients, strict=True):
             view -= surface(terms, self.shape, factor)
 
 
 def surface(terms: F64, shape: tuple[int, int], factor: int = 1) -> F32:
-    """A polynomial [row, col] on a detector of this shape, binned by a factor; terms [term] as in `powers`."""
+    """A polynomial [row, col] on a detector of this shape, binned by `factor`; terms [term] as in `powers`."""
     v, u = (coordinate(n, factor) for n in shape)
     across = np.zeros((HIGHEST + 1, u.size))  # for each power of the row
     for c, (i, j) in zip(terms, powers(HIGHEST), strict=True):
@@ -77,20 +79,20 @@ def surface(terms: F64, shape: tuple[int, int], factor: int = 1) -> F32:
 
 
 def coordinate(n: int, factor: int = 1) -> F64:
-    """Coordinates from -1 to 1 across n pixels, at the centres of bins."""
+    """Coordinates of the bin centres, from -1 to 1 across n pixels."""
     return (2 * np.arange(n // factor) * factor + factor - n) / n
 
 
 def powers(order: int) -> list[tuple[int, int]]:
-    """(power of the column, power of the row) of each term, lower orders first."""
+    """(power of the column, power of the row) of each term, lowest order first."""
     return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
 
 
 def matter(volume: F32, inside: Mask) -> Mask:
-    """Voxels near matter, bool [z, y, x]: the smoothed volume exceeds its air by five standard deviations there.
+    """Voxels near material, bool [z, y, x]: those whose smoothed value exceeds air by five standard deviations.
 
     Args:
-        inside: bool [y, x], voxels that all views see, without the rim of that circle.
+        inside: bool [y, x], voxels that all projections see, without the rim of that circle.
     """
     smooth = gaussian_filter(volume, [min(_SMOOTH, n / 8) for n in volume.shape], mode="nearest")
     level, noise = air_level(smooth[:, inside])
@@ -98,10 +100,10 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums over the air of views, sufficient for fitting polynomials of any order."""
+    """Sums over the air in the projections, from which polynomials of any order can be fitted."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
-        """Start sums for views of a detector (rows, cols), binned by a factor."""
+        """Start the sums for projections of a detector (rows, cols), binned by `factor`."""
         rows, cols = shape[0] // factor, shape[1] // factor
         v, u = coordinate(shape[0], factor), coordinate(shape[1], factor)
         odd = (np.arange(rows)[:, None] // _BLOCK + np.arange(cols) // _BLOCK) % 2
@@ -112,7 +114,7 @@ class AirSums:
         self._totals: list[list[tuple[float, float, float]]] = []  # [view][half]: rays, sum and sum of squares
 
     def add(self, view: F32, air: Mask) -> None:
-        """Add a binned view [row, col], and a mask of its rays that miss the sample."""
+        """Add a binned projection [row, col], with a mask of its rays that miss the sample."""
         air = self._without_outliers(view, air)
         parts = []
         for half in (self._half, ~self._half):
@@ -124,12 +126,15 @@ class AirSums:
         self._totals.append([*totals])
 
     def fit(self, order: int | None = None) -> Background | None:
-        """The surfaces that best predict blocks of air outside their fit; None if there is too little air.
+        """The surfaces that best predict blocks of air that were not used for their fit; None if there is too little
+        air.
 
-        Neighbouring views share a surface as long as it predicts equally well; a higher order must predict better.
+        Neighbouring projections share a surface as long as it predicts equally well. A higher order must predict
+        better.
 
         Args:
-            order: None: up to 3, as far as it predicts better and extrapolates little.
+            order: order of the polynomials; None: up to 3, as long as the order predicts better and extrapolates
+                little.
         """
         squares, products, totals = (np.array(x) for x in (self._squares, self._products, self._totals))
         rays, n_views = totals[..., 0], len(totals)
@@ -148,7 +153,7 @@ class AirSums:
                 break
             for width in (w for w in _WINDOWS if w <= max(n_views, 1)):
                 wide_g, wide_b = _around(g, width), _around(b, width)
-                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # errors of each half by the other's surface
+                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # errors of each half, from the surface of the other half
                 left = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
                 error = float(left.sum() / count)
                 if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
@@ -168,13 +173,13 @@ class AirSums:
         )  # fmt: skip
 
     def _farthest(self, squares: F64, some: list[int]) -> float:
-        """The largest variance of a surface of these terms anywhere, over that of a constant, in a typical view."""
+        """Largest variance of a surface with these terms, divided by that of a constant, in a typical projection."""
         g = np.median(squares, axis=0)
         terms = self._terms.reshape(-1, self._terms.shape[-1])[:, some]
         return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])
 
     def _without_outliers(self, view: F32, air: Mask) -> Mask:
-        """Air, without rays that deviate from a surface of the second order."""
+        """The air mask without rays that deviate from a surface of second order."""
         t, p = self._terms[air][:, :6], view[air].astype(np.float64)
         if p.size < 2 * t.shape[1]:
             return air
@@ -184,12 +189,12 @@ class AirSums:
 
 
 def _around(values: F64, width: int) -> F64:
-    """Sums over `width` views around each [view, ...]; at both ends over the first and the last views."""
+    """Sums over `width` projections around each one [view, ...]; at both ends over the first and the last ones."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
     first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
     return np.asarray(total[first + width] - total[first])
 
 
 def _solved(squares: F64, products: F64) -> F64:
-    """Least squares [..., term]; terms that no ray determines are 0."""
+    """Least-squares solution [..., term]; terms that no ray determines are 0."""
     return np.asarray(np.einsum("...ij,...j", np.linalg.pinv(squares, hermitian=True), products))

@@ -1,4 +1,4 @@
-"""correct: line integrals of the frames of one scan by a plan, in batches (`apply`) or of all views at once."""
+"""correct: converts the frames of a scan to line integrals, in batches (`apply`) or all at once."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ def apply(
     progress: Callable[[int], None] = lambda done: None,
     order: NDArray[np.intp] | None = None,
 ) -> tuple[Projections, Plan]:
-    """Line integrals, and weights where photons are counted, of the next views; and the plan of those that follow.
+    """Line integrals of the next projections (and weights, if photons are counted), and the plan for those after them.
 
-    The plan that is given stays as it is, and with the same plan the same frames have the same line integrals.
+    The given plan is not changed. With the same plan, the same frames give the same line integrals.
 
     Args:
-        frames: [view, row, col], any real type, in the order of acquisition; may be none where `last`. Line integrals
-            in float32 are taken over.
-        positions: [view], number of the frame in the scan, as in the flats' positions.
+        frames: [view, row, col], any real type, in the order of acquisition; may be empty if `last`. The memory of
+            float32 line integrals is reused for the result.
+        positions: [view], number of the frame in the scan, counted as the positions of the flats.
         view_ids: int64 [view].
-        last: no view comes after these; else the newest view waits.
-        progress: how many of two steps a view are done.
-        order: of their neighbours, see `SpotFilter.feed`.
+        last: True if no projection comes after these; otherwise the newest one waits for its neighbour.
+        progress: function called with the number of steps done; each projection has two steps.
+        order: order of neighbours, see `SpotFilter.feed`.
 
     Raises:
-        ValueError: as of `CorrectionPlan.transmission`.
-        UnlitViewsError: the air columns of some views are dark; it has their numbers.
+        ValueError: as for `CorrectionPlan.transmission`.
+        UnlitViewsError: the air columns of some projections are dark; the error contains their numbers.
     """
     if not len(view_ids):
         return plan.line_integrals(None, last)
@@ -58,11 +58,11 @@ def correct(
     view_ids: ArrayLike | None = None,
     masked: Mask | None = None,
 ) -> Projections:
-    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, surveyed and corrected at once.
+    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of projections.
 
-    All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
-    Memory beyond the result: a few frames. Arguments and errors are those of `survey` and of
-    `CorrectionPlan.transmission`.
+    All results are finite: dead pixels and single bad values get the mean of their good neighbours and are counted. The
+    function needs the memory of a few frames in addition to the result. Arguments and errors are those of `survey` and
+    of `CorrectionPlan.transmission`.
     """
     counts = without_mask(counts)
     check_arguments(correct, locals())

@@ -1,6 +1,7 @@
-"""Counts: the photons counted behind a sample, and their likelihood as line integrals with weights, for any method.
+"""Counts: photon counts behind a sample. Their likelihood becomes line integrals with weights, for any method.
 
-The logarithm of few counts is biased (E log n < log E n), and zero has none. The likelihood has neither fault.
+The logarithm of few counts is biased (E log n < log E n), and a zero count has no logarithm. The likelihood has neither
+problem.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from recon.base.declared_types import check_settings
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
 # of the expansion on three samples at 10 to 10 000 photons. So are the other two.
 _SIGMA, _SPREAD = 1.5, 2.0
-_DETAIL = 1.5  # variance over that of counting; places with more have detail
-_FEWEST = 0.25  # photons: least expectation of a ray
+_DETAIL = 1.5  # variance divided by that of counting; a larger ratio means detail of the sample
+_FEWEST = 0.25  # photons; smallest expected number for a ray
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class Photons:
     """How a detector counts photons, see `photon_transfer`.
 
     Attributes:
-        gain: counts a photon.
-        variance: of a pixel of one dark frame, counts².
+        gain: camera gain, counts per photon.
+        variance: variance of a pixel in one dark frame, counts².
     """
 
     gain: float
@@ -35,14 +36,14 @@ class Photons:
 
     def __post_init__(self) -> None:
         if not 0 < self.gain < np.inf:
-            raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
+            raise ValueError(f"gain (counts per photon) must be finite and above 0, got {self.gain}")
         if not 0 <= self.variance < np.inf:
             raise ValueError(f"variance must be finite and 0 or more, got {self.variance}")
 
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Counts of a detector with the sample, without the sample (flat), and without the beam (dark).
+    """Detector counts with the sample, without the sample (flat), and without the beam (dark).
 
     The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
     1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
@@ -52,8 +53,9 @@ class Counts:
         counts: [view, row, col], any real type.
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
-        gain: counts a photon, see `photon_transfer`.
-        variance: of a pixel of one dark frame, counts², a number or [row, col]: readout, and useless photons.
+        gain: camera gain, counts per photon, see `photon_transfer`.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. It comes from readout and from
+            photons that carry no information.
     """
 
     counts: ArrayLike
@@ -73,19 +75,21 @@ class Counts:
             given = np.shape(getattr(self, name))
             if given not in allowed:
                 raise ValueError(
-                    f"{name} has shape {given}, counts of shape {shape} take {' or '.join(map(str, allowed))}"
+                    f"{name} has shape {given}; for counts of shape {shape} it must be {' or '.join(map(str, allowed))}"
                 )
         if not 0 < self.gain < np.inf:
-            raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
+            raise ValueError(f"gain (counts per photon) must be finite and above 0, got {self.gain}")
         if not np.asarray(self.variance).min() >= 0:
             raise ValueError(f"variance must be 0 or more, got {np.asarray(self.variance).min()}")
         if not (np.asarray(self.flat) > np.asarray(self.dark)).any():
-            raise ValueError("the flat is nowhere above the dark: there is no beam")
+            raise ValueError(
+                "no pixel of the flat is brighter than the dark: the beam was off, or dark and flat are exchanged"
+            )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Images [row, col] of a view: photons counted and photons without the sample, each plus v, and v itself.
+        """Images [row, col] of a projection: photons counted, photons without the sample (each plus v), and v itself.
 
-        Pixels where the flat is not above the dark have 0 photons without the sample; NaN counts stay NaN.
+        Pixels whose flat is not above the dark have 0 photons without the sample. NaN counts stay NaN.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)
@@ -97,79 +101,80 @@ class Counts:
 
 
 def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
-    """Line integrals and weights whose weighted squares equal the likelihood to second order, pixel by pixel.
+    """Line integrals and weights whose weighted squares equal the likelihood to second order, for each pixel.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
     is Σ λ - n ln λ. At p0 it has the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information. p~
     = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh & Nelder 1989,
-    section 2.5). Zero counts are as good as any.
+    section 2.5). Zero counts need no special treatment.
     """
     seen = beam * np.exp(-around)
     return around - (photons - seen) / seen, seen * seen / (seen + extra)
 
 
 def line_integrals(counts: Counts) -> tuple[F32, F32]:
-    """Line integrals and weights [view, row, col] that carry the likelihood of counts to any method.
+    """Line integrals and weights [view, row, col] with which any method uses the likelihood of the counts.
 
-    Each view is expanded around its own counts, smoothed where they show only the noise of counting (Lee 1980,
-    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). With many counts the result is the logarithm. The weights are the
-    inverse variances of the line integrals, by the smoothed counts. Pixels that are not finite or have no beam get NaN
-    and weight 0.
+    Each projection is expanded around its own counts, smoothed in places that show only counting noise (Lee 1980, IEEE
+    Trans. Pattern Anal. Mach. Intell. 2, 165). With many counts the result is the logarithm. The weights are the
+    inverse variances of the line integrals, from the smoothed counts. Pixels that are not finite or have no beam get
+    NaN and weight 0.
     """
     shape = np.shape(counts.counts)
     data, weights = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for view in range(shape[0]):
         data[view], weights[view] = of_view(*counts.photons(view))
     if not weights.any():
-        raise ValueError("no pixel has both a beam and a finite count: there is nothing to reconstruct")
+        raise ValueError("nothing can be reconstructed: no pixel has both beam in the flat and a finite count")
     return data, weights
 
 
 def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """`line_integrals` of one view [row, col], from the images of `Counts.photons`."""
+    """`line_integrals` of one projection [row, col], from the images of `Counts.photons`."""
     good = np.isfinite(photons) & (beam > 0)
-    light = np.where(good, beam, 1.0)
+    open_beam = np.where(good, beam, 1.0)
     level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
-    p, _ = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
-    # Weights that follow each ray's own noise would hide this noise from methods that whiten by them.
-    _, w = expanded(smooth, light, extra, -np.log(smooth / light))
+    p, _ = expanded(np.where(good, photons, level), open_beam, extra, -np.log(level / open_beam))
+    # Weights that follow each ray's own noise would hide this noise from methods that whiten with them.
+    _, w = expanded(smooth, open_beam, extra, -np.log(smooth / open_beam))
     return np.where(good, p, np.nan), np.where(good, w, 0)
 
 
 def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[float, float]:
-    """Counts a photon, and the variance of a pixel of a dark frame (counts²), from repeated frames [frame, row, col].
+    """Counts per photon, and variance of a pixel in a dark frame (counts²), from repeated frames [frame, row, col].
 
-    The variance of light grows by `gain` with its mean (photon transfer: Janesick 2007). Differences of successive
-    frames, scaled to equal means, contain no fixed pattern and no drift of the beam. Medians over the pixels are free
-    of defects. Blur after the photons (a scintillator's glow, resampling) lowers the variance: then the gain
-    is too small and the photons are too many.
+    The variance of the counts grows with their mean, with slope `gain` (photon transfer: Janesick 2007). Differences of
+    successive frames, scaled to equal means, contain no fixed pattern and no drift of the beam. Medians over the pixels
+    are not affected by defects. Blur after the photons are counted (scintillator afterglow, resampling) lowers the
+    variance; then the gain is too small and the number of photons too large.
 
     Args:
-        darks: None: the detector gives 0 without beam, and adds no noise.
+        darks: dark frames; None: the detector gives 0 without beam and adds no noise.
 
     Raises:
-        ValueError: for fewer than two frames, or flats whose variance does not grow with the light.
+        ValueError: there are fewer than two frames, or the variance of the flats does not grow with the intensity.
     """
     bright, bright_variance = _mean_and_variance(flats, "flats", scaled=True)
     dark, dark_variance = (
         (np.zeros(1), np.zeros(1)) if darks is None else _mean_and_variance(darks, "darks", scaled=False)
     )
-    light, noise = bright - dark, bright_variance - dark_variance
-    lit = light > 0.1 * np.median(light)
-    # A ratio of sums over the pixels with light, without the hundredth with the largest variances: hot ones.
+    signal, noise = bright - dark, bright_variance - dark_variance
+    lit = signal > 0.1 * np.median(signal)
+    # Ratio of sums over the pixels in the beam, without the 1 % with the largest variances (hot pixels).
     lit &= bright_variance <= np.percentile(bright_variance, 99)
-    gain = float(noise[lit].sum() / light[lit].sum()) if lit.any() else 0.0
+    gain = float(noise[lit].sum() / signal[lit].sum()) if lit.any() else 0.0
     if not gain > 0:
         raise ValueError(
-            f"the variance of the flats does not grow with their light (gain {gain:.3g} counts a photon): give the gain"
+            "state the gain: it cannot be measured here, because the variance of the flats does not grow with their "
+            f"intensity (gain {gain:.3g} counts per photon)"
         )
     return gain, float(np.median(dark_variance))
 
 
 def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """Photons expected in each pixel [row, col], above 0: counts smoothed where they show no detail, or all."""
+    """Photons expected in each pixel [row, col], above 0: counts, smoothed where they show no detail, or everywhere."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
-    left = 1 - 0.75 / (np.pi * _SIGMA**2)  # of white noise's variance, in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
+    left = 1 - 0.75 / (np.pi * _SIGMA**2)  # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
     variance = _smooth((n - mean) ** 2, _SPREAD) / left
     counting = _smooth(n + extra, _SPREAD)
     detail = np.clip(1 - _DETAIL * counting / np.maximum(variance, 1e-12), 0, 1)
@@ -181,10 +186,10 @@ def _smooth(image: F64, sigma: float) -> F64:
 
 
 def _mean_and_variance(frames: ArrayLike, name: str, *, scaled: bool) -> tuple[F64, F64]:
-    """Each pixel's mean and variance over frames, the latter from differences of successive ones."""
+    """Mean and variance of each pixel over the frames; the variance is from differences of successive frames."""
     stack = np.asarray(frames)
     if stack.ndim != 3 or len(stack) < 2:
-        raise ValueError(f"{name} must be [frame, row, col] with two frames or more, got shape {stack.shape}")
+        raise ValueError(f"{name} must be [frame, row, col] with at least two frames, got shape {stack.shape}")
     mean, total = stack.mean(axis=0, dtype=np.float64), np.zeros(stack.shape[1:])
     level = stack.mean(axis=(1, 2), dtype=np.float64)
     factors = level.mean() / level if scaled and level.min() > 0 else np.ones(len(stack))

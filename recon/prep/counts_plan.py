@@ -1,4 +1,4 @@
-"""CorrectionPlan: what makes line integrals of the counts of one scan, by its darks and flats; `survey` makes it."""
+"""CorrectionPlan: converts the counts of one scan to line integrals with its darks and flats; made by `survey`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 
 class UnlitViewsError(ValueError):
-    """The air columns of some views are dark."""
+    """The air columns of some projections are dark (the beam was off)."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,15 @@ class CorrectionSettings:
     """Settings of the correction from counts to line integrals.
 
     Attributes:
-        floor: lowest transmission; below it, also for zero and negative values, the line integral is -log(floor).
-        hot_threshold: robust standard deviations by which a pixel's dark, or its response to the beam, must differ from
-            its neighbours to be masked; inf masks none.
-        zinger_threshold: standard deviations by which a spot is brighter than what is around it, and than the
-            neighbouring views, see `recon.prep.spots.spots`; inf fills none.
-        air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
-        divided by their level, or by the line through the levels of both sides.
-        sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
+        floor: lowest transmission. For lower values, also zero and negative ones, the line integral is -log(floor).
+        hot_threshold: a pixel is masked if its dark, or its response to the beam, differs from its neighbours by more
+            than this many robust standard deviations; inf: no pixel is masked.
+        zinger_threshold: a pixel counts as a zinger if it is brighter by this many standard deviations than its
+            surroundings and than the neighbouring projections, see `recon.prep.spots.spots`; inf: no zinger is removed.
+        air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
+            Each projection is divided by their level, or by the line through the levels of both sides.
+        sample_from: line integral at the edges from which on "auto" takes the edges for sample, see
+            `references.edge_depth`.
     """
 
     floor: float = 1e-4
@@ -59,7 +60,7 @@ class CorrectionSettings:
     def __post_init__(self) -> None:
         check_settings(self)
         if not 0 < self.floor < 1:
-            raise ValueError(f"floor is a transmission between 0 and 1, got {self.floor}")
+            raise ValueError(f"floor must be a transmission between 0 and 1, got {self.floor}")
         if not (self.hot_threshold > 0 and self.zinger_threshold > 0):
             raise ValueError(
                 f"thresholds must be positive (inf turns one off), got hot {self.hot_threshold}, "
@@ -69,26 +70,28 @@ class CorrectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class CorrectionPlan:
-    """What makes line integrals of the counts of one scan; `survey` makes it, and `apply` follows it.
+    """Everything that is needed to convert the counts of one scan to line integrals: `survey` makes it, `apply` uses
+    it.
 
-    Views come in the order they were taken, in batches of any size. A view depends on the references, on the air
-    columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
-    With the same references and air columns the line integrals are the same to the bit for any split into batches.
+    Projections come in the order they were taken, in batches of any size. A projection depends on the flats and darks,
+    on the air columns found in all projections surveyed so far, and on its two neighbours. So the newest projection
+    waits for the next one. With the same flats, darks and air columns, the line integrals are bit-identical for any
+    split into batches.
 
     Attributes:
-        settings: of the correction.
+        settings: settings of the correction.
         dark: float32 [row, col].
-        flats: (position, float32 [row, col]) of each group of flats, in order, without its dark; 1 in masked pixels.
-        part_starts, dynamic: as of `References`.
-        masked: bool [row, col], pixels that are filled in every view.
-        hidden: bool [row, col], `masks.areas` of them.
-        filling: in which order they are filled, see `masks.plan_fill`.
-        photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`; None:
-            the line integrals are logarithms.
-        foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
-        light: float64 [frame of the scan], by how much that of a view grows; None: all views are alike.
-        spots: the filter of spots after the views so far.
-        profiles: `edge_profiles` of the views so far, by batch, with their numbers int64 [view].
+        flats: (position, float32 [row, col]) of each group of flats, in order, minus the dark; 1 in masked pixels.
+        part_starts, dynamic: as in `References`.
+        masked: bool [row, col], pixels that are filled in every projection.
+        hidden: bool [row, col], `masks.areas` of `masked`.
+        filling: order in which masked pixels are filled, see `masks.plan_fill`.
+        photons: how photons are counted; the line integrals and weights then represent the likelihood, see
+            `counts.line_integrals`. None: line integrals are logarithms.
+        foreign: bool [row], rows in which dark pixels are not the sample, see `unmeasured`; None: no such rows.
+        light: float64 [frame of the scan], factor on the intensity of each projection; None: 1 for all.
+        spots: state of the zinger filter after the projections so far.
+        profiles: `edge_profiles` of the projections so far, by batch, with their numbers int64 [view].
     """
 
     settings: CorrectionSettings
@@ -107,7 +110,7 @@ class CorrectionPlan:
 
     @cached_property
     def air_columns(self) -> tuple[int, int]:
-        """(left, right) columns of air from the views surveyed so far; (0, 0) if there are none."""
+        """(left, right) number of air columns, from the projections surveyed so far; (0, 0) if there are none."""
         air = self.settings.air
         if air != "auto":
             return (0, 0) if air == "none" else air
@@ -127,16 +130,16 @@ class CorrectionPlan:
         view_ids: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
-        """(counts - dark) / (flat - dark) with bad pixels filled from their neighbours.
+        """Transmission (counts - dark) / (flat - dark), with bad pixels filled from their neighbours.
 
         Args:
             counts: [view, row, col], any real type, in the order of acquisition.
             positions: [view], number of the frame in the scan, as in the flats' positions.
             view_ids: int64 [view].
-            progress: how many views are done, after each.
+            progress: function called with the number of projections done.
 
         Raises:
-            ValueError: for shapes that do not fit, positions or more than half of a view not finite.
+            ValueError: shapes do not match, a position is not finite, or more than half of a projection is not finite.
         """
         _check_views(counts, positions, self.dark.shape)
         if view_ids.shape != counts.shape[:1]:
@@ -155,7 +158,7 @@ class CorrectionPlan:
             repaired[v] = bad.sum()
             if repaired[v] > view.size / 2:
                 raise ValueError(
-                    f"view {view_ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
+                    f"leave out projection {view_ids[v]}: {repaired[v]} of its {view.size} pixels are not finite"
                 )
             if (unseen := unmeasured(counts[v], view, self.hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
@@ -171,7 +174,7 @@ class CorrectionPlan:
         return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
-        """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
+        """Flat minus dark [row, col] for a projection; 1 in masked pixels."""
         between = flat_at(position, self.flats, self.part_starts)
         if self.dynamic is None:
             return between
@@ -180,7 +183,7 @@ class CorrectionPlan:
         return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
 
     def surveyed(self, views: Transmission) -> CorrectionPlan:
-        """The plan by which these views, too, were used in the search for air columns; of all views, it has theirs."""
+        """The plan after these projections were also used in the search for air columns."""
         if self.settings.air != "auto":
             return self
         return replace(self, profiles=(*self.profiles, (edge_profiles(views.data), views.view_ids)))
@@ -192,16 +195,18 @@ class CorrectionPlan:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Projections, CorrectionPlan]:
-        """Line integrals of these views and of the waiting one, and the plan of the views that follow.
+        """Line integrals of the waiting projection and of these, and the plan for those that follow.
 
         Args:
-            views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
-            last: no view comes after these; else the newest view waits.
-            progress: how many views are free of spots, after each; the logarithm that follows takes little time.
-            order: of their neighbours, see `SpotFilter.feed`.
+            views: the next projections; their memory is reused for the result. None: the waiting projection was the
+                last one.
+            last: True if no projection comes after these; otherwise the newest one waits.
+            progress: function called with the number of projections whose zingers are removed; the logarithm that
+                follows takes little time.
+            order: order of neighbours, see `SpotFilter.feed`.
 
         Raises:
-            UnlitViewsError: the air columns of some views are dark; it has their numbers.
+            UnlitViewsError: the air columns of some projections are dark; the error contains their numbers.
         """
         settings, columns, floored = self.settings, self.air_columns, 0
         views, spots = self.spots.feed(views and self._levelled(views), last, progress, order)
@@ -221,24 +226,24 @@ class CorrectionPlan:
         ), replace(self, spots=spots)  # fmt: skip
 
     def _levelled(self, views: Transmission) -> Transmission:
-        """The views divided by their air, in place."""
-        light, columns = air_light(views.data, *self.air_columns), self.air_columns
-        unlit = views.view_ids[~(light.min(axis=1) > self.settings.floor)]
+        """Divide the projections by the level of their air columns, in place."""
+        level, columns = air_light(views.data, *self.air_columns), self.air_columns
+        unlit = views.view_ids[~(level.min(axis=1) > self.settings.floor)]
         if unlit.size:
             raise UnlitViewsError(
-                f"no beam in {unlit.size} of {len(light)} views ({unlit[:8].tolist()} ...): the air columns, "
-                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
+                f"leave out the projections without beam: {unlit.size} of {len(level)} ({unlit[:8].tolist()} ...). "
+                f"Their air columns, {columns[0]} on the left and {columns[1]} on the right, are dark"
             )
-        views.data[...] /= light[:, None]
-        beam = None if views.beam is None else views.beam * light[:, None]
-        return replace(views, air=light.mean(axis=1), beam=beam)
+        views.data[...] /= level[:, None]
+        beam = None if views.beam is None else views.beam * level[:, None]
+        return replace(views, air=level.mean(axis=1), beam=beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
-        """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
+        """Replace the transmission of a projection by line integrals, and the photons of its beam by weights."""
         assert self.photons is not None
-        light = beam.astype(np.float64)
+        open_beam = beam.astype(np.float64)
         extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
-        p, w = of_view(np.maximum(view * light, -extra), light, extra)
+        p, w = of_view(np.maximum(view * open_beam, -extra), open_beam, extra)
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
 
@@ -250,23 +255,23 @@ def survey(
     standing: Mask | None = None,
     **known: Any,
 ) -> CorrectionPlan:
-    """The plan of views with these references.
+    """The correction plan for these flats and darks.
 
     Args:
-        references: darks and flats of the detector area of the views.
-        masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
-        standing: bool [row, col], pixels to fill besides, in the shadow of an object; None: none.
-        known: `photons`, `foreign` and `light` of the plan.
+        references: darks and flats of the same detector area as the projections.
+        masked: bool [row, col], pixels to fill; None: `dead_pixels` of the darks and flats.
+        standing: bool [row, col], further pixels to fill, in the shadow of a fixed object; None: none.
+        known: values for `photons`, `foreign` and `light` of the plan.
 
     Raises:
-        ValueError: for shapes that do not fit, no flats, or no beam in the flats.
+        ValueError: shapes do not match, there are no flats, or the flats show no beam.
     """
     settings = CorrectionSettings() if settings is None else settings
     check(references)
     dark = np.asarray(references.dark, np.float32)
     air, cols = settings.air, dark.shape[1]
     if isinstance(air, tuple) and not (min(air) >= 0 and 0 < sum(air) <= cols):
-        raise ValueError(f"air columns (left, right) {air} do not fit {cols} columns")
+        raise ValueError(f"air columns (left, right) {air} do not fit into {cols} columns")
     if masked is not None and np.shape(masked) != dark.shape:
         raise ValueError(f"masked must have shape {dark.shape}, got {np.shape(masked)}")
     if masked is None:
@@ -286,14 +291,16 @@ def survey(
 
 def _check_views(counts: NDArray[np.generic], positions: NDArray[np.float64], shape: tuple[int, ...]) -> None:
     if counts.ndim != 3 or counts.size == 0:
-        raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
+        raise ValueError(f"counts must be [view, row, col] with at least one projection, got shape {counts.shape}")
     if counts.shape[1:] != shape:
-        raise ValueError(f"the dark has shape {shape}, the views {counts.shape[1:]}")
+        raise ValueError(
+            f"the dark has shape {shape}, the projections {counts.shape[1:]}; both must have the same shape"
+        )
     if np.shape(positions) != counts.shape[:1]:
         raise ValueError(
-            f"positions must hold one number for each of {len(counts)} views, got shape {np.shape(positions)}"
+            f"positions must hold one number for each of the {len(counts)} projections, got shape {np.shape(positions)}"
         )
     if not np.isfinite(positions).all():
         raise ValueError(
-            f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
+            f"the positions of projections {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
         )

@@ -1,9 +1,9 @@
-"""Dynamic flats: components of the change of the beam from flat to flat, and their weights in each view.
+"""Dynamic flats: the components of the changes of the beam between flats, and their weights in each projection.
 
-After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975. They are principal
-components of the flats, as many as parallel analysis finds. The weights of a view minimise the total variation of the
-corrected view. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components)
-and the weights of a view are a convex fit of its line integrals]
+After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975. The components are
+principal components of the flats; parallel analysis gives their number. The weights of a projection minimise the total
+variation of the corrected projection. [our own: components of the logarithm, so that a flat is mean * exp(weights @
+components), and the weights of a projection are a convex fit to its line integrals]
 """
 
 from __future__ import annotations
@@ -20,23 +20,25 @@ from recon.base.arrays import F32, F64
 
 _FEWEST = 4  # flats
 _MOST = 10  # components
-_RANDOM = 10  # draws of parallel analysis
-_SAMPLED = 1 << 16  # pixels used for the components, and for the weights of a view
-_APART = 4  # pixels between which differences are taken: a beam changes more slowly than noise does
-_ROUNDS = 20  # of reweighting
-_SMOOTHED = 5  # pixels a side, to tell air
-_LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air; range and least share of air
-_MOST_LEFT = 3.0  # times the noise: matter leaves more
+_RANDOM = 10  # random draws of the parallel analysis
+_SAMPLED = 1 << 16  # pixels used for the components, and for the weights of a projection
+_APART = 4  # distance in pixels for differences; the beam changes more slowly than noise
+_ROUNDS = 20  # rounds of reweighting
+_SMOOTHED = 5  # pixels per side, smoothed to detect air
+# percentile of the line integrals that is air; range of line integrals and least share of air
+_LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1
+_MOST_LEFT = 3.0  # multiple of the noise; with material, the residual is larger
 _DARKEST = 0.05  # share of the median flat; darker pixels are not used
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicFlats:
-    """The mean of the flats of a scan, and the components of their differences.
+    """The mean of the flats of a scan and the components of their differences.
 
     Attributes:
-        mean: float32 [row, col], of the flats without their dark.
-        components: float32 [component, row, col], changes of the logarithm of the flat, RMS 1; 0 in dark pixels.
+        mean: float32 [row, col], mean of the flats minus the dark.
+        components: float32 [component, row, col], changes of the logarithm of the flat, each with RMS 1; 0 in dark
+            pixels.
     """
 
     mean: F32
@@ -47,24 +49,25 @@ class DynamicFlats:
         return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """The flat of this view [row, col] (without its dark), with the level of the mean flat."""
+        """The flat [row, col] (minus dark) for this projection, with the level of the mean flat."""
         w = self.weights_of(view, floor)
         return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes).
-        If some pixels turn out to be air, least squares on these follow.
+        """Weights [part] with which the line integrals of this projection vary least between pixels (absolute values).
+        If some pixels turn out to be air, a least-squares fit on these pixels follows.
 
         Args:
-            view: float32 [row, col], counts without the dark.
+            view: float32 [row, col], counts minus dark.
             floor: lowest transmission; darker pixels are not used.
         """
-        light = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
-        known = light > floor
+        transmission = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
+        known = transmission > floor
         if not len(self.components) or known.mean() < _ENOUGH:
             return np.zeros(len(self.components), np.float32)
-        integral = -np.log(np.where(known, light, 1.0))
-        share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral is proportional to one over this
+        integral = -np.log(np.where(known, transmission, 1.0))
+        # the noise of a line integral is proportional to the inverse of this
+        share = np.sqrt(np.where(known, transmission, 0))
         targets, columns = [], []
         for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
             apart = min(_APART, view.shape[axis] - 1)
@@ -78,7 +81,7 @@ class DynamicFlats:
         return self._by_air(w, integral, known).astype(np.float32)
 
     def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
-        """The weights by the pixels without sample; `w` if these are few, or do not fit."""
+        """The weights from the pixels in air; `w` if there are few of them or they do not fit."""
         weights: NDArray[Any] = w
         for _ in range(2):
             left = integral + np.tensordot(weights, self.components, axes=1)
@@ -86,11 +89,13 @@ class DynamicFlats:
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
-            at = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
-            matrix = np.column_stack((self.components.reshape(len(self.components), -1)[:, at].T, np.ones(at.size)))
-            weights = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[
-                0
-            ]
+            pixels = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
+            matrix = np.column_stack(
+                (self.components.reshape(len(self.components), -1)[:, pixels].T, np.ones(pixels.size))
+            )
+            weights = np.linalg.lstsq(
+                matrix.astype(np.float64), -integral.ravel()[pixels].astype(np.float64), rcond=None
+            )[0]
             weights, level = weights[:-1], weights[-1]
         left = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
         smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
@@ -104,11 +109,11 @@ def find_dynamic_flats(
     """Mean and principal components of flats.
 
     Args:
-        flats: returns the flats, float32 [row, col] without the dark, one after another; called three times.
-        masked: bool [row, col], pixels that are not used; None: all are used.
+        flats: function that returns an iterator over the flats, float32 [row, col] minus dark; called three times.
+        masked: bool [row, col], pixels to ignore; None: all are used.
 
     Raises:
-        ValueError: for fewer than four flats, which show no components.
+        ValueError: there are fewer than four flats, which show no components.
     """
     total, n = np.zeros((1, 1)), 0
     for flat in flats():
@@ -133,25 +138,25 @@ def find_dynamic_flats(
 
 
 def search_memory(flats: int, pixels: int) -> int:
-    """Peak memory of `find_dynamic_flats` in bytes, with the components; `pixels` of a flat."""
+    """Peak memory of `find_dynamic_flats` in bytes, including the components; `pixels`: of one flat."""
     return 4 * pixels * (_MOST + 16) + 8 * flats * 6 * min(pixels, 2 * _SAMPLED)
 
 
 def view_memory(flats: int, pixels: int) -> int:
-    """Peak memory in bytes of the components, and of finding the weights of a view."""
+    """Peak memory in bytes of the components and of finding the weights of a projection."""
     components, samples = min(_MOST, flats), min(2 * pixels, 3 * _SAMPLED // 2)
     return 4 * pixels * (4 * components + 14) + 8 * samples * (3 * components + 8)
 
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
-    """The logarithm of a flat over the mean, without its level; 0 in unused pixels."""
+    """The logarithm of a flat divided by the mean flat, minus its level; 0 in unused pixels."""
     ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))
     shape = np.log(ratio)
     return np.asarray(np.where(good, shape - shape[good].mean(), 0), np.float32)
 
 
 def _components(samples: F64, rng: np.random.Generator) -> F64:
-    """Shares [component, flat] of the flats in each component that stands out of noise (Horn's parallel analysis)."""
+    """Shares [component, flat] of the flats in each component that is above noise (Horn's parallel analysis)."""
     values, vectors = np.linalg.eigh(samples @ samples.T)
     deviation = samples.std(axis=0, ddof=1)
     drawn = []
@@ -166,7 +171,7 @@ def _components(samples: F64, rng: np.random.Generator) -> F64:
 
 
 def _least_absolute(matrix: F64 | F32, target: F64 | F32) -> F64:
-    """x with the least sum of |matrix @ x - target|, by iteratively reweighted least squares."""
+    """The x that minimises the sum of |matrix @ x - target| (iteratively reweighted least squares)."""
     matrix, target = matrix.astype(np.float64), target.astype(np.float64)
     weight: NDArray[Any] = np.ones(len(target))
     x = np.zeros(matrix.shape[1])

@@ -1,4 +1,4 @@
-"""The fan of rays that views of a full turn show: each ray is measured again, from the other side."""
+"""The fan angle of the rays, measured from a 360° scan, in which each ray is measured from both sides."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ import numpy as np
 
 from recon.base.arrays import F64
 
-_WIDEST, _STEP = 0.5, 0.01  # radians from the beam's axis to the edge of the detector
-_COLS = 256  # of more, columns are binned
+_WIDEST, _STEP = 0.5, 0.01  # radians from the central ray to the edge of the detector: largest value, and step
+_COLS = 256  # with more columns, they are binned
 
 
 def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tuple[float, float, float, float]:
-    """How ill measurements of a ray from both sides agree, with the fan that is stated, and with the best one.
+    """How much the two measurements of each ray (from both sides) disagree, for the stated fan and for the best one.
 
-    The ray at γ in the view β is the ray at -γ in the view β + π - 2γ, with tan γ = slope x columns from the axis.
+    The ray at γ in the projection at β is the ray at -γ in the projection at β + π - 2γ, with tan γ = slope x columns
+    from the axis.
 
     Args:
-        sinogram: [view, col] of one row in the plane of the source, in any order; views cover the circle.
-        slope: pitch of the detector over its distance from the source; 0: parallel rays.
+        sinogram: [view, col] of one row in the plane of the source, in any order; the projections cover 360°.
+        slope: pixel pitch of the detector divided by its distance from the source; 0: parallel rays.
 
     Returns:
-        Mean square of the differences over twice the variance, as stated, at best, and the median over slopes: 0 where
-        they agree, 1 where they have nothing in common. And the best slope.
+        The mean square of the differences divided by twice the variance: for the stated slope, for the best slope, and
+        the median over all slopes. 0: perfect agreement, 1: no agreement. The fourth value is the best slope.
     """
     order = np.argsort(np.mod(angles, 2 * math.pi), kind="stable")
     factor = math.ceil(sinogram.shape[1] / _COLS)

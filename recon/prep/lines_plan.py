@@ -1,4 +1,4 @@
-"""LinesPlan: how views that are line integrals already are used, as a `CorrectionPlan` uses counts."""
+"""LinesPlan: replaces a `CorrectionPlan` if the projections are already line integrals."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from recon.prep.projections import Projections
 from recon.prep.spots import SpotFilter, Transmission
 from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
-_NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
-_DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
+_NOISY = 0.01  # least share of a projection's line integrals that are below 0 if air contains noise
+_DEEPEST = 60.0  # line integral; e^-60 is practically no intensity, and e^60 squared is still a finite number
 
 
 @dataclass(frozen=True, eq=False)
 class LinesPlan:
-    """The plan of views that are line integrals already, which is used as a `CorrectionPlan` is.
+    """The plan for projections that are already line integrals; it is used like a `CorrectionPlan`.
 
-    Pixels that are not finite or measured nothing, and spots, are filled. There is no air, and nothing is masked but
-    pixels that no view has. Exact zeros at the corners are measured where air is 0 without noise.
+    Zingers and pixels that are not finite or contain no data are filled. Air columns are not used. Only pixels without
+    data in all projections are masked. If air is 0 without noise, exact zeros at the corners count as measured.
 
     Attributes:
-        spots, foreign: as of a `CorrectionPlan`.
-        masked: bool [row, col], pixels that have been finite in no view so far.
+        spots, foreign: as in `CorrectionPlan`.
+        masked: bool [row, col], pixels that have not been finite in any projection so far.
     """
 
     spots: SpotFilter
@@ -38,7 +38,7 @@ class LinesPlan:
 
     @classmethod
     def of(cls, zinger_threshold: float, foreign: Mask | None = None) -> LinesPlan:
-        """The plan before the first view; the threshold is that of `CorrectionSettings`."""
+        """The plan before the first projection; the threshold is that of `CorrectionSettings`."""
         root = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
         return cls(root, foreign)
 
@@ -49,15 +49,15 @@ class LinesPlan:
         view_ids: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
-        """The line integrals; a pixel that measured nothing, or is not finite, takes the value of the nearest one."""
+        """The line integrals; a pixel without data, or not finite, gets the value of the nearest pixel with data."""
         data = lines.astype(np.float32, copy=False)
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
-            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
-            light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
+            values = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
+            values[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
-            if (unseen := unmeasured(view, light, hidden, self.foreign)) is not None:
+            if (unseen := unmeasured(view, values, hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
                 lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
             repaired[v] += np.count_nonzero(bad[v])
@@ -68,7 +68,7 @@ class LinesPlan:
         return Transmission(data, view_ids, repaired, ones, None, np.concatenate(runs), bad.min(axis=0, initial=True))
 
     def surveyed(self, views: Transmission) -> LinesPlan:
-        """The plan that masks what none of these views has either."""
+        """The plan that masks only pixels without data in these projections, too."""
         return self if views.unseen is None else replace(self, masked=self.masked & views.unseen)
 
     def line_integrals(
@@ -78,7 +78,7 @@ class LinesPlan:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Projections, LinesPlan]:
-        """As of a `CorrectionPlan`."""
+        """As in `CorrectionPlan`."""
         views, spots = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(

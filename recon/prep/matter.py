@@ -1,8 +1,8 @@
-"""Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening, and its edges.
+"""Attenuation, phase shift and absorption edges of materials, for the phase and beam-hardening corrections.
 
-Cross sections are those of xraylib from 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The
-simulator reads the same tables and states the same compositions and densities. All formulas here are separate: no
-correction is tested with the formulas that made its data.
+Cross sections are from xraylib, 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The simulator
+uses the same tables, compositions and densities, but its own formulas, so that no correction is tested with the
+formulas that made its data.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ _LEAST_KEV, _MOST_KEV = 0.1, 800.0
 _DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
 _ELECTRON_KEV = 510.99895
 _JOULE_PER_KEV = 1.602176634e-16
-_NODES = 513  # energies of a tube
-_SOFTEST_KEV, _NOTHING = 1.0, 1e-7  # a tube's lowest energy; the share of its light below which an energy is left out
+_NODES = 513  # number of energies in a tube spectrum
+# lowest energy of a tube spectrum; energies with a smaller share of the photons are left out
+_SOFTEST_KEV, _NOTHING = 1.0, 1e-7
 _LP30 = {"LiPF6": 151.9, "C3H4O3": 574.05, "C3H6O3": 574.05}  # g/l: 1 mol/l in equal masses of two carbonates
 
 KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
@@ -49,16 +50,16 @@ KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
         "separator": (1.064, {"C3H6": 590 * 0.90, **{salt: 0.41 * mass for salt, mass in _LP30.items()}}),
     }
 )
-"""Density in g/cm³ and parts of the mass; see simulators.samples.materials.materials for the sources."""
+"""Density in g/cm³ and mass fractions; see simulators.samples.materials.materials for the sources."""
 
 
 _SHELLS = {"K": xraylib.K_SHELL, "L1": xraylib.L1_SHELL, "L2": xraylib.L2_SHELL, "L3": xraylib.L3_SHELL}
-HEAVIEST = 92  # atomic number of the heaviest element of matter, uranium
+HEAVIEST = 92  # atomic number of the heaviest element, uranium
 
 
 @dataclass(frozen=True)
 class TabulatedEdge:
-    """An absorption edge of a free atom; `energy` in keV. Compounds lie a few electronvolts higher."""
+    """An absorption edge of a free atom; `energy` in keV. In compounds the edge is a few electronvolts higher."""
 
     element: str
     shell: str
@@ -71,7 +72,7 @@ class TabulatedEdge:
 
 
 def edges_of(elements: Iterable[int]) -> list[TabulatedEdge]:
-    """K and L edges of elements, by atomic number, rising."""
+    """K and L edges of elements (atomic numbers), in ascending order."""
     edges = []
     for z in elements:
         for shell, number in _SHELLS.items():
@@ -84,16 +85,16 @@ def edges_of(elements: Iterable[int]) -> list[TabulatedEdge]:
 
 
 def delta_beta(name: str, energy_kev: float) -> float:
-    """Ratio of delta to beta of the refractive index 1 - delta + i beta; a material's density does not matter.
+    """Ratio of delta to beta of the refractive index 1 - delta + i beta; it does not depend on the density.
 
-    delta is by the electrons and the dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics,
-    equation 3.2), beta = mu wavelength / 4 pi.
+    delta is computed from the electron density and the dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern
+    X-ray Physics, equation 3.2); beta = mu wavelength / 4 pi.
 
     Args:
-        name: of a known material, or a chemical formula.
+        name: name of a known material, or a chemical formula.
 
     Raises:
-        ValueError: an unknown name or formula, or an energy outside the tables.
+        ValueError: the name or formula is unknown, or the energy is outside the tables.
     """
     beta = 0.1 * float(mass_attenuation(name, energy_kev)) * HC / energy_kev / (4 * math.pi)
     electrons = sum(
@@ -103,11 +104,11 @@ def delta_beta(name: str, energy_kev: float) -> float:
 
 
 def mass_attenuation(name: str, energies: ArrayLike) -> F64:
-    """Mass attenuation in cm²/g at energies in keV, float64, same shape; errors as in `delta_beta`."""
+    """Mass attenuation in cm²/g at energies in keV, float64 of the same shape; errors as in `delta_beta`."""
     e = np.asarray(energies, np.float64)
     if not ((e >= _LEAST_KEV) & (e <= _MOST_KEV)).all():
         raise ValueError(
-            f"attenuation is tabulated from {_LEAST_KEV} to {_MOST_KEV:g} keV; got {e.min():g} ... {e.max():g} keV"
+            f"attenuation is tabulated from {_LEAST_KEV} to {_MOST_KEV:g} keV, got {e.min():g} to {e.max():g} keV"
         )
     total = np.zeros(e.size)
     for z, share in _fractions(name).items():
@@ -118,15 +119,16 @@ def mass_attenuation(name: str, energies: ArrayLike) -> F64:
 def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float:
     """Entrance dose in gray of photons of one energy: fluence x energy x mass energy absorption.
 
-    Absorbed are the energies of photoelectrons and of Compton electrons. Fluorescence counts as absorbed, which is too
-    much by up to a quarter just above an edge. Inside, the dose is less by the attenuation above. xraylib's own
-    coefficient (CS_Energy) is not used: for water at 20 keV it is 30 % below NIST's.
+    The energies of photoelectrons and of Compton electrons count as absorbed. Fluorescence also counts as absorbed,
+    which makes the dose up to a quarter too high just above an edge. Inside the sample, the dose is lower because of
+    the attenuation in front. xraylib's own coefficient (CS_Energy) is not used, because for water at 20 keV it is 30 %
+    below NIST's.
 
     Raises:
-        ValueError: as `delta_beta`, or an energy outside 1 to 200 keV.
+        ValueError: as for `delta_beta`, or the energy is outside 1 to 200 keV.
     """
     if not 1.0 <= energy_kev <= 200.0:
-        raise ValueError(f"doses are tabulated from 1 to 200 keV; got {energy_kev:g} keV")
+        raise ValueError(f"doses are tabulated from 1 to 200 keV, got {energy_kev:g} keV")
     kept = energy_kev / (_ELECTRON_KEV + 2.1 * energy_kev)  # mean share of a Compton electron, to 2 % (Klein-Nishina)
     absorbed = sum(  # cm²/g
         share * (xraylib.CS_Photo(z, energy_kev) + kept * xraylib.CS_Compt(z, energy_kev))
@@ -136,43 +138,45 @@ def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float
 
 
 def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
-    """The light of an X-ray tube: the bremsstrahlung of a thick target (Kramers, Phil. Mag. 46, 836, 1923).
+    """Spectrum of an X-ray tube: bremsstrahlung of a thick target (Kramers, Phil. Mag. 46, 836, 1923).
 
     Args:
-        filters: mm of each known material before the sample.
+        filters: thickness in mm of each filter (known materials) in front of the sample.
 
     Returns:
-        Energies in keV, float64 [energy], and their shares of the photons, of any sum.
+        Energies in keV, float64 [energy], and their relative numbers of photons (not normalised).
 
     Raises:
-        ValueError: a voltage outside 5 ... 800 kV, a filter without a known density, or no light behind the filters.
+        ValueError: the voltage is outside 5 to 800 kV, the density of a filter is unknown, or no photons pass the
+            filters.
     """
     if not 5 <= kv <= 800:
-        raise ValueError(f"kv must lie in 5 ... 800, got {kv}")
+        raise ValueError(f"kv must be 5 to 800, got {kv}")
     x, w = _gauss_rule()
     energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
     depth = np.zeros(_NODES)
     for name, mm in filters.items():
         if name not in KNOWN:
-            raise ValueError(f"the filter {name!r} has no known density; expected one of {', '.join(KNOWN)}")
+            raise ValueError(f"the density of the filter {name!r} is unknown; use one of {', '.join(KNOWN)}")
         depth += 0.1 * mm * KNOWN[name][0] * mass_attenuation(name, energies)
     weights = w * (kv - energies) / energies * np.exp(-depth)
     if not weights.any():
-        raise ValueError(f"no light of the tube's {kv:g} kV passes its filters {dict(filters)} mm")
+        raise ValueError(f"no X-rays of the tube at {kv:g} kV pass its filters {dict(filters)} (thickness in mm)")
     kept = weights > _NOTHING * weights.sum()
     return energies[kept], weights[kept]
 
 
-@cache  # half a second
+@cache  # takes half a second
 def _gauss_rule() -> tuple[F64, F64]:
-    """Nodes in -1 ... 1 and their weights."""
+    """Gauss nodes from -1 to 1 and their weights."""
     return np.polynomial.legendre.leggauss(_NODES)
 
 
 def _fractions(name: str) -> dict[int, float]:
-    """Share of the mass of each element, by atomic number."""
+    """Mass fraction of each element, by atomic number."""
     nmc = re.fullmatch(r"NMC(\d)(\d)(\d)", name)
-    if nmc is not None and any(map(int, nmc.groups())):  # a layered oxide by the shares of its metals: NMC622
+    # a layered oxide, named by the shares of its metals, such as NMC622
+    if nmc is not None and any(map(int, nmc.groups())):
         total = sum(map(int, nmc.groups()))
         metals = [f"{symbol}{int(n) / total:.9f}" for symbol, n in zip(("Ni", "Mn", "Co"), nmc.groups(), strict=True)]
         name = f"Li{''.join(metal for metal in metals if float(metal[2:]) > 0)}O2"
@@ -182,7 +186,7 @@ def _fractions(name: str) -> dict[int, float]:
         try:
             parsed = xraylib.CompoundParser(formula)
         except ValueError as error:
-            raise ValueError(f"{name!r} is neither a material that scenes know nor a chemical formula") from error
+            raise ValueError(f"{name!r} is not a known material and not a chemical formula") from error
         for z, share in zip(parsed["Elements"], parsed["massFractions"], strict=True):
             shares[z] = shares.get(z, 0.0) + mass / sum(parts.values()) * share
     return shares

@@ -1,4 +1,4 @@
-"""Moments of parallel views: errors of their axis, heights and angles, whatever the sample is."""
+"""Moments of parallel projections: they show errors of the axis, heights and angles, for any sample."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 
-_ORDERS = 4  # of moments that tell angles: those above follow edges, rings and noise
-_BANDS = 16  # of rows, whose moments are taken
-_MATTER = 0.2  # of the fullest row, or of the densest column: with less, moments are mostly noise
-_RIM = 0.05  # of the densest column: below it there is air
-_LEAST_ROWS = 8  # fewer have no profile along the axis; each half of the rows has one, too
-_ROUNDING = 1e-6  # of a band's mass: what float32 line integrals do to a moment, and a little more
+_ORDERS = 4  # moments up to this order are used for the angles; higher ones follow edges, rings and noise
+_BANDS = 16  # bands of rows whose moments are computed
+_MATTER = 0.2  # share of the fullest row or the densest column; with less material, moments are mostly noise
+_RIM = 0.05  # share of the densest column; below it is air
+_LEAST_ROWS = 8  # fewer rows give no profile along the axis; each half of the rows must give one, too
+_ROUNDING = 1e-6  # share of a band's mass; slightly above the effect of float32 rounding on a moment
 
 
 @dataclass(frozen=True, eq=False)
 class ViewMoments:
-    """Errors that the moments of views show, with standard deviations; NaN where rows or views are too few.
+    """Errors that moments show, with standard deviations; NaN if there are too few rows or projections.
 
     Attributes:
-        axis_col: the rotation axis, in columns.
-        across: float64 [view], by how many columns the centre of mass leaves its way about the axis.
-        mass: float64 [view], over its median, less 1.
-        down: float64 [view], by how many rows the matter is lower than in the mean view.
-        stretch: the angle by which the views turned, over the one stated, less 1.
+        axis_col: column of the rotation axis.
+        across: float64 [view], columns by which the centre of mass deviates from its sine curve about the axis.
+        mass: float64 [view], total absorption divided by its median, minus 1.
+        down: float64 [view], rows by which the sample is lower than in the mean projection.
+        stretch: actual rotation divided by the stated one, minus 1.
     """
 
     axis_col: float
@@ -41,17 +41,17 @@ class ViewMoments:
 
 
 def moments_of(views: Iterable[F32], angles: NDArray[np.floating], axis_col: float) -> ViewMoments:
-    """The moments of line integrals of a sample within the field, in a parallel beam.
+    """The moments of line integrals of a sample within the field of view, in a parallel beam.
 
     The moment of order k of a row, over the columns, is a polynomial of degree k in the cosine and sine of the angle
-    (Helgason 1965; Ludwig 1966, Comm. Pure Appl. Math. 19, 49). So each row has one mass in all views, and its centre
-    goes along a sinusoid about the axis. Orders up to 4 tell whether all angles are too large by one factor: its
-    effect on the polynomials is fitted to what they leave.
+    (Helgason 1965; Ludwig 1966, Comm. Pure Appl. Math. 19, 49). So the total absorption of a row is the same in all
+    projections, and its centre of mass follows a sine curve about the axis. Moments up to order 4 show whether all
+    angles are too large by a common factor: the effect of this factor is fitted to the residual of the polynomials.
 
     Args:
-        views: float32 [row, col] each, which are taken one after the other.
+        views: projections, float32 [row, col] each, read one after the other.
         angles: [view] in radians.
-        axis_col: about which moments are taken that tell angles; a wrong one spoils these.
+        axis_col: column about which the moments for the angles are computed; they need the right axis.
     """
     turned: F64 = np.asarray(angles, np.float64)
     mass, bands = _sums(views)
@@ -63,7 +63,7 @@ def moments_of(views: Iterable[F32], angles: NDArray[np.floating], axis_col: flo
 
 
 def _sums(views: Iterable[F32]) -> tuple[F64, F64]:
-    """Mass [view, row], and means [view, band, col] of bands of rows that hold matter."""
+    """Total absorption [view, row], and means [view, band, col] of bands of rows that contain material."""
     mass, bands = [], []
     for view in views:
         rows = len(view)
@@ -76,10 +76,10 @@ def _sums(views: Iterable[F32]) -> tuple[F64, F64]:
 
 
 def _down(mass: F64) -> tuple[F64, float]:
-    """Rows by which each view stands lower than the mean of all, and their standard deviation.
+    """Rows by which each projection is lower than the mean of all, and the standard deviation.
 
-    The profile of masses along the axis moves with the sample; a weaker beam scales it, and adds to it. Both halves of
-    the rows must agree: what drifts or hardens changes a profile, too.
+    The profile of total absorption along the axis moves with the sample. A weaker beam scales this profile and adds to
+    it. Both halves of the rows must agree, because drift and beam hardening change the profile, too.
     """
     rows = mass.shape[1]
     down, sigma = _moved(mass)
@@ -88,7 +88,7 @@ def _down(mass: F64) -> tuple[F64, float]:
 
 
 def _moved(mass: F64) -> tuple[F64, float]:
-    """`_down` by some rows; NaN where they do not determine it."""
+    """`_down` from some rows; NaN if these rows do not determine it."""
     views, rows = mass.shape
     unknown = np.full(views, np.nan), np.nan
     if rows < _LEAST_ROWS:
@@ -104,7 +104,7 @@ def _moved(mass: F64) -> tuple[F64, float]:
 
 
 def _centres(bands: F64, angles: F64) -> tuple[float, F64, float]:
-    """The column about which the centre of each band goes along a sinusoid, and by how much all of them leave it."""
+    """The column about which the centre of each band follows a sine curve, and the deviations of all bands from it."""
     mass = bands.sum(axis=2)
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
     if len(angles) <= 3 or not bands.size or (mass <= 0).any() or np.linalg.matrix_rank(parts) < 3:
@@ -120,11 +120,11 @@ def _centres(bands: F64, angles: F64) -> tuple[float, F64, float]:
 
 
 def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
-    """Relative excess of the turn over the stated one, and its standard deviation.
+    """Relative excess of the actual rotation over the stated one, and its standard deviation.
 
-    A small error of the axis is fitted beside it. Of what is nearly a body of revolution that does not suffice: what
-    pixels and the axis do to its moments looks like an error of the angles. So a second fit has all multiples of the
-    angle up to the order, which hold whatever the axis is, and the two have to agree.
+    A small error of the axis is fitted together with it. For a sample that is nearly a body of revolution this is not
+    enough, because the effects of pixels and of the axis on its moments look like an error of the angles. So a second
+    fit uses all multiples of the angle up to the order, which are valid for any axis. The two fits must agree.
     """
     if len(angles) <= 2 * _ORDERS + 1 or not bands.size:
         return np.nan, np.nan
@@ -140,12 +140,12 @@ def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
 
 
 def _fitted(bands: F64, places: F64, column: float, angles: F64, every: int) -> tuple[float, float]:
-    """The stretch of the angles by moments of Chebyshev's polynomials, and its standard deviation.
+    """The stretch of the angles from Chebyshev moments, and its standard deviation.
 
     Args:
-        bands: [view, band, col], where the matter is.
-        places: [col], between -1 and 1; `column`: their step.
-        every: 2 for the multiples of the angle of the order's parity, 1 for all.
+        bands: [view, band, col], the columns with material.
+        places: [col], positions from -1 to 1; `column`: their step.
+        every: 2: only multiples of the angle with the parity of the order; 1: all.
     """
     rounding = (_ROUNDING * np.abs(bands).sum(axis=2).mean(axis=0)) ** 2
     normal, right = np.zeros((rounding.size, 2, 2)), np.zeros((rounding.size, 2))
@@ -168,13 +168,13 @@ def _fitted(bands: F64, places: F64, column: float, angles: F64, every: int) -> 
     if np.linalg.matrix_rank(total) < 2:
         return np.nan, np.nan
     sigma = float(np.sqrt(np.linalg.inv(total)[0, 0]))
-    if (count := rounding.size) > 2:  # without each in turn: bands disagree where the sample moves
+    if (count := rounding.size) > 2:  # jackknife over the bands, because bands disagree if the sample moves
         without = np.linalg.solve(total - normal, (of_all - right)[..., None])[:, 0, 0]
         sigma = max(sigma, float(np.sqrt((count - 1) * without.var())))
     return float(np.linalg.solve(total, of_all)[0]), sigma
 
 
 def _chebyshev(order: int, places: F64) -> F64:
-    """Chebyshev's polynomial of the second kind at places between -1 and 1."""
+    """Chebyshev polynomial of the second kind at positions from -1 to 1."""
     turn = np.arccos(places)
     return np.sin((order + 1) * turn) / np.sin(turn)

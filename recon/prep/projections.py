@@ -1,4 +1,4 @@
-"""Projections: line integrals, and what a correction changed in them; batches of them joined."""
+"""Projections: line integrals with a record of what the correction changed; and how batches are joined."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from recon.prep.unmeasured import NO_RUNS
 
 @dataclass(frozen=True, eq=False)
 class Projections:
-    """Line integrals, and what the correction changed.
+    """Line integrals, with a record of what the correction changed.
 
     Attributes:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
         floored: fraction of the live pixels that were set to -log(floor).
-        air: float32 [view], transmission of the air, by which each view was divided, on average; 1 without air columns.
-        masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
-        air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
-        replaced: fraction of the live pixels that were spots or not finite in one view; filled from their neighbours.
-        weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
-            pixels; None: photons were not counted.
-        unmeasured: int64 [run, 4], pixels that measured nothing in a view, filled from their neighbours: the view's
-            number, row, first column, column after the last.
-        spots_left: pixels of bright spots that were too large to be filled, in these views and those before.
+        air: float32 [view], mean transmission of the air by which each projection was divided; 1 without air columns.
+        masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
+        air_columns: (left, right) number of columns in which `air` was measured; (0, 0): `air` was not measured.
+        replaced: fraction of the live pixels that were zingers or not finite in one projection; filled from their
+            neighbours.
+        weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
+            masked pixels. None: photons were not counted.
+        unmeasured: int64 [run, 4], pixels without data in one projection, filled from their neighbours: number of the
+            projection, row, first column, column after the last.
+        spots_left: number of pixels of zingers that were too large to be filled, in these and all earlier projections.
     """
 
     data: NDArray[np.float32]
@@ -44,26 +45,27 @@ class Projections:
 
     @property
     def lit(self) -> Mask | None:
-        """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
+        """bool [view, row, col] True for pixels with data; None: all (interpolated single lines count as data)."""
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
-        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        index_of = {int(view): number for number, view in enumerate(self.view_ids)}
         for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
-            lit[at[view], row, first:end] = False
+            lit[index_of[view], row, first:end] = False
         return None if lit.all() else lit
 
     @property
     def measured(self) -> NDArray[np.float32]:
-        """The line integrals, NaN where a pixel measured nothing."""
+        """The line integrals, with NaN for pixels without data."""
         return self.data if (lit := self.lit) is None else np.where(lit, self.data, np.float32(np.nan))
 
 
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
-    """Join batches of a scan's views. The list is emptied meanwhile, so that only few views are in memory twice.
+    """Join batches of projections. The list is emptied meanwhile, so that few projections are in memory twice.
 
-    The air columns, the mask and the spots left are those of the last batch.
+    The air columns, the mask and `spots_left` are those of the last batch.
 
     Args:
-        data: the line integrals of all, if they are together already; those of the batches do not count then.
+        data: the line integrals of all batches, if they are in one array already; those in the batches are then
+            ignored.
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]
@@ -74,9 +76,9 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
     if data is None:
-        data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
+        data, start = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
         while parts:
             part = parts.pop(0).data
-            data[at : at + len(part)] = part
-            at += len(part)
+            data[start : start + len(part)] = part
+            start += len(part)
     return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.spots_left)

@@ -1,4 +1,4 @@
-"""References: darks and flats, the flat of a view, dead pixels, and the air beside the sample."""
+"""References: darks and flats, the flat for a projection, dead pixels, and the air next to the sample."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ Kept = TypeVar("Kept", F32, F64)
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """Darks and flats: the images without beam, and with beam but without a sample.
+    """Darks (images without beam) and flats (images with beam but without sample).
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean without bright spots of single frames.
+    A stack of frames [frame, row, col], any real type, is replaced by its mean, without the zingers of single frames.
 
     Attributes:
-        dark: float32 [row, col], mean or median of the darks; or all darks, as a stack.
-        flats: (position, float32 [row, col]) of each group of flats, or (position, stack); the position counts frames
-            of the scan.
-        dynamic: how flats differ from one another; None: a view's flat is interpolated between groups.
-        part_starts: ascending, the first frame of each part of the scan. A view's flat comes from the flats of its own
-        part, or from the nearest group if its part has no flats.
+        dark: float32 [row, col], mean or median of the darks; or all darks as a stack.
+        flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position is the number
+            of the frame in the scan.
+        dynamic: how flats differ from each other; None: the flat of a projection is interpolated between groups.
+        part_starts: the first frame of each part of the scan, ascending. The flat of a projection comes from its own
+            part, or from the nearest group if its part has no flats.
     """
 
     dark: Image
@@ -45,48 +45,53 @@ class References:
 
     def __post_init__(self) -> None:
         some = np.ma.filled(self.flats[0][1], 0) if isinstance(self.flats, tuple) and self.flats else np.zeros(0)
-        light = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
-        object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
+        beam = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
+        object.__setattr__(self, "dark", _mean(self.dark, "darks", beam))
         check_settings(self)
-        flats = tuple((position, _mean(flat, f"flats at {position:g}", light)) for position, flat in self.flats)
+        flats = tuple((position, _mean(flat, f"flats at {position:g}", beam)) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 
     def rows(self, rows: slice) -> References:
-        """The references of some detector rows."""
+        """The darks and flats of some detector rows."""
         flats = tuple((position, flat[rows]) for position, flat in self.flats)
         dynamic = None if self.dynamic is None else self.dynamic.rows(rows)
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
 
 
-def _mean(frames: Image, what: str, light: float) -> Image:
-    """The mean of a stack, or an image as it is; NaN where all is masked."""
+def _mean(frames: Image, what: str, beam: float) -> Image:
+    """The mean of a stack, or a single image unchanged; NaN for pixels that are masked in all frames."""
     if np.ndim(frames) != 3:
         return cast(Image, without_mask(frames))
     if not len(frames):
-        raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
+        raise ValueError(f"the stack of {what} is empty; give at least one frame [frame, row, col]")
     if not np.ma.is_masked(frames):
-        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), light)])
+        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), beam)])
     return np.asarray(without_mask(np.mean(frames, axis=0, dtype=np.float64)), np.float32)
 
 
 def check(references: References) -> None:
     """Raise ValueError if there are no flats, shapes disagree, or two groups of flats have the same position."""
     if not references.flats:
-        raise ValueError("there is no flat: without one, counts cannot be converted to line integrals")
+        raise ValueError("counts cannot be converted to line integrals without a flat; give at least one")
     shape = np.shape(references.dark)
     for position, flat in references.flats:
         if np.shape(flat) != shape or len(shape) != 2:
-            raise ValueError(f"the dark has shape {shape}, the flat at {position:g} {np.shape(flat)}")
-    at = sorted(p for p, _ in references.flats)
-    if len(set(at)) < len(at) or not np.isfinite(at).all():
-        raise ValueError(f"each group of flats needs its own position, got {at}; average the flats taken together")
+            raise ValueError(
+                f"the dark has shape {shape}, the flat at {position:g} has {np.shape(flat)}; both must have the same "
+                "shape"
+            )
+    positions = sorted(p for p, _ in references.flats)
+    if len(set(positions)) < len(positions) or not np.isfinite(positions).all():
+        raise ValueError(
+            f"each group of flats needs a position of its own, got {positions}; average flats that belong together"
+        )
 
 
 def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
-    """The dark for an exposure in s: offset and dark current are linear in it, so that two darks determine any other.
+    """The dark for an exposure time in s. It is linear in the exposure time, so that two darks determine all others.
 
     Args:
-        darks: (exposure, image [row, col]), one or more, of different exposures.
+        darks: (exposure time, image [row, col]), one or more, with different exposure times.
     """
     near = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
     (first, image), *others = near
@@ -97,30 +102,30 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
 
 
 def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Flat without its dark at a frame's position: interpolated between groups of its part, beyond them the nearest."""
+    """Flat minus dark at a frame's position: interpolated between groups of its part, otherwise the nearest group."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
-    at = [p for p, _ in groups]
-    upper = int(np.searchsorted(at, position))
+    positions = [p for p, _ in groups]
+    upper = int(np.searchsorted(positions, position))
     if upper == 0 or upper == len(groups):
         return groups[min(upper, len(groups) - 1)][1]
-    weight = np.float32((position - at[upper - 1]) / (at[upper] - at[upper - 1]))
+    weight = np.float32((position - positions[upper - 1]) / (positions[upper] - positions[upper - 1]))
     return groups[upper - 1][1] * (1 - weight) + groups[upper][1] * weight
 
 
-_DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
-SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
-_WHOLE = 0.9  # of the pixels of a row: noise lights some
-_UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
-_BRIGHT = 90.0  # percentile of a flat that is in the beam
+_DIM, _SURE = 0.05, 3.0  # share of the intensity that no projection reaches in a shadow; standard errors of its median
+SHADOW_REACH = 5  # rows and columns around a pixel, and its own row, decide whether it is in a shadow
+_WHOLE = 0.9  # share of the pixels of a row; noise makes some pixels bright
+_UNLIT = 0.01  # share of the intensity in the full beam; below it, a pixel is outside the beam
+_BRIGHT = 90.0  # percentile of a flat that is in the full beam
 
 
 def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0) -> Mask:
-    """Mask [row, col] of unusable pixels: not finite, blind or unlit (flat near dark), or unlike their neighbours.
+    """Mask [row, col] of unusable pixels: not finite, without signal (flat near dark), or unlike their neighbours.
 
     Raises:
-        ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
+        ValueError: more than half of the detector is dead, because there is no beam or darks and flats are exchanged.
     """
     dark = np.asarray(dark, np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -128,10 +133,10 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
     dead = np.logical_or.reduce([~((net > 0) & np.isfinite(net)) for net in nets])
     if dead.mean() > 0.5:
         raise ValueError(
-            f"{dead.mean():.0%} of the pixels have flat <= dark (median flat {np.median(flats[0]):.4g}, "
-            f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
+            f"the flats show no beam, or darks and flats are exchanged: {dead.mean():.0%} of the pixels have flat <= "
+            f"dark (median flat {np.median(flats[0]):.4g}, median dark {np.median(dark):.4g})"
         )
-    # Behind a slit, flat and view are both noise, and their ratio has no meaning.
+    # Behind a slit, both flat and projection are noise, and their ratio has no meaning.
     dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], _BRIGHT) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
@@ -148,25 +153,25 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
     return dead | hot
 
 
-def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
-    """Mask [row, col] of areas that are lit in the flats but in no view: a part of the instrument is in the beam.
+def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
+    """Mask [row, col] of areas with beam in the flats but in no projection: a part of the instrument is in the beam.
 
-    Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
-    rotation axis darkens the middle, which does not count. Opaque matter that covers an edge in all views counts: its
-    line integrals are not measured either way. Its blurred edge belongs to it, see
+    Only runs of dark pixels from an edge of their row count, and rows that are completely dark. An opaque rod on the
+    rotation axis darkens the middle, so it does not count. Opaque material that covers an edge in all projections
+    counts, because its line integrals cannot be measured anyway. The blurred edge of the area is included, see
     `with_rim`.
 
     Args:
-        light: float32 [view, row, col], transmission of views all around, three at least.
-        floor: lowest transmission that counts as light.
+        light: float32 [view, row, col], transmission of at least three projections from all directions.
+        floor: lowest transmission that counts as beam.
     """
-    n = len(light)
-    middle = np.median(light, axis=0)
-    spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
+    n = len(transmission)
+    middle = np.median(transmission, axis=0)
+    spread = np.median(np.abs(transmission - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    bright = np.partition(light, n - 2, axis=0)[n - 2]  # one view may have a zinger
+    bright = np.partition(transmission, n - 2, axis=0)[n - 2]  # one projection may have a zinger
     dark &= bright < _DIM
-    whole = dark.mean(axis=1) > _WHOLE  # a row that is not read has no blurred edge
+    whole = dark.mean(axis=1) > _WHOLE  # a row that the camera does not read has no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
@@ -174,13 +179,14 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     return with_rim(found, bright) | whole[:, None]
 
 
-_NEXT, _OUTER = 5, 3  # views next to flats; columns
-_RISE = 0.005  # line integral, from the edge to an eighth of the width: about the least a surface of the beam has
-_BANDS = 8  # of rows, at most
+_NEXT, _OUTER = 5, 3  # projections next to flats; columns
+# rise of the line integral from the edge to an eighth of the width; about the smallest that a beam background has
+_RISE = 0.005
+_BANDS = 8  # largest number of bands of rows
 
 
 def edge_profiles(transmission: F32) -> F32:
-    """Input of `air_columns`, by transmissions [view, row, col]: medians [view, side, band of rows, col from edge]."""
+    """Input of `air_columns` from transmissions [view, row, col]: medians [view, side, band of rows, col from edge]."""
     _, rows, cols = transmission.shape
     bands = [b for b in np.array_split(np.arange(rows), min(rows, _BANDS)) if b.size]
     widest = max(cols // 8, 1)
@@ -192,12 +198,13 @@ def edge_profiles(transmission: F32) -> F32:
 
 
 def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int, int]:
-    """Number of columns at the left and right edge that show air in all views; (0, 0) if none do.
+    """Number of columns at the left and right edge that show air in all projections; (0, 0) if none do.
 
-    Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger). This
-    holds in every view, over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
-    darker is sample; a slow trend towards brighter is the beam. A side of fewer than 4 % of the columns, or darker than
-    the other side by more than 10 %, counts as 0. For the `edge_profiles` of all views.
+    Air columns are nowhere darker than the outermost columns by more than the tolerance (or the noise, if larger). This
+    must hold in every projection, over the whole height. A sample that fills the field of view is thinnest at the edge.
+    So a trend towards darker columns is the sample, and a slow trend towards brighter columns is the beam. A side with
+    fewer than 4 % of the columns, or darker than the other side by more than 10 %, counts as 0. `profiles` are the
+    `edge_profiles` of all projections.
     """
     least = max(3, cols // 25)
     counts, levels = [], []
@@ -205,7 +212,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
         noise = deviation_between_neighbours(relative)
-        # One view in twenty may deviate: noise has tails, and the median over the columns tolerates it.
+        # One projection in twenty may deviate, because noise has tails; the median over the columns tolerates it.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)
         n = int(np.argmin(np.append(steady, False)))
@@ -218,30 +225,32 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
 
 
 def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[float], columns: tuple[int, int]) -> float:
-    """Line integral at edges that look like air but may be a sample wider than the field; 0 where they are air.
+    """Line integral at edges that look like air but may show a sample wider than the field of view; 0: they are air.
 
-    It is that of the views next to a group of flats, the least of all groups: a beam drifts away from its flats, and a
-    sample is there at once. A sample is thinnest at the edges. So line integrals rise from there on, on all sides, in
-    the median of views and rows; where they do not, the beam is weaker than its flats.
+    It is measured in the projections next to each group of flats, and the smallest value of all groups counts. The
+    reason: a beam drifts away from its flats, but a sample is there from the start. A sample is thinnest at the edges,
+    so the median line integrals rise from the edge inwards on all sides. If they do not rise, the beam is weaker than
+    in the flats.
 
     Args:
-        profiles: as of `edge_profiles`; positions: [view], of the views in the scan.
-        flats: positions of the groups.
-        columns: that show air, left and right.
+        profiles: from `edge_profiles`; positions: [view], positions of the projections in the scan.
+        flats: positions of the groups of flats.
+        columns: number of columns that show air, left and right.
     """
     sides = [side for side, n in enumerate(columns) if n]
-    light = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
+    levels = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
     beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
-    depth = min(-math.log(max(float(np.median(light[views])), 1e-30)) for views in beside)
+    depth = min(-math.log(max(float(np.median(levels[views])), 1e-30)) for views in beside)
     outer, inner = (np.median(part, axis=(0, 2, 3)) for part in (profiles[..., :_OUTER], profiles[..., -_OUTER:]))
     rises = np.log(np.maximum(outer, 1e-30) / np.maximum(inner, 1e-30))[sides]
     return depth if rises.min() > _RISE else 0.0
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:
-    """Transmission of the air across each view [view, col], from its air columns; 1 without any.
+    """Transmission of the air across each projection [view, col], from its air columns; 1 without air columns.
 
-    Medians of the two sides, and the line through them: a beam that moved or changed its shape since the flat tilts it.
+    It is the line through the medians of both sides. The line is sloped if the beam moved or changed its shape since
+    the flat.
     """
     views, _, cols = transmission.shape
     sides = [(side, at) for side, at in (

@@ -1,4 +1,4 @@
-"""Repeats: views of the same rays at two times show how the sample changed, also in a cone and beyond the field."""
+"""Repeats: two measurements of the same rays at different times show how the sample changed (any beam or width)."""
 
 from __future__ import annotations
 
@@ -12,29 +12,34 @@ from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.views import spread
 
-_COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12  # columns after binning, about; fewer rows or views tell nothing
-_SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation of the smoothing, and those left out at either edge
-_EXACT, _LINEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: beyond, the difference is not linear
-_LATER, _LONGEST = 3, 0.9  # a pair lies a third of the scan apart at least; share of the longest time between two
-_FIRSTS, _PAIRS, _BANDS = 512, 8, 4  # views whose pairs are sought, at most; pairs; bands of rows, which may disagree
-_CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels whose errors are one: those that the Gaussian joins, twice
-_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is reported
+# approximate number of columns after binning; least number of rows and of projections
+_COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12
+_SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation of the smoothing, and width left out at either edge
+# distance in pixels between two rays at the edge of the field; beyond the second value the difference is not linear
+_EXACT, _LINEAR = 0.1, 2.3
+_LATER, _LONGEST = 3, 0.9  # a pair is at least a third of the scan apart; share of the longest time in a pair
+# largest number of projections for which pairs are searched; pairs; bands of rows, which are compared
+_FIRSTS, _PAIRS, _BANDS = 512, 8, 4
+# number of pixels with common errors: those that the Gaussian smoothing joins, twice
+_CORRELATED = 2 * 4 * np.pi * _SMOOTH**2
+_NOISY = 0.1  # ratio of noise to structure above which nothing is reported
 
 
 def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int], float, F64, F64]]:
-    """How the sample changes between views of the same rays: half a turn apart, mirrored (parallel), or a turn.
+    """How the sample changes between projections of the same rays: 180° apart and mirrored (parallel), or 360° apart.
 
-    The difference of two views is fitted by what small changes do to them: shifts, a small turn, more or less
-    absorption, a change of the air, and of both sizes. Whatever the sample is beyond the field, the same rays meet it.
-    How bands of rows disagree is uncertainty, and so is what stays unexplained.
+    The difference of two projections is fitted with the effects of small changes: shifts, a small rotation, a change of
+    absorption, of the air level, and of both sizes. The sample may be wider than the field of view, because both
+    projections see the same rays. The uncertainty comes from the disagreement between bands of rows and from the
+    unexplained rest.
 
     Args:
         data: line integrals [view, row, col], in the order of time.
 
     Yields:
-        The first of the pairs of views that are looked at, the mean time between the views of a pair as a share of the
-        scan, and the change in that time with its standard deviation, float64 [4] each: rows by which the sample sinks,
-        and shares by which its line integrals, its size across the axis and its size along the axis grow.
+        The first of the examined pairs; the mean time within a pair, as a share of the scan; and the change in that
+        time and its standard deviation, float64 [4] each. The four changes are: rows by which the sample sinks, and
+        shares by which its line integrals, its size across the axis and its size along the axis grow.
     """
     side = -(-data.shape[2] // _COLUMNS)
     if len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS * side:
@@ -45,7 +50,8 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
         normal, right, squares, structure, sizes = (np.stack(each) for each in zip(*sums, strict=True))
         total, of_all = normal.sum(axis=0), right.sum(axis=0)
         too_noisy = noise**2 / (2 * np.pi * _SMOOTH**2) * sizes.sum() > _NOISY**2 * structure.sum()
-        if too_noisy or np.linalg.matrix_rank(total - normal).min() < len(total):  # a band may hold all there is
+        # a single band may contain all the information
+        if too_noisy or np.linalg.matrix_rank(total - normal).min() < len(total):
             continue
         shares = np.linalg.solve(total, of_all)
         unexplained = max(float(squares.sum() - shares @ of_all), 0.0) / sizes.sum()
@@ -57,7 +63,7 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
 
 
 def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
-    """Pairs of views of the same rays, the first and the later: those that are exact, then those nearly so.
+    """Pairs (first, later) of projections of the same rays: exact pairs first, then nearly exact ones.
 
     Args:
         reach: columns from the axis to the edge.
@@ -78,10 +84,10 @@ def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
 def _sums(
     data: F32, geometry: Geometry, pair: tuple[int, int], side: int
 ) -> Iterator[tuple[F64, F64, float, float, int]]:
-    """Sums for each band of rows: normal equations of the changes; squares of difference and structure; pixels."""
+    """Sums for each band of rows: normal equations of the changes, squares of difference and structure, pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
-    at = min(later, len(data) - 2)
-    beside = data[[first, later, at - 1, at, at + 1]]
+    second = min(later, len(data) - 2)
+    beside = data[[first, later, second - 1, second, second + 1]]
     view, seen, before, near, after = (
         gaussian_filter(image.astype(np.float64), _SMOOTH, mode="nearest") for image in bin_views(beside, side)
     )

@@ -41,7 +41,9 @@ class Distortion:
     def __post_init__(self) -> None:
         values = np.array([self.col, self.row, *self.factors])
         if not (self.factors and np.isfinite(values).all() and self.factors[0] > 0):
-            raise ValueError(f"expected a centre and finite factors, the first above 0, got {values.tolist()}")
+            raise ValueError(
+                f"the distortion needs a centre and finite factors, the first above 0, got {values.tolist()}"
+            )
 
     @classmethod
     def parse(cls, text: str) -> Distortion:

@@ -1,4 +1,4 @@
-"""find_tilt: how far the rotation axis leans in the detector's plane, from its column in bands of rows."""
+"""find_tilt: the in-plane tilt of the rotation axis, from the column of the axis in bands of rows."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from recon.prep.axis_wedge import FEWEST_BANDS, FEWEST_COLS, wedge_curves
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-STEEPEST = math.radians(5)  # Largest tilt of the search, radians
-_DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
+STEEPEST = math.radians(5)  # largest tilt of the search, radians
+_DEEP = 0.2  # least difference in the logarithm of the mismatch between the found axes and typical ones
 _FLOOR = 1e-3  # least mismatch that counts
-_SIGMAS = 1.4826  # standard deviation over the median distance, of normal errors
-_OWN = 6  # px from the line, within which a band has its own axis
+_SIGMAS = 1.4826  # ratio of standard deviation to median distance for normal errors
+_OWN = 6  # px; the axis of a single band is searched within this distance from the line
 
 
 @dataclass(frozen=True)
 class TiltEstimate:
-    """Estimate of the tilt.
+    """Estimate of the in-plane tilt of the rotation axis.
 
     Attributes:
-        tilt: radians; the axis' column grows by tan(tilt) a row (`Geometry` calls it roll).
+        tilt: radians; the column of the axis grows by tan(tilt) per row (`Geometry` calls it roll).
         uncertainty: radians, one standard deviation.
         axis_col: column of the axis at height 0.
     """
@@ -40,47 +40,48 @@ class TiltEstimate:
 
 
 def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEstimate:
-    """The straight line through the axes of bands of rows with the least sum of the logarithms of their mismatches.
+    """The tilt, from the straight line through the axes of bands of rows with the smallest sum of log mismatches.
 
-    The mismatch of a band with an axis comes from the double wedge. If that fails and the views cover the full turn, it
-    comes from opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band with unknown noise: a
-    band that fits badly with any axis, such as air or a clipped row, weighs little. The uncertainty has two parts. One
-    is the jackknife over bands, or over groups of neighbours (which see the same sample) if that is larger (Efron &
-    Stein 1981, Ann. Stat. 9, 586). The other is the scatter of the bands' own axes about the line, as the jackknife is
-    too small if few bands carry the estimate.
+    The mismatch of a band with an axis comes from the double wedge. If that fails and the scan covers 360°, it comes
+    from opposite projections (see `recon.prep.align`). Its logarithm is the likelihood of a band with unknown noise. So
+    a band that fits badly with any axis, such as air or a clipped row, has little influence. The uncertainty has two
+    parts. One is the jackknife over bands, or over groups of neighbouring bands (which see the same sample) if that is
+    larger (Efron & Stein 1981, Ann. Stat. 9, 586). The other is the scatter of the bands' own axes about the line,
+    because the jackknife is too small if few bands determine the estimate.
 
-    A tilt also turns the views: rows mix by tilt times half the width. The estimate is exact if that is small, and
-    better on views levelled by a first estimate.
+    A tilt also rotates the projections, so that rows mix by tilt times half the width. The estimate is exact if that is
+    small. It is better on projections that were corrected with a first estimate.
 
     Args:
         bands: [view, band, col], line integrals of thin bands of rows.
-        heights: [band], px of the bands' middles from the row of `axis_col`.
+        heights: [band], px from the row of `axis_col` to the middle of each band.
         angles: [view], radians.
 
     Raises:
-        ValueError: fewer than 4 bands or 8 columns, or bands that do not show the axis.
+        ValueError: there are fewer than 4 bands or 8 columns, or the bands do not show the axis.
     """
     data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
     if data.shape[2] < FEWEST_COLS:
-        raise ValueError(f"{data.shape[2]} columns are too few to show the axis; at least {FEWEST_COLS} are needed")
+        raise ValueError(f"{data.shape[2]} columns are too few to find the axis; at least {FEWEST_COLS} are needed")
     if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
         raise ValueError(
-            f"{len(heights)} bands of rows are too few; at least {FEWEST_BANDS} at different heights are needed"
+            f"{len(heights)} bands of rows are too few to measure the tilt; at least {FEWEST_BANDS} at different "
+            "heights are needed"
         )
     for curves_of in (wedge_curves, opposite_curves):
         with suppress(ValueError):
             return line_through(*curves_of(data, np.asarray(angles, np.float64)), heights)
     raise ValueError(
-        f"the axes of {len(heights)} bands of rows lie on no line within {math.degrees(STEEPEST):g} degrees, or the "
-        "views do not go round half a turn"
+        f"found no tilt: the axes of {len(heights)} bands of rows are not on one line within "
+        f"{math.degrees(STEEPEST):g} degrees, or the projections are not evenly spread over 180°"
     )
 
 
 def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
-    """The line through the axes of bands, from their mismatch [band, candidate], as for `find_tilt`.
+    """The line through the axes of bands, from their mismatch [band, candidate], as in `find_tilt`.
 
     Raises:
-        ValueError: it has no clear optimum.
+        ValueError: there is no clear optimum.
     """
     step, far = float(candidates[1] - candidates[0]), float(np.abs(heights).max())
     most = math.ceil(math.tan(STEEPEST) * far / step)
@@ -90,33 +91,33 @@ def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     for slope in range(-most, most + 1):
         shifts = np.rint(slope * heights / far).astype(int) + most
         total = sum(curve[shift : shift + n] for curve, shift in zip(padded, shifts, strict=True))
-        at = int(np.argmin(total))
-        if total[at] < lowest:
-            best, lowest = (slope, at), float(total[at])
-    slope, at = best
+        index = int(np.argmin(total))
+        if total[index] < lowest:
+            best, lowest = (slope, index), float(total[index])
+    slope, index = best
     typical = float(np.median(np.log(curves).sum(axis=0)))
-    if abs(slope) == most or not 0 < at < n - 1 or typical - lowest < _DEEP * heights.size:
+    if abs(slope) == most or not 0 < index < n - 1 or typical - lowest < _DEEP * heights.size:
         raise ValueError("no clear optimum")
-    from scipy.interpolate import CubicSpline  # half a second
+    from scipy.interpolate import CubicSpline  # loading takes half a second
 
     splines = [CubicSpline(candidates, np.log(curve)) for curve in curves]
-    every, start = np.arange(heights.size), np.array([candidates[at], slope * step / far])
+    every, start = np.arange(heights.size), np.array([candidates[index], slope * step / far])
     line = _best_line(splines, heights, every, start)
     variances = []
     for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
         parts = np.array_split(every, count)
         slopes = [_best_line(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts]
         variances.append((count - 1) * np.var(slopes))
-    at = line[0] + line[1] * heights
-    near = np.clip(at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
-    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - at
+    index = line[0] + line[1] * heights
+    near = np.clip(index[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
+    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - index
     scatter = float(np.median(np.abs(own))) * _SIGMAS / math.sqrt(float(((heights - heights.mean()) ** 2).sum()))
     uncertainty = math.hypot(math.sqrt(max(variances)), scatter)
     return TiltEstimate(math.atan(line[1]), uncertainty / (1 + line[1] ** 2), float(line[0]))
 
 
 def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
-    """(axis at height 0, slope) of the least sum of logarithms of some bands, near `start`."""
+    """(axis at height 0, slope) with the smallest sum of log mismatches of some bands, near `start`."""
     from scipy.optimize import minimize
 
     def total(line: F64) -> float:
@@ -130,19 +131,19 @@ def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64
 
 
 def roll_of_mean_view(mean: F64, axis_col: float) -> tuple[float, float]:
-    """The lean of the axis in the detector's plane, by the mean view of a full turn, and its standard deviation.
+    """The in-plane tilt of the axis from the mean projection of a 360° scan, and its standard deviation.
 
-    That is the view of the sample turned into a body of revolution, so that its halves beside the axis are mirror
-    images, in a cone as in a parallel beam. A lean turns it, a wrong axis moves it, a detector that faces the beam
-    askew or light that slopes across it skew it: the difference of the halves is fitted by all of these. The deviation
-    is the jackknife over bands of rows.
+    The mean projection is that of a body of revolution, so its left and right halves are mirror images, in a cone and
+    in a parallel beam. A tilt rotates it, and a wrong axis shifts it. A detector that is not perpendicular to the beam,
+    or an intensity gradient, skews it. All of these effects are fitted to the difference of the halves. The standard
+    deviation is from the jackknife over bands of rows.
 
     Args:
         mean: float64 [row, col], line integrals.
-        axis_col: about which the halves are compared; it may be off by a pixel or two.
+        axis_col: column about which the halves are compared; it may be wrong by a pixel or two.
 
     Returns:
-        Radians, as `Geometry.roll`; NaN where the field has no two halves.
+        Radians, as `Geometry.roll`; NaN if the field of view does not contain both halves.
     """
     rows, cols = mean.shape
     reach = int(min(axis_col, cols - 1 - axis_col))

@@ -1,9 +1,10 @@
-"""Unmeasured pixels: which pixels of a view measured nothing, by its values; and whether the sample took their light.
+"""Pixels without data: finds the pixels of a projection that measured nothing, as opposed to a dark sample.
 
-Three kinds: what is not finite; what a shift or a turn of the image moved in, which has one value and holds a corner of
-the frame; and something opaque that is not the sample, such as the post of a load frame, and reaches a border. Metal in
-the sample is as dark. But it stays within the field, so that each row shows it in all views, or holds the same mass
-where a view looks along it: a post comes and goes, and brings mass.
+There are three kinds: pixels that are not finite; pixels that a shift or rotation of the image moved in, which have one
+value and include a corner of the frame; and an opaque object that is not the sample, such as the post of a load frame,
+and that reaches a border. Metal in the sample is equally dark, but it stays within the field of view. So each row shows
+it in all projections, or has the same total absorption in projections along it. A post comes and goes, and adds
+absorption.
 """
 
 from __future__ import annotations
@@ -19,26 +20,28 @@ from recon.base.masks import areas, fill, plan_fill
 
 NO_RUNS = np.zeros((0, 4), np.int64)
 NO_RUNS.flags.writeable = False
-DARK = 0.01  # transmission, below which a pixel has no light that counts
+DARK = 0.01  # transmission below which a pixel counts as dark
 _BLOCK = np.ones((3, 3), np.bool_)
-_RIM, _BEYOND = 4, 3  # pixels beside an area that interpolation or blur reach at most, and those that tell whether
-_ALTERED, _SURE = 0.02, 3.0  # of the light, and standard errors, by which a rim differs from what lies beyond it
-_FEWEST = 3  # dark pixels, at a border and in an area
-_ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
-_BELOW = 3.0  # standard deviations below the dark, as no camera reads
-_CLEARLY = 0.5  # of the mass that comes and goes, so much may be left without the post
+# largest reach of interpolation or blur next to an area, in pixels; pixels beyond it for comparison
+_RIM, _BEYOND = 4, 3
+# a rim differs from the pixels beyond it by this share of the intensity and this many standard errors
+_ALTERED, _SURE = 0.02, 3.0
+_FEWEST = 3  # fewest dark pixels, at a border and in an area
+_ONE_VALUE = 0.9  # share of the pixels of an area that must be dark, and must have one value if they are not noise
+_BELOW = 3.0  # standard deviations below the dark; no camera gives such values
+_CLEARLY = 0.5  # share of the changing absorption that may remain without the post
 
 
 def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: Mask | None) -> Mask | None:
-    """Which pixels [row, col] of a view measured nothing; None: all did, or none.
+    """Mask [row, col] of the pixels of a projection without data; None: no pixel, or all pixels.
 
     Args:
-        values: as stored.
+        values: pixel values as stored.
         light: transmission; NaN: not finite.
-        hidden: areas that are masked in all views.
-        foreign: bool [row], rows in which what is dark is not the sample, see `foreign_rows`; None: none.
+        hidden: areas that are masked in all projections.
+        foreign: bool [row], rows in which dark pixels are not the sample, see `foreign_rows`; None: no such rows.
     """
-    if light.min() > DARK:  # never of NaN
+    if light.min() > DARK:  # false for NaN
         return None
     low = ~(light > DARK)
     unknown = low & ~np.isfinite(light) & ~hidden
@@ -63,11 +66,11 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
 
 
 def with_rim(dark: Mask, light: F32) -> Mask:
-    """Dark areas [row, col], and on each of their four sides the pixels beside them whose light is not their own.
+    """Dark areas [row, col], extended on their four sides by the pixels whose intensity is mixed with the dark area.
 
-    Blur, or interpolation by a shift, mixes the light of an edge: the pixels next to it on this side differ, in the
-    median, from a straight line through the logarithms of the next three, and so on outwards. Rows that are not read,
-    or a shift by whole pixels, leave the next pixel as it was.
+    Blur, or interpolation in a shift, mixes the intensities at an edge. The median of the pixels next to the edge then
+    differs from a straight line through the logarithms of the next three pixels; this test continues outwards. If rows
+    were not read, or the shift is by whole pixels, the next pixel is not affected.
 
     Args:
         light: transmission [row, col]; NaN: unknown.
@@ -85,7 +88,7 @@ def with_rim(dark: Mask, light: F32) -> Mask:
 
 
 def _mixed(lines: F64) -> bool:
-    """Whether the first of adjacent pixels [edge, pixel] lacks the light that the others extrapolate to; logarithms."""
+    """Whether the first of adjacent pixels [edge, pixel] is darker than the others extrapolate to (logarithms)."""
     lines = lines[np.isfinite(lines).all(axis=1)]
     if not len(lines):
         return True
@@ -97,11 +100,11 @@ def _mixed(lines: F64) -> bool:
 
 
 def foreign_rows(light: F32, angles: F64) -> Mask:
-    """Rows [row] whose dark areas at borders come and go, and bring more matter than the other views show there.
+    """Rows [row] whose dark areas at borders come and go, and add more absorption than the other projections show.
 
     Args:
-        light: transmission [view, row, col], finite, of views all around.
-        angles: of these, radians.
+        light: transmission [view, row, col], finite, of projections from all directions.
+        angles: their angles in radians.
     """
     lit = (light > DARK).any(axis=(1, 2))
     light, angles = light[lit], angles[lit]
@@ -128,7 +131,7 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
 
 
 def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
-    """An image of counts whose areas of exact zeros at its corners have the value of the nearest pixel beside them."""
+    """An image of counts in which areas of exact zeros at the corners get the value of the nearest other pixel."""
     if (_corners(image) != 0).all():
         return image
     labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
@@ -138,19 +141,20 @@ def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def runs_of(mask: Mask, view: int) -> I64:
-    """Runs [run, 4] of the pixels [row, col] of a view: its number, row, first column, column after the last."""
+    """Runs [run, 4] of masked pixels: number of the projection, row, first column, column after the last."""
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, first), end = np.nonzero(edges > 0), np.nonzero(edges < 0)[1]
     return np.stack([np.full(row.size, view), row, first, end], axis=1).astype(np.int64)
 
 
 def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
-    """Areas [row, col] of dark pixels that reach a border of the frame, or what is hidden there, by number; 0: none."""
+    """Numbered areas [row, col] of dark pixels that reach a border of the frame or a hidden area there; 0: no area."""
     if sum(np.count_nonzero(side) for side in (low[0], low[-1], low[:, 0], low[:, -1])) < _FEWEST:
         return np.zeros(low.shape, np.int32)
-    dark = np.pad(low | hidden, 3, mode="edge")  # the outer layer goes in closing
+    dark = np.pad(low | hidden, 3, mode="edge")  # closing removes the outer layer
     solid = ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3]
-    labels, n = ndimage.label(solid | (low & (low.mean(axis=1) > _ONE_VALUE)[:, None]), _BLOCK)  # also single rows
+    # single rows count, too
+    labels, n = ndimage.label(solid | (low & (low.mean(axis=1) > _ONE_VALUE)[:, None]), _BLOCK)
     at_border = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
     large = np.bincount(labels[low & ~hidden], minlength=n + 1) >= _FEWEST
     return np.where(np.isin(labels, at_border[at_border > 0]) & large[labels], labels, 0)

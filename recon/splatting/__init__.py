@@ -1,1 +1,1 @@
-"""R²-Gaussian: a volume as a sum of Gaussians, fitted to the views."""
+"""R²-Gaussian: reconstruction of a volume as a sum of Gaussians that is fitted to the projections."""

@@ -1,9 +1,9 @@
-"""Anytime: rates and mean of a fit with an unknown number of steps.
+"""Anytime: learning rates and running mean of a fit whose number of steps is not known in advance.
 
-The rates fall as 1 / (1 + t / 60) with the steps t, and the model is the mean of the parameters over the last quarter
-of them. A step uses one or two views, so at a high rate the parameters wander about the optimum of all views. Their
-mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit whose rates
-were planned to end there.
+After t steps, the rates are reduced by the factor 1 / (1 + t / 60). The model is the mean of the parameters over the
+last quarter of the steps. A step uses one or two projections, so at a high rate the parameters fluctuate around the
+optimum for all projections. Their mean does not (Polyak & Juditsky 1992). After any number of steps, the mean is about
+as good as a fit whose rates were planned to end there.
 """
 
 from __future__ import annotations
@@ -28,39 +28,42 @@ from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector
 
-HALF = 60.0  # steps after which the rates are half of the first ones
-_WINDOW = 0.25  # share of the steps over which the mean is taken
+HALF = 60.0  # number of steps after which the rates are half of the first ones
+_WINDOW = 0.25  # share of the steps over which the mean is computed
 _EVERY = 4  # steps between two terms of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
-"""The rates of a fit to all views, with a lower end; density control in every round, within the round's limit."""
+"""Settings of a fit during a scan: the rates of a fit to all projections, with lower final rates.
+
+Density control runs in every round, up to the limit of the round.
+"""
 
 
 def while_views_come(settings: FitSettings) -> FitSettings:
-    """The same settings with the caller's where these differ from the defaults."""
+    """`WHILE_VIEWS_COME` with those of the caller's settings that differ from the defaults."""
     usual = FitSettings()
     chosen = {
         f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
     }
-    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # the number of steps to come is not known
+    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # the number of future steps is not known
         chosen["policy"] = replace(policy, start=0.0, stop=2.0)
     return replace(WHILE_VIEWS_COME, **chosen)
 
 
 def fallen(steps: int, settings: FitSettings) -> float:
-    """Fraction, 0..1, of the logarithmic decay of the rates that is done after `steps` steps.
+    """Fraction, 0 to 1, of the logarithmic decay of the rates after `steps` steps.
 
-    Rates that are lower from the start fall as much later.
+    If the first rates are lower, their decay starts correspondingly later.
     """
     half = HALF * WHILE_VIEWS_COME.pace / settings.pace
     return min(1.0, math.log1p(steps / half) / max(-math.log(settings.decay), 1e-9))
 
 
 def average(state: FitState, since: int) -> None:
-    """Include the parameters in their running mean, at every fourth step; the first ones start it.
+    """Add the parameters to their running mean at every fourth step; the first parameters start the mean.
 
     Args:
-        since: the step that the last quarter is counted from.
+        since: the step from which the last quarter is counted.
     """
     if state.step % _EVERY:
         return
@@ -78,30 +81,34 @@ def averaged(state: FitState) -> FitState:
     return state if state.mean is None else replace(state, parameters=state.mean)
 
 
-_NEWEST = 0.2  # this share of the views counts as the newest
-_ONE_IN = 16  # of so many views one is held out until the last round
+_NEWEST = 0.2  # share of the projections that count as the newest
+_ONE_IN = 16  # one in this many projections is held out until the final fit
 
 
 def checked_views(data: ArrayLike, angles: NDArray[np.float64], detector_shape: tuple[int, int]) -> F32:
-    """A copy of new line integrals [view, row, col] as float32; NaN: a pixel measured nothing.
+    """A copy of new line integrals [view, row, col] as float32; NaN marks pixels without data.
 
     Raises:
-        ValueError: shapes that disagree, infinite values, a view of NaN alone, or angles [view] that are not finite.
+        ValueError: the shapes do not match, values are infinite, a projection is all NaN, or an angle is not finite.
     """
     expected = (angles.size, *detector_shape)
     if angles.ndim != 1 or np.shape(data) != expected:
         raise ValueError(f"{angles.size} angles need projections of shape {expected}, got {np.shape(data)}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
+    with np.errstate(over="ignore"):  # values too large for float32 count as not finite
         images = np.array(data, np.float32)
     if np.isinf(images).any() or np.isnan(images).all(axis=(1, 2)).any() or not np.isfinite(angles).all():
-        raise ValueError("new views hold infinite values or nothing but NaN, or angles not finite; nothing was changed")
+        raise ValueError(
+            "the new projections were not added: they contain infinite values, or nothing but NaN, or an angle is "
+            "not finite"
+        )
     return images
 
 
 def next_view(n_views: int, rng: np.random.Generator) -> int | None:
-    """The view of the next step: one of the newest in every third step, else any in turn (None).
+    """The projection for the next step: in every third step one of the newest, otherwise None (any, in turn).
 
-    New views must be learnt and old ones not forgotten (the rule of on-the-fly mapping; Meuleman et al. 2025).
+    The fit must learn new projections without forgetting old ones (the rule of on-the-fly mapping; Meuleman et al.
+    2025).
     """
     newest = max(1, int(n_views * _NEWEST))
     if newest >= n_views or rng.random() >= 1 / 3:
@@ -110,33 +117,33 @@ def next_view(n_views: int, rng: np.random.Generator) -> int | None:
 
 
 def is_held_out(view: int) -> bool:
-    """Whether the view of this number is held out until the last round, to assess the volumes so far."""
+    """Whether the projection with this number is held out until the final fit, to assess the volumes before it."""
     return view % _ONE_IN == _ONE_IN // 2
 
 
 def covered_angle(theta: NDArray[np.float64]) -> float:
-    """The angle that views cover, modulo π: π minus the widest gap."""
+    """The angle in radians that projections cover, modulo π: π minus the widest gap."""
     ordered = np.sort(np.mod(theta, np.pi))
     return float(np.pi - np.diff(ordered, append=ordered[0] + np.pi).max())
 
 
 def shift_with_axis(theta: NDArray[np.float64], moved: float) -> NDArray[np.float32]:
-    """The shift (x, y) of all points that best matches a shift of the axis by `moved` in the views at `theta`.
+    """The shift (x, y) of all points that best corresponds to a shift of the axis by `moved`, for angles `theta`.
 
-    With an axis off by d a point appears at x cos θ + y sin θ + d. The shift (a, b) makes a cos θ + b sin θ nearest to
-    d: (0, 4 d / π) for evenly spread views.
+    If the axis is wrong by d, a point appears at x cos θ + y sin θ + d. The shift (a, b) is the one for which a cos θ +
+    b sin θ is nearest to d: (0, 4 d / π) for evenly spread projections.
     """
     across = np.stack((np.cos(theta), np.sin(theta)), 1)
     return np.linalg.lstsq(across, np.full(theta.size, moved), rcond=None)[0].astype(np.float32)
 
 
-_ROWS = 8  # that are compared
-_VIEWS = 400  # of an FBP, at most; of more, some are left out evenly by angle
-_COMPARED = 4  # views held out, the last ones
+_ROWS = 8  # number of rows that are compared
+_VIEWS = 400  # largest number of projections of an FBP; of more, some are left out, evenly in angle
+_COMPARED = 4  # number of held-out projections that are compared, the last ones
 
 
 def volume_error(rendered: F32, measured: F32) -> float:
-    """The error of a volume along the rays of views [..., col], relative to the measured: √Σ|ω||F Δ|² over it."""
+    """The relative error of a volume in projections [..., col]: √Σ|ω||F Δ|², divided by that of the measured ones."""
     n = 2 * measured.shape[-1]
     ramp = np.arange(n // 2 + 1)
 
@@ -147,17 +154,18 @@ def volume_error(rendered: F32, measured: F32) -> float:
 
 
 def direct_volume(images: Sequence[F32], geometry: Geometry, grid: Grid) -> F32:
-    """FBP of at most 400 of the views [row, col], without what is below zero, float32 [z, y, x]."""
+    """FBP of at most 400 of the projections [row, col], with negative values set to zero, float32 [z, y, x]."""
     some = spread_views(geometry.angles, _VIEWS, np.arange(len(images)))
     return np.maximum(fbp(np.stack([images[i] for i in some]), geometry.select(some), grid, "hann"), 0)
 
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """The `volume_error` of the fit and of FBP in held-out views of a growing scan and as many others; NaN: unknown.
+    """The `volume_error` of the fit and of FBP during a scan, in held-out and in as many other projections.
 
-    A volume's error is least at the angles of views and largest in the gaps. A view held out alone shows a gap that is
-    twice as wide as the others, which FBP bears worse than a fit.
+    NaN: unknown. The error of a volume is smallest at the angles of the projections and largest in the gaps between
+        them. A held-out projection makes a gap that is twice as wide as the others, which is worse for FBP than for a
+        fit.
     """
 
     fit: float = math.nan
@@ -167,13 +175,13 @@ class PredictionErrors:
     def of(
         cls, images: Sequence[F32], geometry: Geometry, held_out: Sequence[int], render: Callable[[int], F32]
     ) -> Self:
-        """Errors in the last held-out views and those before them; FBP uses all views that are not held out.
+        """Errors in the last held-out projections and in those before them; FBP uses all that are not held out.
 
-        NaN where none is, or the beam is not one of FBP's slices.
+        NaN if none is held out, or if a detector row does not show one slice (FBP is then not compared).
 
         Args:
-            images: [row, col] of each view of the geometry.
-            render: the fit's own of a view.
+            images: [row, col] for each projection of the geometry.
+            render: function that returns the fit's projection with a given number.
         """
         if not held_out or not geometry.rows_show_slices:
             return cls()
@@ -190,7 +198,7 @@ class PredictionErrors:
 
 @dataclass(frozen=True, eq=False)
 class BetterVolume:
-    """The volume of the views so far that predicts held-out views best, 1/mm. `direct`: it is FBP's, else the fit's."""
+    """The volume so far, in 1/mm, that predicts held-out projections best; `direct`: FBP made it, not the fit."""
 
     volume: Volume
     direct: bool
@@ -200,7 +208,7 @@ class BetterVolume:
     def of(
         cls, state: FitState, problem: FitProblem, settings: FitSettings, grid: Grid, held_out: Sequence[int]
     ) -> Self:
-        """The better volume of a problem's views; the fit in this state was not fitted to the held-out ones."""
+        """The better volume for a problem; the fit in this state did not use the held-out projections."""
 
         def render(view: int) -> F32:
             return problem.backend.numpy(next(renders(state, problem, settings, [view])))

@@ -1,4 +1,4 @@
-"""Project, Voxelize: the operations of a backend as functions that torch differentiates."""
+"""Project, Voxelize: the operations of a backend as torch functions with gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from recon.splatting.backend import Backend, Cpu, Pass
 
 
 class Renderer(NamedTuple):
-    """Unit of the densities, kernel and backend for raw parameters."""
+    """Density unit, kernel and backend that belong to raw parameters."""
 
     unit: float
     kernel: Kernel
@@ -23,16 +23,14 @@ class Renderer(NamedTuple):
 
 
 class Project(torch.autograd.Function):
-    """Projection of raw parameters on a backend. The backward pass renders each view again, and stores no table of
-    it."""
+    """Projection of raw parameters on a backend. The backward pass renders each projection again, to save memory."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer,
         geometry: Geometry, how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
-        """Images [view, row, col]; `how` has the faintness limit, the truncation in standard deviations, and the
-        rays."""
+        """Images [view, row, col]; `how`: faintness limit, truncation in standard deviations, and ray model."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = renderer, geometry, how
         run = _begin((means, log_scales, quaternions, raw), renderer)
@@ -58,7 +56,7 @@ class Voxelize(torch.autograd.Function):
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer, grid: Grid,
         how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
-        """Density [z, y, x]; `how` has the faintness limit, and the truncation in standard deviations."""
+        """Density [z, y, x]; `how`: faintness limit, and truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = renderer, grid, how
         run = _begin((means, log_scales, quaternions, raw), renderer)
@@ -78,6 +76,6 @@ def _begin(parameters: Sequence[Tensor], renderer: Renderer) -> Pass[Any]:
 
 
 def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
-    """The values as an array of the backend, without a copy where they are contiguous."""
+    """The values as an array of the backend, without a copy if they are contiguous."""
     values = tensor.detach().contiguous()
     return values.numpy() if isinstance(backend, Cpu) else values

@@ -1,7 +1,8 @@
-"""Backend: the operations of a fit's step as one Protocol, with an implementation for the CPU and one for a GPU.
+"""Backend: the operations of a fitting step as a Protocol, with implementations for CPU and GPU.
 
-Arrays are numpy arrays on the CPU and torch tensors on a GPU; a fit passes them from one operation to the next without
-reading them. Losses are values that `float` converts: on a GPU that waits for the device, so convert them rarely.
+Arrays are numpy arrays on the CPU and torch tensors on a GPU. A fit passes them from one operation to the next without
+reading them. Losses can be converted with `float`. On a GPU the conversion waits for the device, so convert them
+rarely.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ Array = TypeVar("Array")
 
 
 class SplatView(Protocol[Array]):
-    """One rendered view and its backward pass."""
+    """One rendered projection and its backward pass."""
 
     @property
     def image(self) -> Array:
         """[row, col]."""
 
     def backward(self, gradient: Array) -> Array:
-        """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+        """Back-propagate an image gradient [row, col]; returns the gradient with respect to centres [n, 2] in 1/px."""
 
 
 class VoxelBox(Protocol[Array]):
@@ -44,39 +45,39 @@ class VoxelBox(Protocol[Array]):
     density: Array
 
     def backward(self, gradient: Array, *, means_too: bool = True) -> None:
-        """Back-propagate a gradient [z, y, x]; `means_too=False` leaves positions out."""
+        """Back-propagate a gradient [z, y, x]; `means_too=False`: not to positions."""
 
 
 class Pass(Protocol[Array]):
-    """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
+    """One pass over a model: physical parameters, and the sum of gradients from its projections and voxel boxes."""
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> SplatView[Array]:
-        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ.
+        """Render one projection. Footprints end below `faint` (units of the image), and at the latest after `cut` σ.
 
-        A view must have run `backward` before the next one is rendered: they share memory.
+        Call `backward` of a projection before the next one is rendered, because they share memory.
         """
 
     def box(self, grid: Grid, faint: float, cut: float) -> VoxelBox[Array]:
         """Voxelise on a grid; `faint` is a density."""
 
     def gradients(self) -> tuple[Array, Array, Array, Array]:
-        """Gradients on means, log scales, quaternions and raw densities."""
+        """Gradients with respect to means, log scales, quaternions and raw densities."""
 
 
 class ProjectionLoss(Protocol[Array]):
     """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `recon.kernels.cpu.losses`."""
 
     def target_maps(self, target: Array, weights: Array | None = None) -> Array:
-        """The maps that are computed once for each target [row, col]."""
+        """The maps of a target [row, col] that are computed only once."""
 
     def __call__(
         self, image: Array, target: Array, target_maps: Array, weights: Array | None = None
     ) -> tuple[SupportsFloat, Array]:
-        """The loss and its gradient [row, col], which the next call overwrites."""
+        """The loss and its gradient [row, col]; the next call overwrites the gradient."""
 
 
 class Backend(Protocol[Array]):
-    """The operations of a fit's step on one device."""
+    """The operations of a fitting step on one device."""
 
     def array(self, values: F32) -> Array:
         """A copy on the device."""
@@ -93,7 +94,7 @@ class Backend(Protocol[Array]):
     def projection_loss(
         self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
     ) -> ProjectionLoss[Array]:
-        """The loss on images of one shape."""
+        """The loss for images of one shape."""
 
     def misfit(self, image: Array, target: Array, weights: Array | None) -> SupportsFloat:
         """||w (image - target)|| / ||w target||; 0 for a target of zeros."""
@@ -114,36 +115,36 @@ class Backend(Protocol[Array]):
         step: int,
         bounds: Sequence[tuple[float, float] | None],
     ) -> None:
-        """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
+        """Update the four parameter arrays and their moments in place, within bounds; steps count from 1."""
 
     def unit_quaternions(self, quaternions: Array, first: Array, second: Array) -> None:
-        """Quaternions [n, 4] of length 1 that turn as before, with Adam's moments in their measure, in place.
+        """Normalise quaternions [n, 4] to length 1 in place, and rescale Adam's moments accordingly.
 
-        Quaternions without a direction stay as they are.
+        Quaternions of length zero are not changed.
         """
 
     def taken(self, array: Array, origin: NDArray[np.int64]) -> Array:
-        """The rows `origin` of an array, zeros for -1."""
+        """The rows `origin` of an array; zeros for -1."""
 
     def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> FusedStep | None:
-        """Whole steps without the host in between; None where the step is made operation by operation.
+        """Complete steps on the device without the host; None if steps are made operation by operation.
 
-        `earlier`: those of the fit before, of another model or plan.
+        `earlier`: the previous fused step, for another model or plan.
         """
 
 
 def backend_for(device: str) -> Backend[Any]:
-    """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" where that is its number).
+    """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" if it has this number).
 
     Raises:
         ImportError: triton is not installed.
         RuntimeError: torch sees no CUDA device.
-        ValueError: another kind of device, or a CUDA device that is missing or not the current one.
+        ValueError: it is another kind of device, or a CUDA device that is missing or not the current one.
     """
     refuse_unknown_device(device)
     if device == "cpu":
         return Cpu()
-    Gpu: Any = loaded("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
+    Gpu: Any = loaded("recon.kernels.gpu.engine").Gpu  # imported here, because it loads triton, which only a GPU needs
 
     return Gpu(device)
 
@@ -181,7 +182,7 @@ class Cpu:
         return None
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
-        """Scratch buffers for a view of n Gaussians; the last ones are reused if they fit."""
+        """Scratch buffers for one projection of n Gaussians; the last ones are reused if they have the right size."""
         if self._scratch is None or self._scratch[0] != (n, detector_shape):
             self._scratch = ((n, detector_shape), Scratch.of(n, detector_shape))
         return self._scratch[1]
@@ -203,7 +204,7 @@ class Cpu:
 
 
 class CpuPass:
-    """A pass with the numba kernels."""
+    """A `Pass` with the numba kernels."""
 
     def __init__(self, backend: Cpu, active: Active, quaternions: F32, raw: F32, unit: float) -> None:
         self._backend, self.active, self._raw, self._unit = backend, active, (quaternions, raw), unit
@@ -221,7 +222,7 @@ class CpuPass:
 
 
 class CpuBox:
-    """A box of voxels with the numba kernels."""
+    """A `VoxelBox` with the numba kernels."""
 
     def __init__(self, run: CpuPass, grid: Grid, faint: float, cut: float) -> None:
         self._into, self._layout = run.into, grid_layout(run.active, grid, faint, cut)

@@ -1,4 +1,4 @@
-"""Checkpoint of a fit: its complete state as plain arrays, restored to the bit. Nothing is pickled."""
+"""Checkpoint of a fit: its complete state as plain arrays, restored bit for bit. Nothing is pickled."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from recon.splatting.settings import NAMES, FitSettings
 _GROUPS = ("parameters", "first", "second")
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
-_WORDS = 4  # 64-bit words: state and increment of PCG64
+_WORDS = 4  # 64-bit words for state and increment of PCG64
 
 
 def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str, NDArray[Any]]:
     """The complete state of a fit, as arrays by name.
 
     Raises:
-        ValueError: for a random generator other than numpy's default, PCG64.
+        ValueError: the random generator is not numpy's default, PCG64.
     """
     settle(state)
     device = backend or Cpu()
@@ -40,7 +40,9 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
     arrays["drawn"] = np.array(state.drawn, np.int64)
     generator = state.rng.bit_generator.state
     if generator["bit_generator"] != "PCG64":
-        raise ValueError(f"a checkpoint holds the state of PCG64, not of {generator['bit_generator']}")
+        raise ValueError(
+            f"a checkpoint must hold the state of the random generator PCG64, not of {generator['bit_generator']}"
+        )
     inner = generator["state"]
     words = [inner[key] >> shift & (2**64 - 1) for key in ("state", "inc") for shift in (0, 64)]
     arrays["generator"] = np.array([*words, generator["has_uint32"], generator["uinteger"]], np.uint64)
@@ -51,7 +53,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
 
     Raises:
-        ValueError: arrays are missing, disagree in length, or hold values that are not finite.
+        ValueError: arrays are missing, have different lengths, or contain values that are not finite.
     """
     _refuse_damaged(arrays)
     device = backend or Cpu()
@@ -74,12 +76,12 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
 
 
 def _refuse_damaged(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise ValueError as `state_from`."""
+    """Raise ValueError if the arrays are not a valid checkpoint, see `state_from`."""
     wanted = [f"{group}.{name}" for group in _GROUPS for name in NAMES]
     others = ("statistic", "counts", "scalars", "kernel_exponent", "drawn", "generator")
     missing = [key for key in (*wanted, *others) if key not in arrays]
     if missing:
-        raise ValueError(f"this is not a checkpoint of a fit: {missing} are missing")
+        raise ValueError(f"this is not the checkpoint of a fit: {missing} are missing")
     n = len(arrays["parameters.raw"])
     widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
     shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}
@@ -95,15 +97,15 @@ def _refuse_damaged(arrays: Mapping[str, NDArray[Any]]) -> None:
             raise ValueError(f"{key} of the checkpoint has shape {np.shape(arrays[key])}, expected {shape}")
     for key in wanted:
         if not np.isfinite(arrays[key]).all():
-            raise ValueError(f"{key} of the checkpoint holds values that are not finite")
+            raise ValueError(f"{key} of the checkpoint contains values that are not finite")
 
 
-_BEST = "best."  # names of the best model's arrays in a checkpoint begin so
+_BEST = "best."  # prefix of the names of the best model's arrays in a checkpoint
 
 
 @dataclass(eq=False)
 class HeldOutTracker:
-    """Tracks the residual of held-out views, and keeps the model with the lowest one."""
+    """Tracks the residual in held-out projections, and keeps the model with the lowest one."""
 
     problem: FitProblem | None
     settings: FitSettings
@@ -116,7 +118,7 @@ class HeldOutTracker:
     def over(
         cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
     ) -> HeldOutTracker:
-        """A tracker for a fit at `step`, or the tracker of a checkpoint."""
+        """A new tracker for a fit at `step`, or the one from a checkpoint."""
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
         best, best_step = resume["watch"]

@@ -1,4 +1,4 @@
-"""Fit: the kind of methods that fit Gaussians, whose volume can grow while views arrive."""
+"""Fit: base class of the methods that fit Gaussians; they can also reconstruct during a scan."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 from recon.base.method_kinds import Iterative
 
-if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
+if TYPE_CHECKING:  # a check whether a method is a fit must not load these modules
     from collections.abc import Mapping
 
     from recon.base.choices import Start
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
 
 
 class Fit(Iterative):
-    """A fit of Gaussians with these settings, see `R2`; its volume can grow while views arrive."""
+    """A Gaussian fit with these settings, see `R2`. It can also reconstruct during a scan."""
 
     takes: ClassVar[frozenset[str]] = frozenset({"device", "held_out", "checkpoints", "quality"})
     needs_matter: ClassVar[bool] = True
@@ -43,25 +43,25 @@ class Fit(Iterative):
     @property
     @abstractmethod
     def planned_steps(self) -> int | None:
-        """Number of steps; None if a time ends the fit."""
+        """Number of steps; None if a time limit ends the fit."""
 
     @property
     @abstractmethod
     def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
-        """All settings that determine the steps, which a resumed run must share, and more by name."""
+        """All settings that determine the steps (a resumed run must have the same ones), and further values by name."""
 
     @property
     @abstractmethod
     def finish_sweeps(self) -> int:
-        """Sweeps of total variation in the finish; 0 without a finish."""
+        """Iterations of total variation in the voxel refinement; 0: no voxel refinement."""
 
     @abstractmethod
     def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit alone, of this share of the rows, with this share of the steps."""
+        """The fit without voxel refinement, for this share of the rows, with this share of the steps."""
 
     @abstractmethod
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit that grows while views with the geometry of `template`, whose angles are ignored, arrive.
+        """A fit that takes projections during a scan, with the geometry of `template` (its angles are ignored).
 
-        `seconds` is then the time of the last round, over all views.
+        `seconds` is then the time limit of the final fit to all projections.
         """

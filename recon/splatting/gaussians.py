@@ -1,4 +1,4 @@
-"""Gaussians: a density field as a sum of anisotropic kernels, with unconstrained raw parameters."""
+"""Gaussians: a volume as a sum of anisotropic kernels, with unconstrained raw parameters."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_dens
 class Gaussians:
     """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
 
-    With another kernel f they are still called Gaussians, and S still holds standard deviations.
+    With another kernel f they are still called Gaussians, and S still contains standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), of any non-zero length.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density, 1/mm; it makes raw values and their learning rates independent of the units of
-            the data.
-        kernel: their radial profile.
+        density_unit: a typical density in 1/mm. It makes raw values and their learning rates independent of the units
+            of the data.
+        kernel: radial profile.
     """
 
     means: Tensor
@@ -63,10 +63,11 @@ class Gaussians:
         density_unit: float | None = None,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> Gaussians:
-        """Gaussians at positions [n, 3] mm, with deviations [n, 3] or [n] mm and densities [n] 1/mm, all positive.
+        """Gaussians at positions [n, 3] mm, with standard deviations [n, 3] or [n] mm and densities [n] 1/mm
+        (positive).
 
         Raises:
-            ValueError: where a scale or a density is not positive and finite.
+            ValueError: a standard deviation or a density is not positive and finite.
         """
         check_arguments(cls.from_physical, locals())
         means = np.atleast_2d(np.asarray(means, np.float64))
@@ -108,7 +109,7 @@ class Gaussians:
         return replace(self, **some)
 
     def widened(self, variance: float) -> Gaussians:
-        """The same Gaussians with a larger variance (mm²) along every direction, and the same mass."""
+        """The same Gaussians with `variance` (mm²) added in every direction, and the same mass."""
         import torch
 
         if variance <= 0:
@@ -135,10 +136,10 @@ class Gaussians:
 
 
 def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaussians:
-    """Each Gaussian turned about the axis by the skew at its row; a Gaussian over many rows is not bent.
+    """Each Gaussian rotated about the axis by the skew at its row. A Gaussian over many rows is not bent.
 
     Args:
-        sense: -1: from the object's frame to that which all rows see at the angle of the first; 1: back.
+        sense: -1: from the object's frame to the frame in which all rows have the angle of the first row; 1: back.
     """
     if not geometry.skew:
         return gaussians
@@ -168,23 +169,24 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     try:
         tensor: Tensor = torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())
     except RuntimeError as error:  # "Numpy is not available"
-        raise LibraryError(f"this torch was built for another numpy: {error}", name="torch") from error
+        raise LibraryError(f"this torch was built for another version of numpy: {error}", name="torch") from error
     return tensor
 
 
-NEEDLES_LIMIT = 0.2  # Share of the mass above which a warning of needles is given, see docs/published.md
+NEEDLES_LIMIT = 0.2  # share of the mass in needle-shaped Gaussians that causes a warning, see docs/published.md
 
-_THIN, _LONG = 0.5, 10.0  # pixels of a standard deviation that views do not resolve; longest over shortest width
+# standard deviation, in pixels, that projections do not resolve; ratio of longest to shortest width
+_THIN, _LONG = 0.5, 10.0
 
 
 @dataclass(frozen=True)
 class Needles:
-    """Gaussians thinner than the views resolve.
+    """Needle-shaped Gaussians: Gaussians that are thinner than the projections resolve.
 
     Attributes:
-        thin: share of the mass in Gaussians with a width below half a pixel.
-        share: of the mass in those that are ten times as long, too.
-        aspect: median of longest over shortest width, each Gaussian counted by its mass.
+        thin: share of the mass in Gaussians that are narrower than half a pixel.
+        share: share of the mass in Gaussians that are also ten times as long as wide.
+        aspect: median ratio of longest to shortest width, weighted by mass.
     """
 
     thin: float
@@ -193,7 +195,7 @@ class Needles:
 
 
 def needles(gaussians: Gaussians, geometry: Geometry) -> Needles:
-    """Shares of the mass, density times the three widths; widths are standard deviations."""
+    """Measure the needle-shaped Gaussians. The mass is the density times the three widths (standard deviations)."""
     values = gaussians.physical()
     widths = np.sort(values["widths"].astype(np.float64), axis=1)
     mass = values["densities"] * widths.prod(axis=1)

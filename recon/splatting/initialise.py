@@ -1,4 +1,4 @@
-"""First Gaussians of a fit: drawn from a first volume, most where it changes (after Zha et al. 2024)."""
+"""First Gaussians of a fit: sampled from a first volume, mostly where it changes (after Zha et al. 2024)."""
 
 from __future__ import annotations
 
@@ -30,42 +30,47 @@ from recon.voxels.view_weights import angular_weights
 from recon.voxels.voxel_problem import density_unit, difference_weights
 
 START_SWEEPS = 10
-"""Of these sweeps; with momentum, more fit the noise. Without: not measured."""
+"""Iterations for the first volume "tv"; with momentum, more would fit the noise. The effect was not measured."""
 
 LEAST_GAUSSIANS, MOST_GAUSSIANS = 2000, 200_000
-"""Bounds of that number. Without: small fields get too few, and large ones more than 400 steps place; not measured."""
+"""Bounds of the default number of Gaussians.
+
+Without them, small fields would get too few Gaussians, and large ones more than 400 steps can place. The effect was not
+measured.
+"""
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
-MATTER = 0.05
+LEAST_DENSITY = 0.05
 
-# The published start: density of a Gaussian over that of its voxel, and its least width over the field's.
+# The published start: density of a Gaussian divided by that of its voxel; its least width divided by that of the field.
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
-SCALED_BY = 12  # views
-_SLOPE_SIGMA = 1.0  # of the Gaussian that gradients are taken under, voxels
+SCALED_BY = 12  # number of projections used to scale the densities
+_SLOPE_SIGMA = 1.0  # standard deviation, in voxels, of the Gaussian for gradients
 _LEAST_JOINED = 4  # pixels
-_MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
+_MIDDLE = 8  # slices on each side of the middle whose changes are measured
 
 
 def default_count(geometry: Geometry, voxel_size: float) -> int:
-    """Default number of Gaussians for the field of these views, see `count_for`."""
+    """Default number of Gaussians for the field of view of this geometry, see `count_for`."""
     return count_for(Grid.of_field(geometry, voxel_size), geometry.is_cone)
 
 
 def count_for(field: Grid, cone: bool) -> int:
-    """Number of Gaussians for a field: one for 60 voxels of its inscribed cylinder, from 2000 to 200 000.
+    """Number of Gaussians for a field of view: one per 60 voxels of its inscribed cylinder, from 2000 to 200 000.
 
-    Of a cone, whose field is often much larger than the sample, at most V^(2/3) for V voxels: Gaussians gather at
-    surfaces (docs/published.md).
+    For a cone, whose field is often much larger than the sample, it is at most V^(2/3) for V voxels, because Gaussians
+    gather at surfaces (docs/published.md).
     """
     return int(np.clip(_count_of(field, cone), LEAST_GAUSSIANS, MOST_GAUSSIANS))
 
 
 def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
-    """The factor by which pixels [row, col] are joined for a fit of `count` Gaussians.
+    """The factor by which pixels [row, col] are binned for a fit of `count` Gaussians.
 
-    Where there are fewer Gaussians than one for 60 voxels, each is wider, by the cube root of the ratio. Those of a
-    cone cover surfaces, and are wider by its square root. Pixels as wide show all of them. At least four rows remain.
+    If there are fewer Gaussians than one per 60 voxels, each one is wider by the cube root of the ratio. In a cone,
+    Gaussians cover surfaces and are wider by its square root. Pixels of that width show all of them. At least four rows
+    remain.
     """
     wider = (_count_of(field, cone) / count) ** (1 / 2 if cone else 1 / 3)
     return max(1, min(int(wider), detector[0] // _LEAST_JOINED, detector[1] // _LEAST_JOINED))
@@ -88,21 +93,21 @@ def place(
     rays: RayModel | None = None,
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
-    """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
+    """The starting point of a fit: Gaussians sampled from a first volume, scaled to the data [view, row, col].
 
     Args:
-        volume: see `first_volume`, of a box that holds all that the views see (`Grid.for_fit`): a fit cannot represent
-            matter outside. Its corners, outside the circle that all views see, stay empty unless the sample leaves the
-            field.
-        count: number of Gaussians; None: `default_count` of the field.
-        start: what made the volume.
+        volume: see `first_volume`. Its box must contain everything that the projections see (`Grid.for_fit`), because a
+            fit cannot represent material outside. The corners of the box, outside the circle that all projections see,
+            stay empty unless the sample is wider than the field of view.
+        count: number of Gaussians; None: the default for the field, see `default_count`.
+        start: how the volume was made.
 
     Raises:
-        ValueError: for a count below 1, and for data without matter or that are not line integrals.
+        ValueError: the count is below 1, or the data contain no material or are not line integrals.
     """
     wanted = default_count(geometry, volume.grid.voxel_size) if count is None else operator.index(count)
     if wanted < 1:
-        raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
+        raise ValueError(f"a fit needs at least one Gaussian, got {wanted}")
     radius = math.inf if wider_than_field(projections, geometry) else geometry.reach
     if start == "published":
         return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
@@ -111,10 +116,11 @@ def place(
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Projections [view, row, col] with values above ten times the largest of other views filled from neighbours.
+    """Projections [view, row, col] whose wild pixels are filled from neighbours.
 
-    One such pixel makes a streak in a first volume, and may dominate a least-squares factor. Up to a tenth of the
-    views, and at least one, may contain such pixels. A view with no other pixels is clipped.
+    A wild pixel is more than ten times the largest value of other projections. One such pixel makes a streak in a first
+    volume, and may dominate a least-squares factor. Up to a tenth of the projections, and at least one, may contain
+    wild pixels. A projection that has only wild pixels is clipped.
     """
     peaks = np.maximum(projections.max(axis=(1, 2)), -projections.min(axis=(1, 2)))
     sound = max(1, peaks.size - max(1, round(WILD_VIEWS * peaks.size)))
@@ -131,11 +137,11 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
 def first_volume(
     projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", device: str = "cpu"
 ) -> Volume:
-    """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
+    """A quick volume in 1/mm to sample Gaussians from, without the effect of wild pixels (`without_wild_pixels`).
 
-    "fbp": FBP or FDK; too short a scan of a cone for FDK gets a few sweeps of OS-SIRT with TV instead.
-    "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
-    ramp. The device is that of `direct` and of the sweeps.
+    "fbp": FBP or FDK; if a cone scan is too short for FDK, a few iterations of OS-SIRT with TV. "tv": these iterations
+    in every case, slower but without the streaks of few projections. "published": as "fbp" with the plain ramp filter.
+    `device`: for the direct method and the iterations.
     """
     swept = _swept(geometry, start)
     sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
@@ -144,19 +150,20 @@ def first_volume(
     volume = quick.run(problem, RunControl()).volume
     if swept or geometry.is_cone:
         return volume
-    # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
+    # FBP of a limited angular range is too small by the share that is missing; the density unit would be too small,
+    # too.
     return Volume(volume.data * np.float32(np.pi / angular_weights(geometry.angles).sum()), grid)
 
 
 def mean_change(
     projections: NDArray[np.float32], geometry: Geometry, grid: Grid, known: Volume | None = None, device: str = "cpu"
 ) -> float:
-    """Total variation of matter a voxel, over the density unit, in the middle slices of a first volume "fbp".
+    """Total variation of the sample per voxel, in density units, in the middle slices of a first volume "fbp".
 
-    0 where a direct method takes these views badly (too short a scan of a cone), or the slices hold no matter.
+    It is 0 if a direct method is not suitable (too short a cone scan), or if the slices contain no material.
 
     Args:
-        known: such a volume of the grid; None: it is made, of these slices, on the device.
+        known: such a volume on the grid; None: the slices are reconstructed on the device.
     """
     nz, ny, nx = grid.shape
     first = max(0, nz // 2 - _MIDDLE)
@@ -167,8 +174,8 @@ def mean_change(
     data = first_volume(projections, geometry, slab, device=device).data if known is None else known.data[middle]
     lines = volume_lines(np.maximum(data, 0))
     unit = density_unit(lines)
-    matter = np.count_nonzero(lines > MATTER * unit)
-    return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
+    in_sample = np.count_nonzero(lines > LEAST_DENSITY * unit)
+    return float(total_variation(lines, difference_weights(slab)) / (in_sample * unit)) if in_sample else 0.0
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:
@@ -184,24 +191,24 @@ def sample_gaussians(
     smooth: float = SMOOTHED,
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
-    """At most n isotropic Gaussians drawn from a volume.
+    """At most n isotropic Gaussians sampled from a volume.
 
-    The volume is smoothed first, since streaks of few views would attract Gaussians. (Yuluo et al. 2025, GR-Gaussian,
-    gain 0.4 dB with 25 views.) Then voxels above 5 % of the density unit are drawn without replacement, with a
-    probability that is half density and half gradient. A Gaussian's size is the distance to its neighbours, its density
-    the voxel's.
+    The volume is smoothed first, because Gaussians would otherwise be placed on the streaks of few projections (Yuluo
+    et al. 2025, GR-Gaussian; gain 0.4 dB with 25 projections). Then voxels above 5 % of the density unit are drawn
+    without replacement. The probability is half from the density and half from the gradient. The size of a Gaussian is
+    the distance to its neighbours, its density that of the voxel.
 
     Args:
         volume: an FBP or iterative reconstruction.
-        n: number of Gaussians; fewer if fewer voxels hold matter.
-        field_radius: mm around the rotation axis; no Gaussian is placed outside.
+        n: number of Gaussians; the result has fewer if fewer voxels contain material.
+        field_radius: radius in mm around the rotation axis outside which no Gaussian is placed.
         smooth: standard deviation of the smoothing, in voxels.
 
     Raises:
-        ValueError: where the volume holds no matter inside the field.
+        ValueError: the volume contains no material inside the field of view.
     """
-    data, unit, candidates = _matter(volume, field_radius, smooth)
-    data /= unit  # so that squares of gradients stay in float32's range
+    data, unit, candidates = _material(volume, field_radius, smooth)
+    data /= unit  # so that squared gradients stay in the range of float32
     value, slope = data.ravel()[candidates], np.empty(candidates.size, np.float32)
     slopes_at(_smoothed(data, _SLOPE_SIGMA), candidates, slope)
     weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
@@ -221,12 +228,13 @@ def sample_gaussians(
 def sample_as_published(
     volume: Volume, n: int, rng: np.random.Generator, *, field_radius: float, kernel: Kernel = Kernel.GAUSSIAN
 ) -> Gaussians:
-    """The published start (Zha et al. 2024): voxels above 5 % of the density unit, all equally likely.
+    """The published start (Zha et al. 2024): voxels above 5 % of the density unit, all with the same probability.
 
-    A Gaussian's width is the distance to its neighbours, its density 0.15 of its voxel's. The published ones lie half
-    a voxel off the centres of the voxels, ours at the centres. Arguments and errors as in `sample_gaussians`.
+    The width of a Gaussian is the distance to its neighbours, its density 0.15 of that of its voxel. In the published
+    code, Gaussians are half a voxel away from the voxel centres; here they are at the centres. Arguments and errors as
+    in `sample_gaussians`.
     """
-    data, unit, candidates = _matter(volume, field_radius, 0.0)
+    data, unit, candidates = _material(volume, field_radius, 0.0)
     chosen = rng.permutation(candidates)[:n]
     z, y, x = volume.grid.coordinates()
     k, j, i = np.unravel_index(chosen, data.shape)
@@ -237,23 +245,26 @@ def sample_as_published(
     return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
 
 
-def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
-    """The smoothed volume within the field, its density unit, and the voxels that may hold a Gaussian."""
+def _material(
+    volume: Volume, field_radius: float, smooth: float
+) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
+    """The smoothed volume within the field of view, its density unit, and the voxels in which a Gaussian may start."""
     data = _smoothed(np.maximum(volume.data, 0), smooth)
     _, y, x = volume.grid.coordinates()
     data *= (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
     unit = density_unit(data)
-    candidates = np.flatnonzero(data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
+    candidates = np.flatnonzero(data.ravel() > LEAST_DENSITY * unit) if unit > 0 else np.empty(0, np.int64)
     if candidates.size < 4:
         raise ValueError(
-            f"the initial volume holds no matter: {candidates.size} voxels above {MATTER:.0%} of {unit:.3g} 1/mm; "
-            "are the projections line integrals (-log of the transmission), and is the axis right?"
+            f"the initial volume contains no material: only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
+            f"{unit:.3g} 1/mm. Are the projections line integrals (-log of the transmission), and is the rotation "
+            "axis right?"
         )
     return data, unit, candidates
 
 
 def _smoothed(x: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """x [z, y, x] under a Gaussian of this standard deviation in voxels, cut off at four of them."""
+    """x [z, y, x] smoothed by a Gaussian with this standard deviation in voxels, cut off at four of them."""
     taps, out = np.arange(-round(4 * sigma), round(4 * sigma) + 1), np.empty(x.shape, np.float32)
     window = np.exp(-0.5 * (taps / max(sigma, 1e-9)) ** 2)
     windowed(x, (window / window.sum()).astype(np.float32), out)
@@ -274,9 +285,9 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
 def scale_to_data(
     gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, rays: RayModel | None = None
 ) -> Gaussians:
-    """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
+    """The same Gaussians with all densities multiplied by k = <Aρ, P> / <Aρ, Aρ> over a few projections.
 
-    Projection is linear in density, so this is the exact least-squares factor. It replaces the published constant 0.15
+    Projection is linear in density, so k is the exact least-squares factor. It replaces the published constant 0.15,
     and makes the start independent of units and of the number of Gaussians.
     """
     chosen = spread(np.arange(geometry.n_views), SCALED_BY)
@@ -286,7 +297,8 @@ def scale_to_data(
     factor = float((rendered * measured).sum()) / power if power > 0 else 0.0
     if not factor > 0:
         raise ValueError(
-            f"the data do not look like line integrals: the best density factor is {factor:.3g}, it must be positive"
+            "the data do not look like line integrals: the best factor between the initial volume and the "
+            f"projections is {factor:.3g}, and it must be positive"
         )
     densities = gaussians.densities.double().numpy() * factor
     return Gaussians.from_physical(

@@ -1,4 +1,4 @@
-"""The fit over an explicit state: init, step; it prints nothing, reads no clock, can stop after any step."""
+"""The fitting steps on an explicit state: init and step. They print nothing, read no clock, and can stop anywhere."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, DensityPolicy, FitSettings, control, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
 
-NORMALISE = 100  # steps between two normalisations of the quaternions
+NORMALISE = 100  # number of steps between two normalisations of the quaternions
 
 
 @dataclass(eq=False)
 class FitState:
-    """Everything that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
+    """Everything that a step reads and changes. With the settings it is a complete checkpoint (see `checkpoint`).
 
-    `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels. They live on the
-    backend's device. `mean` is a running mean of the parameters, or None, see `anytime`. Where `fused` makes the steps,
-    the arrays may be some steps behind until `settle`.
+    `step` updates the arrays in place, because for 50k Gaussians a copy takes as long as the kernels. The arrays are on
+    the device of the backend. `mean` is a running mean of the parameters or None, see `anytime`. If `fused` makes the
+    steps, the arrays may be some steps behind until `settle` is called.
     """
 
     parameters: dict[str, Any]
@@ -60,26 +60,26 @@ class FitState:
 def problem_of(
     views: Views, grid: Grid, unit: float, settings: FitSettings, backend: Backend[Any] | None = None
 ) -> FitProblem:
-    """The problem for these settings; see `make_problem`. None computes on the CPU."""
+    """The problem for these settings; see `make_problem`. backend None: the CPU."""
     return make_problem(views, grid, unit, backend or Cpu(), loss=settings.loss, ssim_weight=settings.ssim_weight)
 
 
 def init(
     gaussians: Gaussians, seed: int | np.random.Generator, growth: float = 1.0, backend: Backend[Any] | None = None
 ) -> FitState:
-    """A fresh state; the Gaussians are copied as float32, in an order that keeps neighbours together in memory.
+    """A new state. The Gaussians are copied as float32, in an order that keeps neighbours together in memory.
 
     Raises:
-        ValueError: for no Gaussians, or parameters that are not finite.
+        ValueError: there are no Gaussians, or parameters are not finite.
     """
     if gaussians.n == 0:
-        raise ValueError("there are no Gaussians to start a fit from")
+        raise ValueError("a fit needs at least one Gaussian to start from")
     arrays = gaussians.arrays()
     named = zip(NAMES, ("means", "log_scales", "quaternions", "raw_densities"), strict=True)
     parameters = {name: np.array(arrays[source], np.float32) for name, source in named}
     for name, values in parameters.items():
         if not np.isfinite(values).all():
-            raise ValueError(f"{name} of the Gaussians hold {int((~np.isfinite(values)).sum())} values not finite")
+            raise ValueError(f"{name} of the Gaussians: {int((~np.isfinite(values)).sum())} values are not finite")
     order = _order(parameters)
     device = backend or Cpu()
     return FitState(
@@ -97,11 +97,11 @@ def init(
 def step(
     state: FitState, problem: FitProblem, settings: FitSettings, fraction: float, view: int | None = None
 ) -> FitState:
-    """One Adam step on one view (or a few); density control when it is due. Changes and returns `state`.
+    """One Adam step on one projection (or a few), and density control when it is due. Changes and returns `state`.
 
     Args:
-        fraction: how far the schedule has come, 0..1; sets the learning rates and the window of density control.
-        view: the first view to take; None draws it, as the others, without replacement.
+        fraction: position in the schedule, 0 to 1; it sets the learning rates and the window of density control.
+        view: the first projection to use; None: it is drawn without replacement, as are the others.
     """
     views = [
         _draw(state, problem.geometry.n_views) if view is None or k else view for k in range(settings.views_per_step)
@@ -124,8 +124,8 @@ def step(
         state.loss, state.residual = fused.loss, fused.residual
     state.seen += len(views)
     if state.step % NORMALISE == 0:
-        # A gradient is orthogonal to its quaternion, so that every step makes the quaternion longer and the next turn
-        # smaller. Without this it is twice as long after 30 000 steps.
+        # A gradient is orthogonal to its quaternion, so every step makes the quaternion longer and the next rotation
+        # smaller. Without normalisation, quaternions are twice as long after 30 000 steps.
         settle(state)
         quaternions = (arrays["quaternions"] for arrays in (state.parameters, state.first, state.second))
         problem.backend.unit_quaternions(*quaternions)
@@ -136,9 +136,9 @@ def step(
 
 
 class _RandomBox(NamedTuple):
-    """The voxels on which a step's total variation acts: the first one (z, y, x), and their number along each axis.
+    """The box of voxels for the total variation of a step: first voxel (z, y, x), and number along each axis.
 
-    A step takes no `Grid` of its own, whose checks take as long as a GPU takes for the step.
+    It is not a `Grid`, because the checks of a `Grid` take as long as the step takes on a GPU.
     """
 
     corner: tuple[int, ...]
@@ -151,7 +151,7 @@ class _RandomBox(NamedTuple):
         return cls(corner, (z, y, x))
 
     def first(self, grid: Grid) -> tuple[float, float, float]:
-        """The centre (z, y, x) of its first voxel, mm."""
+        """The centre (z, y, x) of the first voxel in mm."""
         z, y, x = (f + c * edge for f, c, edge in zip(grid.first, self.corner, grid.spacing, strict=True))
         return z, y, x
 
@@ -181,7 +181,7 @@ class _Update:
 def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
-    """The fused step of this state on the device, kept from step to step while its plan stays."""
+    """The fused step of this state on the device; it is kept for the next steps as long as its plan is the same."""
     shape, before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
@@ -206,7 +206,7 @@ def _fused(
 
 
 def settle(state: FitState) -> None:
-    """Wait until the arrays of a state include all its steps, before they are read."""
+    """Wait until the arrays of a state include all of its steps. Call it before reading them."""
     if state.fused is not None:
         state.fused.settle()
 
@@ -241,7 +241,7 @@ def _by_operations(
 
 
 def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> float:
-    """||rendered - measured|| / ||measured|| over all views of a problem, root mean square of the views' own."""
+    """||rendered - measured|| / ||measured||: root mean square over all projections of a problem."""
     rendered = renders(state, problem, settings, range(problem.geometry.n_views))
     squares = [
         float(problem.backend.misfit(image, problem.images[view], problem.weights[view])) ** 2
@@ -251,7 +251,7 @@ def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> fl
 
 
 def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: Iterable[int]) -> Iterator[Any]:
-    """The model's render of these views [row, col], in units of the problem's images, on its device."""
+    """The projections [row, col] of the model, in units of the problem's images, on its device."""
     settle(state)
     p, cut = state.parameters, settings.truncation
     run = problem.backend.begin(
@@ -270,7 +270,7 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
 
 
 def volume_of(state: FitState, grid: Grid, views: Geometry, settings: FitSettings) -> Volume:
-    """The `voxel_means` of a model of these views, 1/mm."""
+    """The `voxel_means` of a model that was fitted to these projections, 1/mm."""
     return Volume(voxel_means(gaussians_of(state), grid, views, truncation=settings.truncation).numpy(), grid)
 
 
@@ -286,12 +286,13 @@ def _draw(state: FitState, n_views: int) -> int:
 
 
 def _running(mean: Any, value: Any) -> Any:
-    # The first value is the mean; only a float can be the NaN of no value yet, so that a GPU need not be waited for.
+    # The first value is the mean. Only a Python float can be the NaN for "no value yet", so a GPU need not be waited
+    # for.
     return value if isinstance(mean, float) and np.isnan(mean) else 0.95 * mean + 0.05 * value
 
 
 def _smooth(problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any], box: Grid) -> Any:
-    """Total variation on a box of voxels, in normalised density."""
+    """Total variation of the normalised density on a box of voxels."""
     cut = settings.truncation
     filled = run.box(box, cut.faint / problem.half_field, cut.sigmas)
     half = np.float32(problem.half_field)
@@ -313,14 +314,14 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     origin = np.concatenate((change.keep, change.parents))
     fresh = change.keep.size
     if origin.size == 0:
-        return  # all Gaussians are faint, as in empty views: later views may need them
+        return  # all Gaussians are faint, for example in empty projections; later projections may need them
     parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
     grown = dict(zip(NAMES, parts, strict=True))
     order = _order(grown)
     if state.mean is not None:
         for name, new in grown.items():
             mean = backend.numpy(state.mean[name])[origin]
-            changed = new != p[name][origin]  # parents of splits and clones; their other halves are new, too
+            changed = new != p[name][origin]  # parents of splits and clones; the second halves are new, too
             changed[fresh:] = True
             state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}

@@ -1,4 +1,4 @@
-"""FitProblem: the data of a fit on the device that fits them, in the units of published rates and weights."""
+"""FitProblem: the data of a fit on its device, in the units of the published learning rates and weights."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ from recon.splatting.backend import Backend, ProjectionLoss
 
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
-# Images hold values of about one. No matter in the field can cause values beyond this limit. In SSIM the sums of
-# products of their squares would exceed the range of float32.
+# Images contain values of about one. No material in the field of view can cause values above this limit. In SSIM, sums
+# of products of their squares would exceed the range of float32.
 _LARGEST = 1e6
-# For later views, whose unit may come from noise before the sample came: the limit of SSIM in float32.
+# Limit for later projections: that of SSIM in float32. Their unit may come from noise before the sample was in the
+# beam.
 _LARGEST_LATER = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """The data of a fit: images in half fields times density units, geometry and grid in mm.
+    """The data of a fit. Images are in units of half_field * unit, geometry and grid in mm.
 
     Attributes:
-        images: one [row, col] each view, projections / (half_field * unit).
-        target_maps: each view blurred for SSIM.
-        weights: of each view's pixels [row, col]; None where all weigh one.
-        grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
-        half_field: mm.
-        unit: 1/mm.
-        noise: standard deviation of a pixel's noise, in units of `images`.
-        change: mean of matter from voxel to voxel, in `unit`, see `initialise.mean_change`; 0: not known.
-        backend: the device's operations, and the owner of all these arrays.
+        images: one [row, col] for each projection: line integrals / (half_field * unit).
+        target_maps: each projection blurred for SSIM.
+        weights: weights of the pixels [row, col] of each projection; None: all 1.
+        grid: box of the Gaussians; it should contain everything that the projections see, whatever volume is wanted
+            later.
+        half_field: half of the field of view, mm.
+        unit: density unit, 1/mm.
+        noise: standard deviation of the noise of a pixel, in units of `images`.
+        change: mean change of the sample from voxel to voxel, in `unit`, see `initialise.mean_change`; 0: unknown.
+        backend: operations on the device of all these arrays.
     """
 
     images: tuple[Any, ...]
@@ -62,21 +64,21 @@ class FitProblem:
 
     @property
     def projections(self) -> F32:
-        """The line integrals [view, row, col], back on the host."""
+        """The line integrals [view, row, col], copied to the host."""
         return np.stack([self.backend.numpy(image) * self.scale for image in self.images])
 
 
 def make_problem(
     views: Views, grid: Grid, unit: float, backend: Backend[Any], *, loss: Loss = "l1", ssim_weight: float = 0.25
 ) -> FitProblem:
-    """Normalise views for a fit in density unit `unit` (1/mm).
+    """Normalise projections for a fit with the density unit `unit` (1/mm).
 
-    Values that are not finite, or more than a million half fields times density units, get no weight, see
-    `masks.masked`. The squared losses are scaled to the size of the absolute one at the data's noise (see
-    `noise_level`). So the weights of SSIM and total variation keep their meaning.
+    Values that are not finite, or above a million times half_field * unit, get weight 0, see `masks.masked`. The
+    squared losses are scaled so that at the noise of the data (`noise_level`) they are as large as the absolute loss.
+    So the weights of SSIM and total variation mean the same with every loss.
 
     Raises:
-        ValueError: where shapes disagree, a view has no value that can be used, or the loss is unknown.
+        ValueError: the shapes do not match, a projection has no usable value, or the loss is unknown.
     """
     geometry = views.geometry
     require_views(geometry, views.data)
@@ -94,14 +96,14 @@ def make_problem(
 
 
 def extend(problem: FitProblem, projections: F32, angles: NDArray[np.float64]) -> FitProblem:
-    """The problem with more views [view, row, col]; those it has are not copied.
+    """The problem with additional projections [view, row, col]; the existing ones are not copied.
 
-    Large values are accepted up to the limit of the loss: if the first views were empty, the density unit is wrong.
-    Values beyond a thousand million half fields times density units get no weight.
+    Large values are accepted up to the limit of the loss, because the density unit is wrong if the first projections
+    were empty. Values above 10⁹ times half_field * unit get weight 0.
 
     Raises:
-        ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`, or a view has no value
-            that can be used.
+        ValueError: the projections of the problem differ in shift, roll or tilt (see `Geometry.at`), or a projection
+            has no usable value.
     """
     geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
     largest = _LARGEST_LATER * problem.half_field * problem.unit
@@ -109,19 +111,19 @@ def extend(problem: FitProblem, projections: F32, angles: NDArray[np.float64]) -
 
 
 def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
-    """The same problem with the line integrals [view, row, col] of its views replaced.
+    """The same problem with all line integrals [view, row, col] replaced.
 
     Raises:
-        ValueError: a view has no value that can be used.
+        ValueError: a projection has no usable value.
     """
     empty = replace(problem, images=(), target_maps=(), weights=())
     return _with_views(empty, *masked(projections, None, _LARGEST_LATER * problem.half_field * problem.unit))
 
 
 def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
-    """The geometry of factor x factor binned pixels, each centred on its own pixels, while the sample stays in place.
+    """The geometry of pixels binned by factor x factor, for a sample that stays at its position.
 
-    `Geometry.binned` instead counts a parallel beam's heights from the middle of the remaining rows.
+    In contrast, `Geometry.binned` counts the heights of a parallel beam from the middle of the remaining rows.
 
     Raises:
         ValueError: the detector has fewer rows or columns than the factor.
@@ -129,19 +131,20 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
     if factor > min(geometry.detector_shape):
         rows, cols = geometry.detector_shape
         raise ValueError(
-            f"joined_pixels={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set it to "
-            f"{min(rows, cols)} or less (1: the fit sees single pixels)"
+            f"joined_pixels={factor} is larger than the detector, {rows} x {cols} pixels: set it to {min(rows, cols)} "
+            "or less (1: the fit uses single pixels)"
         )
     return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
 def join_pixels(views: Views, factor: int) -> Views:
-    """Views with factor x factor pixels joined.
+    """Projections binned by factor x factor pixels.
 
-    A joined pixel is the weighted mean of its pixels and has their mean weight, so that unmeasured ones do not count.
+    A binned pixel is the weighted mean of its pixels and has their mean weight, so that pixels without data do not
+    count.
 
     Raises:
-        ValueError: as `binned_geometry`.
+        ValueError: as for `binned_geometry`.
     """
     if factor == 1:
         return views

@@ -1,4 +1,4 @@
-"""R2: the R²-Gaussian fit as a method, with the settings that its user chooses."""
+"""R2: the R²-Gaussian fit as a reconstruction method, with the settings for its users."""
 
 from __future__ import annotations
 
@@ -33,22 +33,24 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
 @dataclass(frozen=True, eq=False)
 class R2(Fit):
-    """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
+    """R²-Gaussian fit: fits a sum of Gaussians to the projections (Zha et al. 2024, with refinements).
 
     Attributes:
-        steps: of the fit. 0 gives the starting point. None takes 400; with `seconds` it takes as many as fit.
-        seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
-            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. The
-            start and one step are made in any case.
-        gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
-        start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
-        early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
-        with the lowest residual.
-        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8,
-            and a pull to few materials or steps with sparse patches as views held out prefer. The result's
-            `gaussians` stay the model as it was fitted.
-        allow_negative: the finish keeps voxels below zero; Gaussians have none.
-        fit: weights, rates and limits.
+        steps: number of steps. 0: the result is the starting point. None: 400 steps, or with `seconds` as many as time
+            allows.
+        seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
+            learning rates decay over this time. It includes the compilation of kernels if `warm_up` was not called. The
+            start and one step are always made.
+        gaussians: number of Gaussians at the start, or the Gaussians to start from. None: a number derived from the
+            detector.
+        start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
+        early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
+            the lowest residual.
+        finish: iterations of the voxel refinement after the fit, see `finish.finish`. None: 8, then discrete levels or
+            PnP-DCT steps if these predict held-out projections better. `gaussians` of the result remain the fitted
+            model.
+        allow_negative: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
+        fit: weights, learning rates and limits.
     """
 
     name: ClassVar[str] = "r2"
@@ -67,11 +69,11 @@ class R2(Fit):
 
     @property
     def planned_steps(self) -> int | None:
-        """Number of steps that end the fit; None if only `seconds` do."""
+        """Number of steps after which the fit ends; None if only `seconds` ends it."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
     def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit alone, of this share of the rows, with this share of the steps."""
+        """The fit without voxel refinement, for this share of the rows, with this share of the steps."""
         steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
         return replace(self.for_part(share, 1.0), steps=steps, finish=0)
 
@@ -84,31 +86,31 @@ class R2(Fit):
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps on voxels and steps of a trial, as a rule."""
+        """Usual number of voxel iterations and fitting steps in a test reconstruction."""
         refined = FINISH_SWEEPS + PnpDct.iterations
         return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction of a fit by steps with the usual finish; of another one that of its volume."""
+        """How well the fit predicts held-out projections: with voxel refinement if steps end it, otherwise without."""
         other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if other or self.early_stop or trial.prior is None:
             return trial.predicted(self)
         return predict(self, trial, so_far, trial.prior)
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit of future views, from this number of Gaussians.
+        """A fit that takes projections during a scan and starts with this number of Gaussians.
 
-        Settings of `fit` that differ from the defaults replace those of `WHILE_VIEWS_COME`.
+        Values of `fit` that differ from the defaults replace those of `WHILE_VIEWS_COME`.
 
         Raises:
-            ValueError: as `StreamingFit`, or where the fit would start from Gaussians instead of a number.
+            ValueError: as for `StreamingFit`, or `gaussians` is a model instead of a number.
         """
         if isinstance(self.gaussians, Gaussians):
-            raise ValueError("a fit that follows a scan starts from a number of Gaussians, not from a model")
+            raise ValueError("a fit during a scan cannot start from a given model; set gaussians to a number")
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The fit of this share of a volume: its share of the Gaussians, in this share of the seconds."""
+        """The fit for a part of a volume: `share` of the Gaussians, in `of_time` of the seconds."""
         count, seconds = self.gaussians, self.seconds
         return replace(
             self,
@@ -130,7 +132,7 @@ class R2(Fit):
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)
         rays = self.fit.rays
         if rays.exact_above < math.inf:
-            rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
+            rays = replace(rays, exact_above=0.0)  # so that the toy also runs the kernels for exact rays
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 

@@ -1,4 +1,4 @@
-"""Settings of a fit: weights, rates and limits, and values that depend on the scan and the grid."""
+"""Settings of a Gaussian fit: weights, learning rates and limits, and values that depend on the scan and the grid."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ Rule = Literal["mass", "published"]
 
 @dataclass(frozen=True)
 class DensityPolicy(Checked):
-    """When density control runs, and its thresholds.
+    """When density control (splitting, cloning, removing Gaussians) runs, and its thresholds.
 
-    All but `growth` and `rule` are those of Zha et al. 2024.
+    All values except `growth` and `rule` are those of Zha et al. 2024.
 
     Attributes:
-        start, stop: first and last step as fractions of all steps.
-        every: steps between two rounds.
-        threshold: mean gradient of the loss with respect to a centre, per half detector width, above which a Gaussian
-            is split or cloned.
-        large: a Gaussian longer than this fraction of the field is split; a smaller one is cloned. By the rule "mass"
-            all are split.
-        prune_below: density (in density units) below which a Gaussian is removed.
+        start, stop: first and last step, as fractions of all steps.
+        every: number of steps between two rounds.
+        threshold: a Gaussian is split or cloned if the mean gradient of the loss with respect to its centre, per half
+            detector width, is above this.
+        large: a Gaussian longer than this fraction of the field of view is split, a smaller one is cloned. With the
+            rule "mass" all are split.
+        prune_below: a Gaussian with a density below this (in density units) is removed.
         growth: largest number of Gaussians, relative to the number at the start.
-        rule: "mass": splits conserve the mass of the Gaussian, see `control`. "published": a clone is two equal
-            Gaussians of half the density. A split draws two centres from the Gaussian, with half its density and its
-            width over 1.6. A Gaussian is removed where its centre leaves the box.
+        rule: "mass": splits conserve the mass of the Gaussian, see `control`. "published": a clone becomes two equal
+            Gaussians with half the density. A split draws two centres from the Gaussian; the new ones have half its
+            density and its width divided by 1.6. A Gaussian whose centre is outside the box is removed.
     """
 
     start: NonNegative = 500 / 30_000
@@ -68,12 +68,12 @@ class DensityPolicy(Checked):
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Result of a round of density control: changes to the arrays of a model.
+    """Result of one round of density control: the changes to the arrays of a model.
 
     Attributes:
-        keep: int64, indices of the Gaussians that stay.
-        parents: int64, indices (in the old arrays) of those whose second half is appended.
-        means, log_scales, raw: new values, first for those that stay, then for the appended ones.
+        keep: int64, indices of the remaining Gaussians.
+        parents: int64, indices (in the old arrays) of the Gaussians whose second half is appended.
+        means, log_scales, raw: new values, first for the remaining Gaussians, then for the appended ones.
     """
 
     keep: NDArray[np.int64]
@@ -92,20 +92,21 @@ def control(
     box: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Change:
-    """Compute one round. By the rule "mass" every split conserves ρ √|Σ|: the projections hardly change.
+    """Compute one round of density control. With the rule "mass" a split conserves ρ √|Σ|, so projections hardly
+    change.
 
-    Pruning comes first: a model at its limit may add as many Gaussians as were pruned. The number then stays constant,
-    and faint or outside Gaussians are in effect relocated to places where the statistic is largest.
-    Only the mass of the pruned ones is lost, which is negligible.
+    Pruning comes first, so that a model at its limit can add as many Gaussians as were pruned. The number then stays
+    constant. In effect, faint Gaussians and those outside the box move to the positions with the largest statistic.
+    Only the mass of the pruned Gaussians is lost, which is negligible.
 
     Args:
         model: means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]; ρ = softplus(raw) in density units.
-        statistic: [n], the mean gradient that is compared with `policy.threshold`.
+        statistic: [n], mean gradient that is compared with `policy.threshold`.
         field: width of the field of view, mm.
         limit: largest number of Gaussians.
-        box: [2, 3] mm, lower and upper corner (x, y, z); a Gaussian whose centre is more than three standard deviations
-            of its longest axis outside is removed.
-        rng: draws the centres of halves by the rule "published".
+        box: [2, 3] mm, lower and upper corner (x, y, z). A Gaussian is removed if its centre is outside by more than
+            three standard deviations of its longest axis.
+        rng: random generator for the centres of halves with the rule "published".
     """
     means, log_scales, rotations, raw = model
     density = np.logaddexp(0, raw)
@@ -139,26 +140,26 @@ def control(
 
 
 def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
-    """Splits Gaussians by the rule "mass".
+    """Splits Gaussians with the rule "mass".
 
     Two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
 
     Returns:
-        Shifts of the first and second halves [n, 3] mm, what is added to their log scales [n, 3], and what their
-        density is divided by.
+        Shifts of the first and the second halves [n, 3] mm, the values to add to their log scales [n, 3], and the
+        divisor of their density.
     """
-    at, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
-    apart, shrink = APART * np.exp(log_scales[at, axis]), math.sqrt(1 - APART**2)
-    offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
+    index, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
+    apart, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
+    offset = (apart[:, None] * rotations[index, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
-    narrower[at, axis] = math.log(shrink)
+    narrower[index, axis] = math.log(shrink)
     return offset, -offset, narrower, 2 * shrink
 
 
 def _published_halves(
     log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[F32, F32, F32, float]:
-    """The same by the rule "published": mass and covariance are not conserved."""
+    """The same with the rule "published"; mass and covariance are not conserved."""
     own = np.exp(log_scales) * rng.standard_normal((2, *log_scales.shape))
     first, second = np.einsum("nij,hnj->hni", rotations, own * split[:, None]).astype(np.float32)
     narrower = np.where(split, -np.log(_PUBLISHED_SHRINK), 0.0)[:, None].astype(np.float32)
@@ -171,43 +172,50 @@ def _inverse(density: NDArray[np.floating]) -> F32:
 
 
 TV_WIDEST = 96
-"""Voxels of that side, at most. Without: a step in 512³ voxels takes longer; not measured."""
+"""Largest side, in voxels, of the box of total variation.
 
-NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
+Without it, a step on a grid of 512³ voxels would take longer (not measured).
+"""
 
-TV_LEAST_SIDE = 32  # voxels of the box of total variation (Zha et al. 2024)
+NAMES = ("means", "log_scales", "quaternions", "raw")  # parameters of the model, in the order of their rates
+
+TV_LEAST_SIDE = 32  # smallest side, in voxels, of the box of total variation (Zha et al. 2024)
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of a fit. Defaults are the published ones (Zha et al. 2024) unless stated otherwise.
+    """Settings of a Gaussian fit. Defaults are the published values (Zha et al. 2024) unless stated otherwise.
 
     Attributes:
-        loss: "l1" (published), "l2", or "poisson" (squares weighed by the transmission).
-        ssim_weight: of 1 - SSIM beside it.
-        tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
-            times the density unit). That is divided by the pixels of a Gaussian. Where matter changes by more than 0.16
-            of the density unit a voxel, it falls with the square of this change. It is at most 0.25.
-        tv_least: the least of these weights, in a fit of `paced_for` steps; more steps need less, see `in_steps`.
-        tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
-            side, 32 to 96.
-        tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
-        squared, and has no effect (its weight there is 0.05). With the right gradient we measure +0.2
-            dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
-        rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
-        pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
-            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
-            higher last rate gives in 400 steps and a finish as much as 20 in 500.
-        paced_for: steps of the longest fit that `pace` holds for, see `in_steps`.
-        decay: last rate / first rate; log-linear in between.
-        policy: density control; None keeps the count.
-        truncation: where Gaussians end; a compact kernel ends by itself.
-        smallest: least standard deviation, in pixels: point sampling sees nothing thinner.
-        views_per_step: gradients of so many views are averaged.
-        joined_pixels: pixels of the views are joined by this factor for the fit, not for its finish. None joins as
-            many as Gaussians are wide, see `initialise.joined_for`: of large volumes alone.
-        rays: the integral of a Gaussian along a ray; matters for cones.
-        kernel: radial profile of the Gaussians, also by its name; a fit that starts from a model keeps the model's.
+        loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
+        ssim_weight: weight of 1 - SSIM, which is added to the loss.
+        tv_weight: weight of total variation. None: 3e5 times the variance of a pixel's noise (in units of the half
+            field times the density unit), divided by the number of pixels of a Gaussian. If the sample changes by more
+            than 0.16 of the density unit per voxel, the weight falls with the square of this change. It is at most
+            0.25.
+        tv_least: smallest weight of total variation in a fit of `paced_for` steps; more steps need less, see
+            `in_steps`.
+        tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
+            to 96.
+        tv_moves: True: total variation may move centres. In the published code this gradient is too small by the voxel
+            size squared and has no effect (its weight there is 0.05). With the right gradient we measure +0.2 dB on the
+            walnut (60 projections) and +0.4 dB on the battery (90 projections).
+        rates: learning rates at the first step: of means (per half field), log scales, quaternions and raw densities.
+        pace: factor on all rates. The published rates are for 30 000 steps; with them, a fit of 1000 steps is far from
+            convergence. Twenty times the rates, with two projections per step and a low last rate, gain 1 to 4 dB in
+            1000 steps. 26 times the rates with a higher last rate reach in 400 steps plus voxel refinement the same as
+            20 times in 500 steps.
+        paced_for: number of steps of the longest fit for which `pace` is valid, see `in_steps`.
+        decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
+        policy: density control; None: the number of Gaussians stays the same.
+        truncation: where Gaussians are cut off; a compact kernel ends by itself.
+        smallest: smallest standard deviation in pixels; point sampling misses anything thinner.
+        views_per_step: number of projections whose gradients are averaged in a step.
+        joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). None: pixels become
+            as wide as the Gaussians, which happens only in large volumes, see `initialise.joined_for`.
+        rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
+        kernel: radial profile of the Gaussians, or its name. A fit that starts from a model uses the profile of the
+            model.
     """
 
     loss: Loss = "l1"
@@ -233,22 +241,22 @@ class FitSettings:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
         if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
             raise ValueError(
-                f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"
+                f"rates must be {len(NAMES)} finite numbers, each 0 or more ({', '.join(NAMES)}), got {self.rates}"
             )
 
 
 def in_steps(settings: FitSettings, steps: float) -> FitSettings:
-    """The settings for a fit of `steps` steps: slower rates if these are more than `paced_for`.
+    """The settings for a fit of `steps` steps: lower rates if there are more steps than `paced_for`.
 
-    Its rates fall with their square root. So does the least weight of total variation, which a short fit needs to be
-    smooth.
+    The rates and the smallest weight of total variation are divided by the square root of the ratio. A short fit needs
+    the larger weight to be smooth.
     """
     share = min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
     return replace(settings, pace=share * settings.pace, tv_least=share * settings.tv_least)
 
 
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
-    """The weight of total variation in a fit of at most `count` Gaussians: as set, or by the noise of the data."""
+    """The weight of total variation in a fit of at most `count` Gaussians: as set, or from the noise of the data."""
     if settings.tv_weight is not None:
         return settings.tv_weight
     rows, cols = problem.geometry.detector_shape
@@ -258,10 +266,10 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
-    """Voxels per side of the box of total variation: as set, or by the size of the grid."""
+    """Voxels per side of the box of total variation: as set, or from the size of the grid."""
     if settings.tv_size is not None:
         return settings.tv_size
-    side = round(math.prod(grid.shape) ** (1 / 3) / TV_SHARE / 16) * 16  # whole lanes of the kernels
+    side = round(math.prod(grid.shape) ** (1 / 3) / TV_SHARE / 16) * 16  # a multiple of the kernels' vector length
     return min(max(side, TV_LEAST_SIDE), TV_WIDEST)
 
 

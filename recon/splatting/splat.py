@@ -1,6 +1,6 @@
-"""project and voxelize: Gaussians to line integrals and to voxels, differentiable.
+"""project and voxelize: differentiable functions from Gaussians to line integrals and to voxels.
 
-Tensors are float32: on the CPU the threaded CPU kernels are used, on a CUDA device the GPU kernels.
+Tensors are float32. On the CPU, the threaded CPU kernels are used; on a CUDA device, the GPU kernels.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ def project(
     truncation: Truncation | None = None,
     model: RayModel | None = None,
 ) -> Tensor:
-    """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
+    """Line integrals [view, row, col] (dimensionless) of the Gaussians. For a parallel beam, exact except truncation.
 
-    In a cone the footprint is affine, or integrated along the true ray if `model` asks for it. Differentiable in all
-    four parameter tensors.
+    For a cone, the footprint is an affine approximation, or integrated along the true ray if `model` says so. The
+    result is differentiable in all four parameter tensors.
 
     Raises:
-        ValueError: tensors that are not float32.
+        ValueError: the tensors are not float32.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
     check_arguments(project, locals())
@@ -44,12 +44,13 @@ def project(
     g = turned_by_rows(gaussians, chosen, -1)
     chosen = chosen.at_row(0)
     cut = truncation or Truncation()
-    faint = cut.faint * g.density_unit * chosen.sample_pitch * chosen.detector_shape[1]  # line integral of a cut
+    # line integral at which footprints are cut off
+    faint = cut.faint * g.density_unit * chosen.sample_pitch * chosen.detector_shape[1]
     return Project.apply(*_raw(g), chosen, (faint, cut.sigmas, model or RayModel()))
 
 
 def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None) -> Tensor:
-    """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
+    """Density [z, y, x] (1/mm) of the Gaussians at the voxel centres of a grid. Errors as in `project`."""
     check_arguments(voxelize, locals())
     from recon.splatting.autograd import Voxelize
 
@@ -60,13 +61,14 @@ def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None 
 def voxel_means(
     gaussians: Gaussians, grid: Grid, geometry: Geometry, *, truncation: Truncation | None = None
 ) -> Tensor:
-    """Density [z, y, x] (1/mm) of a fit's Gaussians, each voxel the mean over its edges; raises as `voxelize`.
+    """Density [z, y, x] (1/mm) of fitted Gaussians, averaged over each voxel. Errors as in `voxelize`.
 
-    A mean over h has the variance h²/12. Gaussians that were fitted to views whose rays have no width hold that of a
-    pixel, p²/12, already; so voxels of a pixel take the centres' values.
+    A mean over the length h adds the variance h²/12. Gaussians fitted to projections with rays of zero width already
+    contain the variance of a pixel, p²/12. So voxels of pixel size get the values at their centres.
     """
     pixel, edge = 0.0 if geometry.width.pixel else geometry.sample_pitch, min(grid.spacing)
-    parts = max(1, math.ceil(edge / (2 * geometry.sample_pitch)))  # of a coarse voxel's edge, whose box is no Gaussian
+    # parts of a coarse voxel's edge, because a Gaussian does not approximate its box
+    parts = max(1, math.ceil(edge / (2 * geometry.sample_pitch)))
     nz, ny, nx = (parts * n for n in grid.shape)
     slices = None if grid.slice_pitch is None else grid.slice_pitch / parts
     fine = Grid((nz, ny, nx), grid.voxel_size / parts, grid.centre, slices)
@@ -78,13 +80,13 @@ def voxel_means(
 
 
 def _raw(g: Gaussians) -> tuple[Any, ...]:
-    """The first arguments of `Project` and `Voxelize`."""
+    """The first arguments for `Project` and `Voxelize`."""
     import torch
 
     from recon.splatting.autograd import Renderer
 
     if g.means.dtype != torch.float32:
-        raise ValueError(f"Gaussians must be float32, these are {g.means.dtype}: convert their tensors")
+        raise ValueError(f"Gaussians must be float32, got {g.means.dtype}; convert their tensors")
     device = g.means.device
     backend = backend_for("cpu" if device.type == "cpu" else str(device))
     return g.means, g.log_scales, g.quaternions, g.raw_densities, Renderer(g.density_unit, g.kernel, backend)

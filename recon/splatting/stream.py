@@ -1,11 +1,13 @@
-"""StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
+"""StreamingFit: a Gaussian fit that takes projections one by one during a scan.
 
-The first Gaussians come from an FBP of the first well-spread views. If there is time for many steps, they are placed
-anew when the views have grown by half: from the model's volume and an FBP of its residual. From then on the model
-stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
-clones and splits them where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any
-number of steps to come (`anytime`). The first step after its arrival learns a view. Every third other step takes one of
-the newest views, the rest replay all views evenly (`anytime`). One view of sixteen is held out until the last round.
+The first Gaussians are placed with an FBP of the first projections, as soon as these are well spread. If there is time
+for many steps, the Gaussians are placed again when the number of projections has grown by half, from the volume of the
+model and an FBP of its residual. After that the model is kept. Each time the number of projections has grown by half, a
+new round allows more Gaussians, and density control clones and splits Gaussians according to the new projections.
+Between arrivals the fit continues, with learning rates that suit any number of future steps (`anytime`). A new
+projection is used in the first step after its arrival. Of the other steps, every third uses one of the newest
+projections, and the rest use all projections evenly (`anytime`). One in sixteen projections is held out until the final
+fit.
 """
 
 from __future__ import annotations
@@ -53,31 +55,36 @@ from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
 from recon.voxels.beyond_field import sample_radius
 
-_GROWTH = 1.5  # a new round begins when the views have multiplied by this
-_YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
-_LAST_GROWTH = 0.5  # density control ends at this share of the last round
-_AXIS_ANEW = 0.3  # px; a move of the axis by so much starts the rates anew, a smaller one in part
-_NEW = 0.2  # weight of the newest view in the running mean over views before they were learnt
-_OTHERS = 0.2  # of the norm of views that replace those of a model: with more change it is placed anew
-# Without: -0.4 to -13.5 dB on three scenes (texture, plates, points) whose first 3 to 16 of 48 views were empty.
-_BLIND = 100.0  # data so many times larger than the density unit implies show that the first views were empty
-PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
-_ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
+_GROWTH = 1.5  # a new round begins when the number of projections has grown by this factor
+_YOUNG = 16  # a round that begins with fewer projections, after HALF steps, places all Gaussians again
+_LAST_GROWTH = 0.5  # density control ends at this share of the final fit
+_AXIS_ANEW = 0.3  # px; if the axis moves by this much, the rates start again; a smaller move raises them in part
+_NEW = 0.2  # weight of the newest projection in the running mean of residuals before a projection is used
+_OTHERS = 0.2  # if replaced projections change by more than this share of their norm, the Gaussians are placed again
+# Without it: -0.4 to -13.5 dB on three scenes (texture, plates, points) in which the first 3 to 16 of 48 projections
+# are empty.
+_BLIND = 100.0  # if data are larger than the density unit implies by this factor, the first projections were empty
+# largest number of voxels, so that a placement takes about a second; new projections wait meanwhile
+PLACED_FROM = 2**22
+# share of the first number of Gaussians that a round may add; the final fit may add the rest of the growth
+_ROUND_GROWTH = 0.25
 
 
 class StreamingFit:
-    """An R²-Gaussian fit whose views arrive in time.
+    """An R²-Gaussian fit that takes projections one by one, as a running scan delivers them.
 
     Args:
-        template: geometry of all future views, with their shift, roll and tilt; its angles are ignored.
-        grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
-        gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
-        settings: of the fit; `joined_pixels` is for fits whose views are all there.
-        first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
+        template: geometry of all future projections, with shift, roll and tilt; its angles are ignored.
+        grid: grid of the snapshots; None: it matches the detector. The fit itself covers everything that the
+            projections see.
+        gaussians: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
+        settings: settings of the fit; `joined_pixels` can only be used in a fit of a finished scan.
+        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
+            π).
 
     Raises:
-        ValueError: for no Gaussians, settings with `joined_pixels`, an axis outside the detector, or a template whose
-            views differ in shift, roll or tilt.
+        ValueError: the number of Gaussians is 0, `joined_pixels` is set, the axis is outside the detector, or the
+            projections of the template differ in shift, roll or tilt.
     """
 
     def __init__(
@@ -98,27 +105,27 @@ class StreamingFit:
         self._template, self._grid = template.at([0.0]), grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
         if gaussians is not None and gaussians < 1:
-            raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
+            raise ValueError(f"a fit needs at least one Gaussian, got {gaussians}")
         self._count = gaussians
         self._settings = settings or WHILE_VIEWS_COME
         if (self._settings.joined_pixels or 1) > 1:
             raise ValueError(
-                f"joined_pixels={self._settings.joined_pixels} is for a fit of a finished scan; this one follows one: "
-                "bin the scan, or leave it out"
+                f"joined_pixels={self._settings.joined_pixels} works only in a fit of a finished scan. For a fit "
+                "during a scan, leave it out and bin the scan"
             )
         self._first_views, self._first_span = first_views, first_span
         self._now, self._start = now, now()
         self._data: list[F32] = []
         self._angles: list[float] = []
-        self._held_out: list[bool] = []  # of each view; also where others before it are dropped
-        self._unseen: list[int] = []  # views that no step has learnt, in the order they came
+        self._held_out: list[bool] = []  # for each projection; the value stays if earlier projections are dropped
+        self._unseen: list[int] = []  # projections that no step has used, in the order of arrival
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
         self._arrived, self._round_views, self._schedule_step, self._placed = 0, 0, 0, 0
         self.unlearnt = math.nan
-        """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
+        """Running mean of ||rendered - measured|| / ||measured|| of new projections before a step uses them."""
         self.step_seconds = 0.0
-        """Of a step, by the last `advance`."""
+        """Duration of a step in s, measured in the last `advance`."""
 
     @property
     def n_views(self) -> int:
@@ -126,7 +133,7 @@ class StreamingFit:
 
     @property
     def n_unlearnt(self) -> int:
-        """Number of views that no step has used yet."""
+        """Number of projections that no step has used yet."""
         return len(self._unseen)
 
     @property
@@ -135,20 +142,20 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """Whether there is a model; before, there are too few views for one."""
+        """Whether there is a model; False as long as there are too few projections."""
         return self._state is not None
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
         """Add line integrals [k, row, col] at angles [k] in radians; they are used from the next step on.
 
-        Pixels that measured nothing are NaN: they have no weight.
+        Pixels without data are NaN and get weight 0.
 
         Raises:
-            ValueError: where shapes disagree with the template, values are infinite, or a view holds nothing but NaN or
-                values far too large; nothing is added.
+            ValueError: the shapes do not match the template, values are infinite, or a projection contains only NaN or
+                values that are far too large. Nothing is added.
 
         Warns:
-            UserWarning: where the angles so far look like degrees, once.
+            UserWarning: the angles so far look like degrees (given once).
         """
         check_arguments(StreamingFit.add_views, locals())
         theta = np.atleast_1d(np.asarray(angles, np.float64))
@@ -162,7 +169,7 @@ class StreamingFit:
         self._angles.extend(theta.tolist())
         if not look_like_degrees(
             np.asarray(self._angles[: self.n_views - theta.size]), ended=False
-        ):  # else it was said
+        ):  # otherwise the warning was given before
             warn_of_degrees(np.asarray(self._angles), ended=False)
         if self._state is not None and theta.size:
             new = range(self.n_views - theta.size, self.n_views)
@@ -173,13 +180,13 @@ class StreamingFit:
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest view and the model's render of it, line integrals [row, col]; equal where nothing was measured.
+        """The newest projection and that of the model, line integrals [row, col]; equal in pixels without data.
 
         Raises:
             ValueError: there is no model yet.
         """
         if self._state is None or self._problem is None:
-            raise ValueError("there is no model yet that could be compared with the newest view")
+            raise ValueError("there is no model yet to compare with the newest projection")
         problem = self._problem
         (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
         measured, weight = problem.images[-1] * problem.scale, problem.weights[-1]
@@ -187,19 +194,20 @@ class StreamingFit:
         return measured, rendered if weight is None else np.where(weight == 0, measured, rendered)
 
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
-        """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
+        """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
-        The model stays and goes on, unless the views are others by a fifth than those that it was placed by: then it is
-        placed anew. With `kept`, the numbers of the views whose data these are, in order, only these
-        count from then on, and the rates start again, because the model has learnt from bad views.
+        The model is kept, unless the new data differ by a fifth from the data with which the Gaussians were placed. In
+        that case the Gaussians are placed again. `kept` are the numbers of the projections that these data belong to,
+        in order. If it is given, only these projections count from then on, and the rates start again, because the
+        model has learnt from bad projections.
 
         Raises:
-            ValueError: as `add_views`, or there are no views; nothing is changed.
+            ValueError: as for `add_views`, or there are no projections; nothing is changed.
         """
         which = np.arange(self.n_views) if kept is None else np.asarray(kept, np.intp)
         theta = np.asarray(self._angles)[which]
         if theta.size == 0:
-            raise ValueError("there are no views to replace, or none would be left")
+            raise ValueError("there are no projections to replace, or none would be left")
         images = checked_views(data, theta, self._template.detector_shape)
         self._angles, self._held_out = theta.tolist(), [self._held_out[view] for view in which]
         if self._problem is None or self._state is None or self._others(images, which):
@@ -213,7 +221,7 @@ class StreamingFit:
             self._unseen = []
 
     def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
-        """Whether these line integrals differ from the model's views `which` by more than a fifth, in squares."""
+        """Whether these line integrals differ from projections `which` of the model by more than a fifth (norm)."""
         assert self._problem is not None
         changed = total = 0.0
         for view, image in zip(which, images, strict=True):
@@ -223,13 +231,13 @@ class StreamingFit:
         return changed > _OTHERS**2 * total
 
     def replace_newest(self, data: F32) -> None:
-        """Replace the line integrals [row, col] of the newest view: its correction has changed.
+        """Replace the line integrals [row, col] of the newest projection, after a changed correction.
 
         Raises:
-            ValueError: as `add_views`, or there is no view; nothing is changed.
+            ValueError: as for `add_views`, or there is no projection; nothing is changed.
         """
         if not self._angles:
-            raise ValueError("there is no view to replace")
+            raise ValueError("there is no projection to replace")
         theta = np.asarray(self._angles)
         images = checked_views(np.asarray(data)[None], theta[-1:], self._template.detector_shape)
         if self._problem is None:
@@ -243,9 +251,9 @@ class StreamingFit:
         self._problem = extend(others, images, theta[-1:])
 
     def move_axis(self, axis_col: float) -> None:
-        """Move the rotation axis. The model moves with it to its place in the views.
+        """Move the rotation axis. The model moves with it to its position in the projections.
 
-        Remaining errors double edges, which the model must learn anew: the rates rise again.
+        The remaining errors are double edges, which the model must correct, so the rates rise again.
         """
         moved = float(axis_col) - self._template.axis_col
         self._template = replace(self._template, axis_col=float(axis_col))
@@ -261,7 +269,7 @@ class StreamingFit:
         self._schedule_step = self._state.step - round(kept * (self._state.step - self._schedule_step))
 
     def advance(self, seconds: float) -> Progress:
-        """Fit for about `seconds` s (at least one step once there is a model) and return the progress."""
+        """Fit for about `seconds` s (at least one step if there is a model), and return the progress."""
         begin = self._now()
         if self.n_views >= _GROWTH * self._round_views:
             self._begin_round()
@@ -277,7 +285,7 @@ class StreamingFit:
                 return self.progress()
 
     def _next_view(self, state: fit.FitState) -> int | None:
-        """The first view of the next step; None: any in turn, but for those held out, which the last round takes."""
+        """The first projection of the next step; None: any in turn (held-out ones wait for the final fit)."""
         if len(state.drawn) < self._settings.views_per_step:
             state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not self._held_out[view]]
         view = self._unseen.pop(0) if self._unseen else next_view(self.n_views, self._rng)
@@ -285,32 +293,33 @@ class StreamingFit:
 
     @property
     def last_steps(self) -> int:
-        """Steps of the last round: those missing to a fit of all views at once, and at least one for each view.
+        """Number of steps of the final fit: those missing compared with a fit of all projections at once.
 
-        Never more than such a fit has. So a fit that had to wait for its processor makes up for it.
+        It is at least one per projection, and never more than a fit of all projections has. So a fit that was slow
+        during the scan catches up here.
         """
         each_view_once = math.ceil(self.n_views / self._settings.views_per_step)
         taken = 0 if self._state is None else self._state.step
         return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - taken))
 
     def finish(self, seconds: float = math.inf, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
-        """Fit a last round over all views, after the scan: `last_steps` steps, but no longer than about `seconds` s.
+        """Make the final fit to all projections after the scan: `last_steps` steps, or about `seconds` s if shorter.
 
-        The rates decay to its end; density control goes on in its first half. `on_progress` is called about ten times
-        a second and ends the fit by returning True.
+        The rates decay until its end. Density control continues in its first half. `on_progress` is called about ten
+        times a second; if it returns True, the fit ends.
 
         Raises:
-            ValueError: no view has arrived, or the views hold no matter.
+            ValueError: no projection has arrived, or the projections show no material.
         """
         if not self._angles:
-            raise ValueError("no view has arrived, there is nothing to finish")
+            raise ValueError("the fit cannot finish, because no projection has arrived")
         if not look_like_degrees(np.asarray(self._angles), ended=False):
             warn_of_degrees(np.asarray(self._angles))
         self._begin_round(force=True)
         state, problem = self._state, self._problem
         assert state is not None and problem is not None
         self._unseen = []
-        if state.mean is not None:  # from the better of the two
+        if state.mean is not None:  # continue from the better of the two
             state.parameters = {name: values + 0 for name, values in state.mean.items()}
         settled, first = replace(self._settings, policy=None), self._fraction()
         begun, steps, share = state.step, self.last_steps, 0.0
@@ -328,14 +337,14 @@ class StreamingFit:
         return replace(self.progress(), steps=begun + steps)
 
     def snapshot(self, grid: Grid | None = None) -> Volume:
-        """The current volume, 1/mm, on a grid (None: that of the fit); all zero before the first model."""
+        """The current volume in 1/mm on a grid (None: that of the fit); all zero before the first model."""
         grid = grid or self._grid
         if self._state is None:
             return Volume(np.zeros(grid.shape, np.float32), grid)
         return fit.volume_of(averaged(self._state), grid, self._template, self._settings)
 
     def best_preview(self) -> BetterVolume:
-        """The volume that predicts held-out views better: that of the model, or FBP of the views so far."""
+        """The volume that predicts held-out projections better: the model, or FBP of the projections so far."""
         if self._problem is None or self._state is None:
             return BetterVolume(self.snapshot(), False, PredictionErrors())
         apart = np.flatnonzero(self._held_out).tolist()
@@ -343,7 +352,7 @@ class StreamingFit:
 
     @property
     def gaussians(self) -> Gaussians | None:
-        """A copy of the model, None before the first one."""
+        """A copy of the model; None before the first one."""
         return None if self._state is None else fit.gaussians_of(averaged(self._state))
 
     def progress(self) -> Progress:
@@ -362,27 +371,27 @@ class StreamingFit:
             if not self._placed_first(force):
                 return
         elif self._problem is not None:
-            # The sample or the beam came later, so the density unit is noise. Or so few views place Gaussians badly.
+            # Either the sample or the beam came later, so the density unit is noise; or the projections were too few.
             blind = max(float(image.max()) for image in self._problem.images) > _BLIND
             if blind or (not force and self.n_views < _YOUNG and self._state.step >= HALF):
                 views = zip(self._problem.projections, self._problem.weights, strict=True)
                 self._data = [view if w is None else np.where(w == 0, np.float32(np.nan), view) for view, w in views]
                 self._place_first(None if blind else self._state, all_views=force)
         assert self._state is not None
-        # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
+        # Later projections need new Gaussians. Early ones span a narrow angle and would use all of them for streaks.
         most = round(self._placed * growth(self._settings))
         self._state.limit = most if force else min(most, self._state.n + round(_ROUND_GROWTH * self._placed))
         self._round_views = self.n_views
-        self._state.drawn = []  # draw from all views from now on
+        self._state.drawn = []  # from now on, draw from all projections
 
     def _placed_first(self, force: bool) -> bool:
-        """Place the first Gaussians, if the views suffice or there are no others; whether they were placed."""
+        """Place the first Gaussians if there are enough projections or no further ones; returns whether it did."""
         theta = np.asarray(self._angles)
         if not force and (theta.size < self._first_views or covered_angle(theta) < self._first_span):
             return False
         try:
             self._place_first(all_views=force)
-        except ValueError:  # no matter in these views: wait for half as many again
+        except ValueError:  # these projections show no material: wait for half as many again
             if force:
                 raise
             self._round_views = self.n_views
@@ -390,9 +399,9 @@ class StreamingFit:
         return True
 
     def _place_first(self, known: fit.FitState | None = None, *, all_views: bool) -> None:
-        """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual.
+        """Place all Gaussians with an FBP of the projections, or with a `known` volume and an FBP of its residual.
 
-        Views held out have no part in it, unless `all_views` do.
+        Held-out projections are not used, unless `all_views` is True.
         """
         views = Views(np.stack(self._data), self._template.at(self._angles)).masked()
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
@@ -406,7 +415,8 @@ class StreamingFit:
         rough = Grid.for_fit(self._template, rough, wider=wider is not None)
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
-        if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
+        # the first volume of a cone does not depend linearly on the data
+        if known is None or self._problem is None or geometry.is_cone:
             volume = first_volume(seen, geometry, rough)
             placed = place(volume, seen, geometry, count, self._rng, kernel=kernel)
         else:
@@ -420,4 +430,4 @@ class StreamingFit:
         self._problem = fit.problem_of(views, field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
-        self._data, self._unseen = [], []  # the problem holds them from now on
+        self._data, self._unseen = [], []  # from now on the problem contains them

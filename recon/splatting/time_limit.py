@@ -1,4 +1,4 @@
-"""A time limit: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
+"""Time limit: divides the seconds of a fit between its start, steps, voxel refinement and volume."""
 
 from __future__ import annotations
 
@@ -28,20 +28,21 @@ from recon.voxels.trial import TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
-"""Largest share of the finish in the time after the first steps: it adds more than most steps before it."""
+"""Largest share of the voxel refinement in the time after the first steps. It adds more than most fitting steps."""
 
-_GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling then takes so many times longer
-_SLAB = 16  # slices that are filled to measure it
+# a fit may end with this many times the Gaussians, and filling the volume then takes as many times longer
+_GROWTH = 1.5
+_SLAB = 16  # number of slices that are filled to measure the time
 _SWEPT_VIEWS = 8
-# Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
-# projections and an FBP.
+# Work before the iterations of a voxel refinement, without the choice of its weight, in units of an iteration: the
+# largest eigenvalue of a subset, projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 
 
 def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of a sweep of FISTA-TV over all views.
+    """Time of one FISTA-TV iteration over all projections.
 
-    It is measured on projections of a few views in both directions and one proximal step of total variation.
+    It is measured with forward and back-projections of a few projections and one proximal step of total variation.
     """
     some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
     projector = Projector(some, grid)
@@ -54,7 +55,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
-    """Time to fill the grid at the end of a fit that starts from these Gaussians, measured on a slab."""
+    """Time to fill the grid at the end of a fit that starts with these Gaussians, measured on a slab."""
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
     begin = now()
     voxelize(gaussians, slab)
@@ -62,12 +63,13 @@ def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
 
 
 class FinishPlan(NamedTuple):
-    """Length of a finish: its sweeps, seconds and trials.
+    """Plan of a voxel refinement: iterations, seconds and test reconstructions.
 
     Attributes:
-        sweeps: of total variation; None: as many as it makes by default, and steps with sparse patches.
-        seconds: that it will take.
-        trials: views held out choose its prior; else it is total variation by the noise.
+        sweeps: iterations of total variation; None: the default number, and PnP-DCT steps.
+        seconds: expected duration.
+        trials: True: held-out projections choose its regularisation. False: total variation with a weight from the
+            noise.
     """
 
     sweeps: int | None
@@ -76,10 +78,12 @@ class FinishPlan(NamedTuple):
 
 
 def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
-    """A fit's finish within `seconds`: the usual sweeps at most, unless `beside_steps` suffice for patches and trials.
+    """Plan the voxel refinement of a fit within `seconds`.
 
-    Where time is short it goes without trials of its weight, which on few rows cost more than seven finishes. A time
-    for fewer than two sweeps gives 0, because the work before them takes as long.
+    If `seconds` and `beside_steps` (the time that the fitting steps leave) are enough, the plan is the default
+    refinement with PnP-DCT and test reconstructions. Otherwise it has at most the usual number of iterations. If time
+    is short, the weight is chosen without test reconstructions, which on few rows take longer than seven refinements.
+    If there is time for fewer than two iterations, the plan has none, because the work before them takes as long.
     """
     if seconds <= 0:
         return FinishPlan(0, 0.0)
@@ -87,7 +91,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, damped=False) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
-    if choice:  # else views are too few to hold some out, and patches are not tried
+    if choice:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried
         trials_of_patches = EARLY_CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * patches.trial_steps
         refused = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
         most += patches.iterations * sweep + choice * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
@@ -103,9 +107,9 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
 
 
 def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
-    """The finish of a method in its share of the remaining seconds, of which all steps take `steps`.
+    """The voxel refinement of a method in its share of the remaining seconds, of which all steps take `steps`.
 
-    If the time suffices for two sweeps, the method's own number is used.
+    If there is time for two iterations, a number that the method states is used.
     """
     room, geometry = FINISH_SHARE * remaining, problem.geometry.at_row(0)
     plan = finish_within(room, remaining - steps, geometry, problem.grid, now)
@@ -114,15 +118,17 @@ def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconPr
 
 @dataclass(frozen=True, eq=False)
 class FinalFit(Iterative):
-    """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
+    """The final fit after a scan, to the projections that the fit already knows, and the voxel refinement after it.
 
     Attributes:
-        fit: holds the line integrals of the problem that it is run on, in the same order, but for offset views.
-        method: that began the fit.
-        seconds: for the round and the sweeps, at most.
-        began: when the fit began to wait for views, by the clock of the run; `Progress.seconds` count from there.
-        before: the progress of the fit until now.
-        on_progress: gets each progress of the round, too, while the fit can be looked at.
+        fit: the fit during the scan. It contains the line integrals of the problem in the same order, except laterally
+            offset projections.
+        method: the method that started the fit.
+        seconds: time limit for the final fit and the voxel refinement.
+        began: time at which the fit began to wait for projections, by the clock of the run; `Progress.seconds` count
+            from it.
+        before: progress of the fit so far.
+        on_progress: also called with each progress of the final fit, while the fit can be inspected.
     """
 
     fit: StreamingFit
@@ -132,14 +138,14 @@ class FinalFit(Iterative):
     before: Sequence[Progress] = ()
     on_progress: Callable[[Progress], None] = lambda progress: None
 
-    name: ClassVar[str] = "the last round"
-    label: ClassVar[str] = "Last round of a fit whose views came one by one"
+    name: ClassVar[str] = "the final fit"
+    label: ClassVar[str] = "Final fit after a scan"
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The volume, marked with the name of the method that began it.
+        """The volume, labelled with the name of the method that started the fit.
 
         Raises:
-            ValueError: no view has arrived, or the views hold no matter.
+            ValueError: no projection has arrived, or the projections show no material.
         """
         begin, stop, decide = control.now(), control.stop, control.decide or Decisions(problem.seed)
         end, history = begin + self.seconds, list(self.before)
@@ -163,19 +169,19 @@ class FinalFit(Iterative):
         if plan.sweeps != 0 and gaussians is not None and not stop():
             late = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
-                # Gaussians that learnt while views came leave the offset of the middle open: -2 dB on grains.
+                # Gaussians from a fit during the scan do not determine the offset in the middle: -2 dB on grains.
                 made = FistaTv().run(problem, late)
                 volume, sweeps = made.volume, len(made.history)
                 plan = plan._replace(sweeps=self.method.finish)
             else:
                 volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)
-        # The end cuts steps with patches, which no number of sweeps tells.
+        # The time limit may also cut PnP-DCT steps, which the number of iterations does not show.
         finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
         if not ((finished and reached.step >= reached.steps) or stop.stopped):
             warnings.warn(
-                f"{self.seconds:g} s did not suffice for the last round: {reached.step} of {reached.steps} steps, and "
-                f"{'a whole' if finished else 'a shorter' if sweeps else 'no'} finish on voxels. "
-                "A reconstruction of the finished scan leaves nothing out",
+                f"{self.seconds:g} s were not enough for the final fit: it made {reached.step} of {reached.steps} "
+                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement. To get "
+                "the full quality, reconstruct the finished scan",
                 stacklevel=2,
             )
         settings = {
@@ -189,9 +195,9 @@ class FinalFit(Iterative):
         return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)
 
     def toy(self) -> Self:
-        """The same method: its kernels were compiled when the fit began."""
+        """The same method, because its kernels were compiled when the fit started."""
         return self
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Peak memory in bytes without the projections: that of the method that began the fit."""
+        """Peak memory in bytes without the projections: that of the method that started the fit."""
         return self.method.memory(geometry, grid, weighted)

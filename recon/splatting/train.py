@@ -1,4 +1,4 @@
-"""run_fit: a whole R²-Gaussian fit, by a number of steps or a clock, with views held out and checkpoints."""
+"""run_fit: a complete R²-Gaussian fit, ended by steps or time, with held-out projections and checkpoints."""
 
 from __future__ import annotations
 
@@ -45,22 +45,22 @@ from recon.splatting.time_limit import (
 )
 from recon.voxels.residuals import residuals_of
 
-_TIMED = 3  # steps after which a fit's seconds are planned
-_LOOK = 50  # steps between two measurements of the views held out
-_PATIENCE = 0.2  # share of the planned steps, and at least six measurements, that may pass without a better model
+_TIMED = 3  # number of steps after which the time of a fit is planned
+_LOOK = 50  # number of steps between two measurements in held-out projections
+_PATIENCE = 0.2  # share of the planned steps that may pass without a better model; at least six measurements
 
 
 @dataclass(frozen=True, eq=False)
 class _FitViews:
-    """The views of a fit, and those kept back.
+    """The projections of a fit, and the held-out ones.
 
     Attributes:
-        fitted: what the finish sees: finite views, with weights of a mean of about 1 on matter.
-        kept_back: likewise the views that are not fitted; None: there are none.
-        joined: pixels that are joined for the steps.
-        seen: the views that the steps see.
+        fitted: projections for the voxel refinement: all values finite, mean weight in the sample about 1.
+        kept_back: the held-out projections in the same form; None: there are none.
+        joined: factor by which pixels are binned for the fitting steps.
+        seen: the projections that the fitting steps use.
         field: box of the Gaussians.
-        count: Gaussians at the start.
+        count: number of Gaussians at the start.
     """
 
     fitted: ReconProblem
@@ -74,28 +74,29 @@ class _FitViews:
     def of(cls, method: Fit, problem: ReconProblem) -> _FitViews:
         if problem.geometry.skew and isinstance(method.gaussians, Gaussians):
             raise ValueError(
-                "a fit whose rows have different angles cannot start from given Gaussians: give their number"
+                "a fit whose rows have different angles cannot start from given Gaussians; give their number"
             )
         if problem.geometry.width and problem.device != "cpu":
             warnings.warn(
-                f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows "
-                f"{problem.geometry.width}",
+                f"on {problem.device} the Gaussian fit ignores the width of the rays; only its voxel refinement takes "
+                f"{problem.geometry.width} into account",
                 stacklevel=3,
             )
         used, apart = used_and_kept_back(problem.geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         views = problem.views.masked()
-        if (rays := views.weights) is not None:  # only ratios mean something: total variation has a weight of its own
+        # only ratios of weights matter, because total variation has its own weight
+        if (rays := views.weights) is not None:
             views = replace(views, weights=rays / np.float32(usual_weight(rays, views.data)))
         blank = apart[~views.data[apart].any(axis=(1, 2))]
         if blank.size:
-            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere; choose other held-out views")
+            raise ValueError(f"held_out: projections {blank.tolist()} are zero everywhere; hold out others")
         measured, start = views.select(used), method.gaussians
         geometry = _of_steps(measured.geometry, problem.device)
         pixel_grid = Grid.for_fit(_of_steps(views.geometry, problem.device), problem.grid)
         usual = default_count(geometry, pixel_grid.voxel_size)
         count = start.n if isinstance(start, Gaussians) else usual if start is None else start
         if count < 1:
-            raise ValueError(f"a model needs at least one Gaussian, got {count}")
+            raise ValueError(f"a fit needs at least one Gaussian, got {count}")
         joined = method.fit.joined_pixels or joined_for(
             pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
         )  # fmt: skip
@@ -105,7 +106,7 @@ class _FitViews:
         return cls(replace(problem, views=measured), kept_back, joined, seen, field, count)
 
     def unseen(self, problem: FitProblem, settings: FitSettings, unit: float) -> FitProblem | None:
-        """The views kept back, as the steps see theirs."""
+        """The held-out projections, prepared as those of the fitting steps."""
         if self.kept_back is None:
             return None
         geometry = self.kept_back.geometry.at_row(0).seen_with(self.seen.geometry.width)
@@ -114,8 +115,9 @@ class _FitViews:
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
-    """The geometry that steps see: all rows at the angle of the first, as slices that turn against each other would
-    twist the model; and on a GPU rays without a width.
+    """The geometry of the fitting steps: all rows at the angle of the first row; on a GPU, rays without a width.
+
+    With an angle for each row, slices would turn against each other and twist the model.
     """
     first = geometry.at_row(0)
     return first if device == "cpu" else first.seen_with(NO_WIDTH)
@@ -126,11 +128,11 @@ class _Length:
     """Length of a fit, in steps or seconds.
 
     Attributes:
-        steps: end the fit; None: only `seconds` end it.
-        seconds: of the steps, by the caller's clock; None: `steps` alone end it.
-        sweeps: of the finish; None: as it takes by default.
-        trials: the finish may try priors.
-        planned: the seconds are divided among steps and finish.
+        steps: number of steps after which the fit ends; None: only `seconds` ends it.
+        seconds: time for the steps by the caller's clock; None: only `steps` ends the fit.
+        sweeps: iterations of the voxel refinement; None: its default.
+        trials: True: the voxel refinement may make test reconstructions to choose its regularisation.
+        planned: True: the seconds have been divided between steps and voxel refinement.
     """
 
     steps: int | None
@@ -140,12 +142,12 @@ class _Length:
     planned: bool
 
     def fraction(self, step: int, spent: float) -> float:
-        """Share of the fit that is done after `step` steps and `spent` s, 0..1."""
+        """Share of the fit, 0 to 1, that is done after `step` steps and `spent` s."""
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
     def plan(self, plan: FinishPlan, spent: float) -> None:
-        """Reserve time for the finish."""
+        """Reserve time for the voxel refinement."""
         self.sweeps, finishing, self.trials = plan
         self.planned = True
         if self.seconds is not None:
@@ -154,7 +156,7 @@ class _Length:
 
 @dataclass(eq=False)
 class _Run:
-    """A fit on its way: what its phases share."""
+    """A running fit: the data that its phases share."""
 
     method: Fit
     problem: ReconProblem
@@ -176,12 +178,12 @@ class _Run:
 
     @property
     def stopped_falling(self) -> bool:
-        """Whether the residual of views held out has not fallen for a while."""
+        """Whether the residual in held-out projections no longer falls."""
         patience = max(6 * _LOOK, _PATIENCE * (self.length.steps or 0))
         return self.state.step - self.tracker.best_step > patience
 
     def model(self) -> tuple[Volume, Gaussians]:
-        """The volume of the Gaussians, and these, turned as the rows see them."""
+        """The volume of the Gaussians, and the Gaussians rotated to the angle of their row."""
         model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.problem.geometry, 1)
         filled = voxel_means(
             model, self.problem.grid, self.fitting.geometry, truncation=self.method.fit.truncation
@@ -206,7 +208,7 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
     """Fit the line integrals of a problem; see `R2`.
 
     Raises:
-        ValueError: for a problem that the method cannot be fitted to.
+        ValueError: the method cannot be fitted to this problem.
     """
     begin, decide = control.now(), control.decide or Decisions(problem.seed)
     views = _FitViews.of(method, problem)
@@ -232,7 +234,7 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
 def _started(
     method: Fit, problem: ReconProblem, control: RunControl, decide: Decisions, views: _FitViews, begin: float
 ) -> _Run:
-    """The fit before its first step, or as a checkpoint holds it."""
+    """The fit before its first step, or in the state of a checkpoint."""
     settings, start, backend = method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
     first = None
@@ -263,9 +265,9 @@ def _started(
 
 
 def _steps(run: _Run) -> None:
-    """The steps of the fit, to its end or until it is stopped."""
+    """Make the steps of the fit until its end or until it is stopped."""
     now, length, state, method = run.control.now, run.length, run.state, run.method
-    if length.seconds is not None:  # the volume is filled after the steps
+    if length.seconds is not None:  # reserve time to fill the volume after the steps
         filling = fill_seconds(fit.gaussians_of(state, run.fitting.backend), run.problem.grid, now)
         length.seconds = max(0.0, run.end - filling - now())
     begin = reported = saved = now()
@@ -278,14 +280,14 @@ def _steps(run: _Run) -> None:
         done += 1
         if done >= _TIMED and length.seconds is not None:
             _pace(run, length.seconds, now() - begin, done)
-        if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
+        if state.step % _LOOK == _LOOK - 1:  # before density control, because its changes need some steps to settle
             run.tracker.measure(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
             run.report(reported)
         if run.control.on_checkpoint is not None and now() - saved >= run.control.checkpoint_every:
             run.control.on_checkpoint(run.checkpoint(state))
-            saved = now()  # the time that saving takes must not crowd out the fit
+            saved = now()  # the time for saving must not displace the fit
         if method.early_stop and run.stopped_falling:
             break
     run.tracker.measure(state, method.early_stop)
@@ -293,24 +295,24 @@ def _steps(run: _Run) -> None:
 
 
 def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
-    """Plan the finish and the rates of a fit of `seconds` s, by the time that its first `done` steps took."""
+    """Plan the voxel refinement and the rates of a fit of `seconds` s, from the duration of its first `done` steps."""
     length, state = run.length, run.state
     remaining, step = seconds - spent, spent / done
     if not length.planned and done == _TIMED:
         length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
         assert length.seconds is not None
         remaining = length.seconds - spent
-    if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
+    if step > 0:  # the first steps are slower than the others, so the estimate is updated
         expected = state.step + max(0.0, remaining) / step
         run.settings = in_steps(run.method.fit, min(expected, length.steps or expected))
 
 
 def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]:
-    """The volume of the fit, refined on voxels where time is left for it, and the sweeps."""
+    """The volume of the fit after voxel refinement (if there is time), and the number of iterations."""
     method, length, now, kept_back = run.method, run.length, run.control.now, run.views.kept_back
     if method.finish_sweeps == 0:
         return volume, 0
-    if not length.planned:  # the fit has ended before
+    if not length.planned:  # the fit ended before the time was planned
         length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, run.end - now(), 0.0))), 0.0)
     if length.sweeps == 0 or now() >= run.end or run.stopped:
         return volume, 0
@@ -327,22 +329,22 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
 
 
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
-    """The plan of the finish, with `remaining` s left after first steps of `step` s each."""
+    """The plan of the voxel refinement, with `remaining` s left after first steps of `step` s each."""
     return planned_finish(run.method, remaining, MOST_STEPS * step, run.views.fitted, run.control.now)
 
 
 def _predicts_worse(finished: Volume, fitted: Volume, unseen: Views) -> bool:
-    """Whether the finished volume leaves more of the views held out than the fit's, by more than 0.1 dB."""
+    """Whether the residual in held-out projections is larger after the refinement than before, by more than 0.1 dB."""
     after, before = (np.square(residuals_of(volume, unseen)).mean() for volume in (finished, fitted))
     return bool(after > 10 ** (0.1 / 10) * before)
 
 
 def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:
-    """The state that a checkpoint holds."""
+    """The state in a checkpoint."""
     state = state_from(checkpoint, backend)
     if max(state.drawn, default=0) >= n_views:
         raise ValueError(
-            f"the checkpoint belongs to a fit with at least {max(state.drawn) + 1} views, these are {n_views}: "
-            "resume takes the same data and settings"
+            f"the checkpoint belongs to a fit of at least {max(state.drawn) + 1} projections, but the data have "
+            f"{n_views}. To resume, use the same data and settings"
         )
     return state

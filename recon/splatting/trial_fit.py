@@ -1,4 +1,4 @@
-"""Trial fit: how well the volume of a fit, refined on voxels, predicts views held out, by as few steps as will do."""
+"""Test fit: measures with few steps how well a Gaussian fit with voxel refinement predicts held-out projections."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 FAR_BEHIND = 0.25
-"""Of a trial fit's residual: total variation that leaves so much less ends the trial at the first look. Without: half
-as much time again. Of 17 scans two fits win, whose residuals are 1.17 and 1.22 times those of total variation there;
-ten others have 1.45 times and more, and end."""
+"""A test fit ends at the first look if the residual of total variation is lower by this share of its own residual.
+
+Without this rule, it takes half as much time again. In 17 scans, the fit is best in two; there its residual at the
+first look is 1.17 and 1.22 times that of total variation. In ten others it is 1.45 times and more, and the test ends.
+"""
 
 FIRST_SHARE = 0.25
-"""Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
+"""Share of the steps after which a test fit is examined first. Without it: 0.9 s more CPU time, of 3 s."""
 
 
 def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
-    """The prediction of a fit of the views that are not held out: a fit of all views would know the others.
+    """How well a fit to the other projections predicts the held-out ones (a fit to all would know them).
 
-    It ends after a quarter of its steps where it then leads the simpler candidates, or is far behind total variation.
+    The fit ends after a quarter of its steps if it is then already better than the simpler candidates, or far behind
+    total variation.
 
-    No prior is named where the fit takes matter beyond the box off the views: from all of them a region of interest
-    gets one that costs 1.3 dB.
+    The prediction names no prior if the fit subtracts material outside the box from the projections. For a region of
+    interest, a prior chosen from all projections would cost 1.3 dB.
     """
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
@@ -42,8 +45,8 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     leads = best is None or significantly_better(trial.in_line_integrals(left), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, left, FAR_BEHIND):
         remark = (
-            f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, too far behind (a full trial: about "
-            f"{(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; --quality best runs it)"
+            f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, because it was too far behind (a full test "
+            f"takes about {(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; --quality best runs it)"
         )
     elif not leads:
         tried = _Fit.of(method, trial, 1.0)
@@ -54,11 +57,12 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A fit of the views that are not held out, in the units of a trial.
+    """A fit to the projections that are not held out, in the units of the test reconstruction.
 
     Attributes:
-        start: its volume.
-        beyond, beyond_unseen: [view, col, row] what it explains beyond its box in the views fitted, and in the others.
+        start: volume of the fit.
+        beyond, beyond_unseen: [view, col, row] contribution of Gaussians outside the box to the fitted and to the
+            held-out projections.
     """
 
     trial: Trial
@@ -71,7 +75,7 @@ class _Fit:
         """The fit with this share of its steps.
 
         Raises:
-            ValueError: it does not take these views, such as rows without matter.
+            ValueError: the fit cannot use these projections, for example rows without material.
         """
         views = trial.views_of(method)
         rows = views.geometry.detector_shape[0] / trial.scan.projector.geometry.detector_shape[0]
@@ -90,10 +94,10 @@ class _Fit:
         return cls(trial, trial.lines_of(made.volume), beyond(views.geometry), beyond(unseen))
 
     def refined(self, prior: Prior) -> F64:
-        """Residuals [view held out] of the volume refined by total variation.
+        """Residuals [held-out projection] of the volume after refinement with total variation.
 
-        Only where that leaves less than total variation alone do patches follow, which cost four times as much: else
-        they would not lead patches either.
+        PnP-DCT steps follow only if the residual is below that of total variation alone. They take four times as long,
+        and otherwise would not be better than PnP-DCT alone either.
         """
         residuals = self._by(prior, 0.0)
         if prior.patches and residuals.mean() < self.trial.residuals_of_weight(prior.weight).mean():
@@ -110,7 +114,7 @@ class _Fit:
 
     @property
     def level_beyond(self) -> float:
-        """Root mean square of what is beyond the box in the views held out."""
+        """Root mean square of the contribution from outside the box in the held-out projections."""
         if self.beyond_unseen is None:
             return 0.0
         return math.sqrt(np.mean(np.square(self.beyond_unseen, dtype=np.float64)))

@@ -1,4 +1,4 @@
-"""MethodConformance: the laws of every reconstruction method, as a pytest class that a method's tests subclass.
+"""MethodConformance: tests that every reconstruction method must pass, as a pytest class to subclass.
 
 class TestMine(MethodConformance):
     @pytest.fixture
@@ -30,11 +30,11 @@ from recon.voxels.projector import Projector
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 24), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
-BOX = slice(1, 5), slice(8, 15), slice(6, 13)  # voxels of matter
+BOX = slice(1, 5), slice(8, 15), slice(6, 13)  # voxels with material
 
 
 def problem() -> ReconProblem:
-    """A small box of 0.2 /mm, off the axis."""
+    """A small box of 0.2 /mm away from the axis."""
     truth = np.zeros(GRID.shape, np.float32)
     truth[BOX] = 0.2
     return ReconProblem(Views(Projector(VIEWS, GRID).plain.forward(truth), VIEWS), GRID, seed=3)
@@ -44,7 +44,7 @@ _WHOLE: dict[str, Reconstruction] = {}
 
 
 def whole(method: Method) -> Reconstruction:
-    """What the method makes of the problem, once for all laws that compare with it; nobody may change it."""
+    """The reconstruction of the problem, computed once for all tests that compare with it; tests must not change it."""
     if repr(method) not in _WHOLE:
         result = _WHOLE[repr(method)] = method.run(problem(), RunControl())
         result.volume.data.flags.writeable = False
@@ -52,11 +52,11 @@ def whole(method: Method) -> Reconstruction:
 
 
 class MethodConformance:
-    """Laws of `recon.base.method.Method`. A subclass gives `method`, with settings that are done within seconds."""
+    """Tests of `recon.base.method.Method`. A subclass defines the fixture `method`, with settings that take seconds."""
 
     @pytest.fixture
     def method(self) -> Method:
-        pytest.fail("A subclass gives the fixture `method`: the method, with settings that are done within seconds.")
+        pytest.fail("Define the fixture `method` in your subclass: the method, with settings that take seconds.")
 
     def test_it_is_an_immutable_value_that_says_who_it_is(self, method: Method) -> None:
         assert is_dataclass(method) and method.__dataclass_params__.frozen
@@ -88,15 +88,15 @@ class MethodConformance:
         assert np.abs(found - expected).mean() < 0.2 * np.abs(expected).mean()
 
     def test_it_tells_how_far_it_is_and_stops_when_it_is_asked_to(self, method: Method) -> None:
-        told: list[int] = []
-        control = RunControl(should_stop=lambda: True, on_progress=lambda progress: told.append(progress.step))
+        steps: list[int] = []
+        control = RunControl(should_stop=lambda: True, on_progress=lambda progress: steps.append(progress.step))
         result = method.run(problem(), control)
         assert result.volume.data.shape == GRID.shape
         if not method.fitted:
             assert result.history == ()
         else:
-            assert told and result.history
-            assert result.history[-1].step <= 2  # it stopped before the third
+            assert steps and result.history
+            assert result.history[-1].step <= 2  # it stopped before the third step
 
     def test_its_toy_runs_and_its_memory_grows_with_the_volume(self, method: Method) -> None:
         assert type(method.toy()) is type(method)

@@ -1,4 +1,4 @@
-"""Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, by the real camera's rules for time.
+"""Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, with the timing of the real camera.
 
 Nothing runs in the background: the camera catches up with the trigger line and the clock whenever it is asked, and a
 frame is computed when it is taken. Triggers and frames are numbered over the camera's life for faults and noise, so
@@ -135,9 +135,9 @@ class SimulatedOrcaQuest:
             self._answer()
             problem = orca_quest.refusal(settings, self._model)
             if self._armed_for:
-                problem = "is capturing and takes no settings; disarm it first"
+                problem = "is capturing and accepts no settings; disarm it first"
             if problem:
-                raise DeviceRefused(self.name, problem, request=str(settings), state="Its settings are as they were")
+                raise DeviceRefused(self.name, problem, request=str(settings), state="Its settings were not changed")
             self._settings = replace(settings, exposure=round(settings.exposure, 8))
             self._timing = orca_quest.timing(self._settings, model=self._model)
             return self._settings
@@ -147,7 +147,7 @@ class SimulatedOrcaQuest:
         with self._lock:
             self._answer()
             if n_frames < 1 or self._armed_for:
-                problem = "is armed already" if self._armed_for else "cannot be armed for less than one frame"
+                problem = "is already armed" if self._armed_for else "cannot be armed for less than one frame"
                 raise DeviceRefused(
                     self.name, problem, request=f"arm({n_frames})", advice="Call disarm() first, with n >= 1"
                 )
@@ -192,7 +192,7 @@ class SimulatedOrcaQuest:
             if now >= deadline:
                 raise DeviceTimeout(
                     self.name,
-                    f"no frame came within {timeout:g} s; it was armed for {self._armed_for} and exposed {exposed}",
+                    f"no frame arrived within {timeout:g} s; it was armed for {self._armed_for} and exposed {exposed}",
                     expected=f"a frame by {self._settings.trigger} trigger",
                     advice="Check that the stage moves and its trigger output is connected",
                 )
@@ -242,9 +242,9 @@ class SimulatedOrcaQuest:
     def _answer(self, armed: bool = False) -> None:
         """Raises DeviceError if the camera is gone (once its last frame is taken), or must be armed and is not."""
         if self._gone and not self._ring:
-            raise DeviceError(self.name, self._gone, advice="Connect it anew", state="Frames already taken are good")
+            raise DeviceError(self.name, self._gone, advice="Connect it again", state="Frames already taken are good")
         if armed and not self._armed_for:
-            raise DeviceRefused(self.name, "is not armed", advice="Call arm(n) before frames are read or triggered")
+            raise DeviceRefused(self.name, "is not armed", advice="Call arm(n) before reading or triggering frames")
 
     def _catch_up(self, now: float) -> None:
         """Look at every trigger up to `now`."""
@@ -278,7 +278,7 @@ class SimulatedOrcaQuest:
             return
         self._accepted = time
         if self._build.unplug_at is not None and self._frames >= self._build.unplug_at:
-            self._gone = f"does not answer any more: it was unplugged at frame {self._frames}"
+            self._gone = f"no longer answers: it was unplugged at frame {self._frames}"
             return
         ready = time + self._settings.exposure + self._timing.readout
         beam, sample = self._beam_is_on(), self._place_of_sample()
@@ -294,10 +294,10 @@ class SimulatedOrcaQuest:
             gone = [self._ring.popleft().framestamp for _ in range(over)]
             raise DeviceError(
                 self.name,
-                f"its ring of {self._build.ring_frames} frames was overrun and {over} frames are lost: framestamps "
-                f"{gone}",
-                advice="Take frames faster, trigger slower or use a larger ring",
-                state="Later frames can still be taken",
+                f"its ring of {self._build.ring_frames} frames was overrun and {over} frames are "
+                f"lost: framestamps {gone}",
+                advice="Read frames faster, trigger more slowly, or use a larger ring buffer",
+                state="Later frames can still be read",
             )
 
     def _render(self, frame: Exposed) -> CameraFrame:
@@ -305,7 +305,7 @@ class SimulatedOrcaQuest:
         try:
             counts = expose(self._scene, shot)
         except CannotExposeError as error:
-            advice = "Change the scene, or the settings that it does not go with"
+            advice = "Change the scene, or the settings that do not match it"
             raise DeviceRefused(self.name, f"cannot show the scene: {error}", advice=advice) from error
         if labels := self._scene.chain.labels(shot):
             self._labels[frame.time] = labels

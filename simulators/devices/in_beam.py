@@ -1,4 +1,4 @@
-"""Simulated devices in the beam, which the simulated camera shows: shutter, sample mover and monochromator."""
+"""Simulated devices in the beam, whose effect the simulated camera shows: shutter, sample mover and monochromator."""
 
 from __future__ import annotations
 

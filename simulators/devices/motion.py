@@ -1,4 +1,5 @@
-"""Trapezoid move: speed up, cruise, slow down, in closed form: position at a time and time at a position.
+"""Trapezoidal move (accelerate, constant speed, decelerate) in closed form: position at a time, and time at a
+position.
 
 With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²/a it never reaches v and takes
 2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move that shares the past of the first.

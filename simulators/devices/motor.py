@@ -64,7 +64,7 @@ class MotorOutput:
         self._coming: list[float] = []
 
     def can_arm(self, position: int) -> bool:
-        """Whether the output is on, and the axis at `position` stands before its start point."""
+        """True if the output is on, and the axis at `position` stands before its start point."""
         return self.settings.width is not None and self.settings.sign * (self.settings.start - position) > 0
 
     def arm(self) -> None:
@@ -76,7 +76,7 @@ class MotorOutput:
         self._fired, self._coming, self._armed = 0, [], False
 
     def ready(self, now: float) -> bool:
-        """Whether the output waits for its start point."""
+        """True if the output waits for its start point."""
         self.settle(now)
         return self._armed and self._fired == 0
 

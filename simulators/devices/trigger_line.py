@@ -1,4 +1,5 @@
-"""Trigger line: the cable from the stage's trigger output to the camera; the stage schedules, the camera consumes.
+"""Trigger line: the cable from the stage's trigger output to the camera. The stage schedules pulses, the camera
+receives them.
 
 Pulses are put on the line with the time at which they will rise, often ahead of that time. The stage knows its motion
 when it starts. A consumer takes a pulse only once the clock has passed its time, because a stop cancels later ones.

@@ -1,4 +1,4 @@
-"""Effects: one departure from Beer-Lambert a file; a scene computes only those that it names."""
+"""Effects: departures from Beer-Lambert, by physical kind; a scene computes only those that it names."""
 
 from __future__ import annotations
 

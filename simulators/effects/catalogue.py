@@ -1,4 +1,4 @@
-"""Catalogue: every effect by name, with its domain and its place in it; no effect's module is imported here.
+"""Catalogue: every effect by name, with its domain and its place in the order; no effect's module is imported here.
 
 The module of effect `photon_noise` is simulators.effects.sensor, and its class PhotonNoise. It is imported when a
 scene names the effect. EFFECTS of a folder has those in it.
@@ -24,22 +24,25 @@ _exposure, _sensor = (partial(EffectRow, module=f"simulators.effects.{name}") fo
 _OURS: Mapping[str, EffectRow] = MappingProxyType(
     {
         "motion_blur": _exposure(Domain.MOTION, "the sample turns during the exposure"),
-        "pixel_area": _exposure(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
-        "beam_profile": _exposure(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
+        "pixel_area": _exposure(Domain.OPTICAL_DEPTH, "a pixel measures the mean intensity over its area"),
+        "beam_profile": _exposure(Domain.PHOTONS, "the beam is brightest in the middle, has stripes, and drifts"),
         "quantum_efficiency": _sensor(
             Domain.PHOTONS,
-            "the sensor detects a share of the photons",
+            "the sensor detects only a share of the photons",
             frozenset({"scatter"}),
-            "stray light is detected like any other",
+            "stray light is detected like other light",
         ),
         "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),
-        "dark_current": _sensor(Domain.ELECTRONS, "electrons that arise without light"),
+        "dark_current": _sensor(Domain.ELECTRONS, "electrons that are generated without light (dark current)"),
         "saturation": _sensor(
-            Domain.ELECTRONS, "a pixel holds no more than its full well", _CHARGE, "charge of any origin fills a pixel"
+            Domain.ELECTRONS,
+            "a pixel holds at most the charge of its full well",
+            _CHARGE,
+            "charge of any origin fills a pixel",
         ),
-        "read_noise": _sensor(Domain.ELECTRONS, "noise of the readout"),
-        "offset": _sensor(Domain.COUNTS, "the digital bias"),
-        "adc": _sensor(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
+        "read_noise": _sensor(Domain.ELECTRONS, "readout noise of the camera"),
+        "offset": _sensor(Domain.COUNTS, "the digital offset of the camera"),
+        "adc": _sensor(Domain.COUNTS, "an analogue-to-digital converter with fewer bits, or a nonlinear one"),
         **in_folders("simulators.effects", "EFFECTS"),
     }
 )

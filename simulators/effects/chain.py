@@ -1,4 +1,4 @@
-"""Chain: a scene's effects in order, from the moving sample to the counts; the order is checked once."""
+"""Chain: the effects of a scene in order, from the moving sample to the counts; the order is checked once."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Chain:
         for i, effect in enumerate(effects):
             for earlier in effects[:i]:
                 if earlier.name == effect.name:
-                    raise ValueError(f"effect {effect.name!r} is named twice")
+                    raise ValueError(f"effect {effect.name!r} is given twice")
                 if earlier.domain > effect.domain:
                     raise ValueError(
                         f"effect {effect.name!r} acts on {effect.domain.words} and cannot follow {earlier.name!r}, "
@@ -180,7 +180,7 @@ class Label:
 
 
 def within(views: Views | None, shot: Shot) -> bool:
-    """Whether the shot lies in the range; True without a range."""
+    """True if the shot lies in the range; True without a range."""
     return views is None or views[0] <= shot.view < views[1]
 
 

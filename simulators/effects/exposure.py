@@ -1,4 +1,4 @@
-"""Exposure: the sample turns meanwhile, a pixel has an area, and the beam is uneven and wanders."""
+"""Effects of an exposure: the sample rotates during it, a pixel has an area, and the beam is uneven and drifts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensor: efficiency, noise, dark current, full well, offset and converter."""
+"""Effects of the sensor: efficiency, noise, dark current, full well, offset and analogue-to-digital converter."""
 
 from __future__ import annotations
 
@@ -189,8 +189,9 @@ class Adc(ImageEffect):
         """Raises CannotExposeError in the photon number readout, unless the converter is linear and has 16 bits."""
         if shot.readout == "photon_number" and (self.bits, self.nonlinearity) != (BITS, 0):
             raise CannotExposeError(
-                f"adc: photon numbers need a linear converter of {BITS} bits, got {self.bits} bits and nonlinearity "
-                f"{self.nonlinearity:g}; leave adc out, or choose the readout standard or ultra_quiet"
+                f"adc: photon numbers need a linear converter of {BITS} bits, got {self.bits} bits and "
+                f"nonlinearity {self.nonlinearity:g}; omit adc, or choose the readout standard or "
+                "ultra_quiet"
             )
         step, codes = 2.0 ** (BITS - self.bits), 2**self.bits - 1
         if self.nonlinearity:

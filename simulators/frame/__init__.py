@@ -1,1 +1,1 @@
-"""Values of one frame: pose, detector, sensor, and the conditions it is exposed under."""
+"""Values for one frame: pose, detector, sensor, and the conditions of its exposure."""

@@ -1,4 +1,4 @@
-"""Mapping: reads a scene's YAML mapping into frozen dataclasses; an error names the path of its key."""
+"""Reads a scene's YAML mapping into frozen dataclasses; an error names the path of the wrong key."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SceneError(ValueError):
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
     """`cls(**mapping)` for a dataclass of numbers, text, booleans, tuples and mappings of these, dataclasses of such
-    fields, and None where a field is optional. An annotated type may have bounds.
+    fields, and None if a field is optional. An annotated type may have bounds.
 
     A number is finite and may be given as text: YAML 1.1 reads 1e5 and 1.0e5 (no sign) as text.
 

@@ -1,7 +1,8 @@
 """Sensor: figures of the ORCA-Quest, and the conversion of electrons to counts.
 
 A beam counts detected photons, so that a photon is an electron, unless a scene names the quantum efficiency.
-The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000 electrons.
+The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000
+electrons.
 Binning is digital: charge and noise of the summed pixels add up.
 
 Photon number resolving is a readout of the camera and needs no effect. A count is an electron and there is no offset,

@@ -1,4 +1,4 @@
-"""Shot: the conditions of one exposure: the rays of the frame, the pose of the sample, moments and random numbers."""
+"""Shot: the conditions of one exposure: rays of the frame, pose of the sample, times and random numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light: beams, their energies, and materials whose attenuation depends on them."""
+"""Light: beams and their energies, and materials whose attenuation depends on the energy."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Beam:
             raise ValueError(f"sod must be positive and sdd no less, got {self.sod} and {self.sdd} mm")
         if self.sod is not None and self.sdd is not None and not NEAREST <= self.sod <= self.sdd <= FARTHEST:
             raise ValueError(
-                f"sod and sdd must lie in {NEAREST:g} ... {FARTHEST:g} mm, got {self.sod} and {self.sdd}; a beam from "
-                "farther is parallel: leave both out"
+                f"sod and sdd must be {NEAREST:g} ... {FARTHEST:g} mm, got {self.sod} and {self.sdd}. A "
+                "beam from farther away is parallel: omit both"
             )
         given = [name for name in ("energy_kev", "spectrum", "tube") if getattr(self, name) is not None]
         if len(given) > 1:
@@ -85,5 +85,5 @@ class Beam:
 
     @property
     def has_energy(self) -> bool:
-        """Whether it states its energies, as materials need."""
+        """True if it states its energies, as materials need."""
         return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

@@ -1,1 +1,1 @@
-"""Pixels: random numbers, fixed patterns and wide blurs of frames, used by effects."""
+"""Random numbers, fixed patterns and wide blurs of frames, used by effects."""

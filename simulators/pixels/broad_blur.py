@@ -1,4 +1,4 @@
-"""Broad blur: a wide, round blur, computed on a smaller image because its result has no fine detail.
+"""Broad blur: a wide, round blur, computed on a smaller image because the result has no fine detail.
 
 Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of
 (ω width)², with the angular frequency ω. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +

@@ -152,8 +152,8 @@ def poisson(image: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.
     low, high = image.min(initial=0.0), image.max(initial=0.0)
     if not (low >= 0 and high <= LARGEST):
         raise CannotExposeError(
-            f"Poisson noise: expectations must lie in 0 ... {LARGEST:g}, got {low:g} ... {high:g} photons or electrons "
-            f"a pixel; give less light or a shorter exposure"
+            f"Poisson noise: expected values must be 0 ... {LARGEST:g}, got {low:g} ... {high:g} photons "
+            "or electrons per pixel; use a weaker beam or a shorter exposure"
         )
     key = rng.integers(2**64, dtype=np.uint64)
     share_rows(lambda first, end: _poisson_rows(key, first, end, image), image.shape)

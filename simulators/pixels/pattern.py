@@ -1,4 +1,5 @@
-"""Pattern: fixed differences between the sensor's pixels: a hash of (effect, seed, row, column).
+"""Fixed pattern: differences between the sensor's pixels that are the same in all frames, from a hash of (effect,
+seed, row, column).
 
 Only the pixels of the frame are computed; they are the same for any ROI and binning.
 """

@@ -1,4 +1,4 @@
-"""Phantoms: the sample that a scene's mapping names; a kind's module is imported only when it is named."""
+"""Phantoms: builds the sample that a scene's mapping names; a kind's module is imported only if it is named."""
 
 from __future__ import annotations
 
@@ -135,8 +135,8 @@ def _place(
                 break
         else:
             raise ValueError(
-                f"only {i} of {reach.size} particles find room in a can of {radius:.3g} x {2 * half_height:.3g} mm "
-                f"(radius x height); lower fill or n_particles"
+                f"lower fill or n_particles: only {i} of {reach.size} particles fit into a can of "
+                f"{radius:.3g} x {2 * half_height:.3g} mm (radius x height)"
             )
     return centres
 

@@ -1,4 +1,4 @@
-"""Sample: the interface of all phantoms, of solids, of voxels or of materials; and a sample that changes with time."""
+"""Sample: the interface of all phantoms (solids, voxels or materials), and a sample that changes with time."""
 
 from __future__ import annotations
 

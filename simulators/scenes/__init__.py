@@ -1,1 +1,1 @@
-"""Scenes: sample, light and effects together, exposed into frames."""
+"""Scenes: sample, beam and effects together, exposed into frames."""

@@ -48,7 +48,7 @@ class Scan:
 
     @classmethod
     def of(cls, scene: Scene, seed: int = 0, views: int | None = None, start: float = 0.0) -> Scan:
-        """`views` in place of the scene's number. Raises ValueError where it is less than one."""
+        """`views` in place of the scene's number. Raises ValueError if it is less than one."""
         if views is not None and views < 1:
             raise ValueError(f"a scan needs at least one view, got {views}")
         return cls(scene, seed, start, scene.scan.views if views is None else views)
@@ -92,7 +92,7 @@ class Scan:
             IndexError: there is no such frame.
         """
         if not 0 <= number < len(self):
-            raise IndexError(f"frame {number} is not one of the scan's 0 ... {len(self) - 1}")
+            raise IndexError(f"frame {number} is not in the scan, which has 0 ... {len(self) - 1}")
         settings, scan = self.scene.detector, self.scene.scan
         view = number - scan.darks - scan.flats
         beam, sample = number >= scan.darks, view >= 0

@@ -58,7 +58,7 @@ class DetectorSettings:
     def __post_init__(self) -> None:
         if any(n * self.binning > whole for n, whole in zip(self.shape, SENSOR_SHAPE, strict=True)):
             raise ValueError(
-                f"{self.shape} pixels of {self.binning} x {self.binning} do not lie on the sensor of "
+                f"{self.shape} pixels of {self.binning} x {self.binning} do not fit on the sensor of "
                 f"{SENSOR_SHAPE[0]} x {SENSOR_SHAPE[1]}"
             )
 

@@ -1,1 +1,1 @@
-"""Simulated controllers at the far end of a wire: one folder a controller."""
+"""Simulated controllers at the other end of a serial cable: one folder per controller."""

@@ -1,6 +1,7 @@
-"""Wire: the far end of a serial cable: bytes in, bytes out; and `sim://name`, which opens it.
+"""Wire: the other end of a serial cable, bytes in and bytes out; and `sim://name`, which opens it.
 
-pyserial opens such a URL by the same code path as a real port. It finds the scheme in `simulators.wires.protocol_sim`
+pyserial opens such a URL by the same code path as a real port. It finds the scheme in
+`simulators.wires.protocol_sim`
 once this module is imported. Names are process-wide, as the ports of a computer are.
 """
 
@@ -147,7 +148,7 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
             if self._name not in _WIRES:
                 known = ", ".join(SCHEME + known for known in sorted(_WIRES)) or "none"
                 raise SerialException(
-                    f"could not open port {SCHEME}{self._name}: no such simulated port; there are {known}"
+                    f"could not open port {SCHEME}{self._name}: there is no such simulated port, only {known}"
                 )
             self._wire = _OPEN[self._name] = _WIRES[self._name]
         self._wire.transmit()  # opening a port drops earlier bytes, as an operating system does

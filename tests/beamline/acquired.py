@@ -1,4 +1,4 @@
-"""A scan by the fake instrument run to its end, and what must be true of its frames and of what it leaves."""
+"""Runs a scan with the fake instrument to its end, and checks what must hold for its frames and files."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ SETTLE = 0.05
 
 
 class Run:
-    """A scan run to its end, whatever that is."""
+    """A scan that has run to its end, however it ended."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A scan in memory that notes what is read of it."""
+"""A scan in memory that records which parts of it are read."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from beamline.storage.writers.rows import ScanEnding
 def scan_of(
     darks: NDArray[Any], flats: NDArray[Any], views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16
 ) -> ArraySource:
-    """Darks, flats and views [frame, row, col], of which the views have angles."""
+    """A scan of darks, flats and projections [frame, row, col]; the projections have angles."""
     frames, before = np.concatenate([darks, flats, views]), len(darks) + len(flats)
     keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
     return ArraySource(frames.astype(dtype), keys, np.r_[np.full(before, np.nan), angles])
 
 
 def counted(views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16) -> ArraySource:
-    """A dark of 100 counts, a flat of 20,000 more and these views."""
+    """A scan with a dark of 100 counts, a flat that is 20,000 counts brighter, and these projections."""
     dark = np.full((1, *views.shape[1:]), 100.0)
     return scan_of(dark, dark + 20_000, views, angles, dtype)
 
 
 class ArraySource(ScanSource):
-    """A scan of counts in arrays that notes what is read of it."""
+    """A scan of counts in arrays that records what is read."""
 
     path, format = Path("array"), "array"
     quantity: Quantity = "counts"
@@ -52,7 +52,7 @@ class ArraySource(ScanSource):
         self.was_read: list[tuple[list[int], int]] = []
 
     def state(self, **columns: Any) -> None:
-        """Other columns of the table."""
+        """Replace columns of the frame table."""
         self.table = replace(self.table, **columns)
 
     def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:

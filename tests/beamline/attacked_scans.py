@@ -1,4 +1,4 @@
-"""Small scans by formula, right ones of all kinds and attacked ones, whose findings test_findings.py keeps."""
+"""Small analytic scans of all kinds, correct ones and ones with a fault; test_findings.py stores their findings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OPAQUE: Any = [(0, 0, 0, 19, 0.1), (8, 4, 2, 5, 0.8)]
 
 @dataclass
 class Parts:
-    """A scan before it is written: counts [frame, row, col], angles of the views in radians, and what a file states."""
+    """A scan before it is written: counts [frame, row, col], angles in radians, and the values stated in the file."""
 
     darks: F64
     flats: F64
@@ -72,7 +72,7 @@ def camera(light: F64, seed: int) -> F64:
 def right(
     balls: Any = None, angles: F64 = HALF, axis: float = AXIS, sod: float | None = None, seed: int = 0, **change: Any
 ) -> Parts:
-    """A right scan of balls."""
+    """A correct scan of balls."""
     open_beam = np.broadcast_to(light_of(), (6, *SHAPE))
     lines = lines_of(np.array(WITHIN if balls is None else balls), angles, SHAPE, axis, sod, **change)
     parts = Parts(
@@ -132,13 +132,13 @@ Attack = Callable[[Parts], None]
 
 
 def lit(parts: Parts, factors: Any, name: str = "views") -> None:
-    """More or less light, by frame."""
+    """Multiply the intensity of each frame by a factor."""
     frames = getattr(parts, name)
     setattr(parts, name, (frames - DARK) * np.broadcast_to(factors, len(frames))[:, None, None] + DARK)
 
 
 def put(name: str, change: Callable[[F64], F64]) -> Attack:
-    """Other frames."""
+    """Replace frames."""
     return lambda parts: setattr(parts, name, change(getattr(parts, name).copy()))
 
 
@@ -147,7 +147,7 @@ def light(factors: Any, name: str = "views") -> Attack:
 
 
 def stated(angles: Callable[[F64], Any]) -> Attack:
-    """Angles stated otherwise than the sample turned, radians."""
+    """State angles (radians) that differ from the rotation of the sample."""
     return lambda parts: setattr(parts, "angles", np.asarray(angles(parts.angles), np.float64))
 
 
@@ -168,7 +168,7 @@ def both(*attacks: Attack) -> Attack:
 
 
 def with_sample(degrees: float, moved: float = 0.0, n: int = 6) -> Attack:
-    """All flats, or the first, show a sample."""
+    """The sample is in all flats, or in the first one."""
 
     def attack(parts: Parts) -> None:
         lines = lines_of(np.array(WITHIN), np.radians([degrees]), SHAPE, AXIS + moved)[0]
@@ -178,19 +178,19 @@ def with_sample(degrees: float, moved: float = 0.0, n: int = 6) -> Attack:
 
 
 def exposed(darks: float, flats: float, views: float) -> Attack:
-    """Stated exposures of darks, flats and views, s."""
+    """State exposure times in s of darks, flats and projections."""
     return lambda parts: setattr(parts, "exposures", np.array([views, flats, darks]))
 
 
 def each_exposed(parts: Parts) -> None:
-    """Views of two exposures in turn, flats of none stated."""
+    """Projections with two alternating exposure times, flats without a stated exposure time."""
     seconds = np.where(np.arange(len(parts.views)) % 2, 0.1, 0.3)
     lit(parts, seconds / 0.3)
     parts.exposures = np.concatenate([np.full(len(parts.darks) + len(parts.flats), np.nan), seconds])
 
 
 def scaled(dtype: type) -> Attack:
-    """Each view scaled by itself."""
+    """Scale each projection separately."""
 
     def attack(parts: Parts) -> None:
         low, high = (bound(parts.views, axis=(1, 2), keepdims=True) for bound in (np.min, np.max))
@@ -202,13 +202,13 @@ def scaled(dtype: type) -> Attack:
 
 
 def transmission(parts: Parts) -> None:
-    """Float images of transmission without references, whose bright ends are 1."""
+    """Float images of transmission without flats and darks; air is 1."""
     parts.views, parts.dtype = (parts.views - DARK) / light_of(), np.float32
     parts.flats, parts.darks = np.ones_like(parts.flats[:1]), np.zeros_like(parts.darks[:1])
 
 
 def integrals(parts: Parts) -> None:
-    """Line integrals without references."""
+    """Line integrals without flats and darks."""
     parts.views = -np.log(np.maximum((parts.views - DARK) / light_of(), 1e-3))
     parts.dtype, parts.quantity = np.float32, "line_integrals"
     parts.darks, parts.flats = parts.darks[:0], parts.flats[:0]
@@ -225,7 +225,7 @@ def last(n: int, factor: float = 1.0, change: Callable[[F64], F64] = lambda fram
 
 
 def crumb(parts: Parts) -> None:
-    """Something crosses the beam in ten views."""
+    """A particle crosses the beam in ten projections."""
     for step, view in enumerate(range(20, 30)):
         parts.views[view, 6:10, 5 * step : 5 * step + 6] *= 0.7
 
@@ -240,7 +240,7 @@ def jumps(cols: int, rows: int) -> Attack:
 
 
 def uneven(parts: Parts) -> None:
-    """A slit before the right half in all flats and views."""
+    """A slit in front of the right half in all flats and projections."""
     for name in ("flats", "views"):
         frames = getattr(parts, name)
         frames[:, :, 44:] = camera(0 * frames[:, :, 44:], 5)
@@ -381,4 +381,4 @@ SCANS: Mapping[str, Callable[[], Parts]] = {
     **{f"{name}, wide": (lambda name=name: attacked(name, WIDE)) for name in ATTACKS},  # type: ignore[misc]
     **MOVING,
 }
-"""All scans by name, each made anew."""
+"""Functions that make the scans, by name."""

@@ -1,4 +1,4 @@
-"""A small scan of a ball off the axis by any simulated stage, on a virtual clock: its pictures show its angles."""
+"""A small scan of a ball away from the axis, for any simulated stage on a virtual clock; the images show the angles."""
 
 from functools import cache
 from typing import Any
@@ -13,7 +13,7 @@ from beamline.plan.plan import Block
 from beamline.plan.timeline import passes
 from drivers.base.protocols import TriggerSource
 
-# A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.
+# A ball away from the axis and no effects: every frame follows Beer-Lambert, so its angle can be read from the image.
 BALL = {
     "phantom": {
         "kind": "solids",
@@ -27,7 +27,7 @@ BALL = {
 
 @cache
 def shipped(name: str, *overrides: str) -> Config:
-    """A value, read once."""
+    """The shipped configuration, read once."""
     return config.load(config.config_folder() / f"{name}.yaml", overrides, {})
 
 
@@ -37,14 +37,14 @@ def small(*overrides: str) -> Config:
 
 
 def with_scene(settings: Config, scene: dict[str, Any]) -> Config:
-    """Settings of a simulated instrument, of another scene."""
+    """Settings of a simulated instrument with another scene."""
     assert settings.simulation is not None
     simulation = settings.simulation.model_copy(update={"scene": scene})
     return settings.model_copy(update={"simulation": simulation})
 
 
 def fly(instrument: devices.ConnectedDevices, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
-    """The block's passes by hand, as acquisition does it: framestamps and counts [frame, row, col]."""
+    """Run the passes of a block as acquisition does; returns framestamps and counts [frame, row, col]."""
     stage, camera = instrument.devices.stage, instrument.devices.camera
     camera.configure(camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
     stamps, images = [], []

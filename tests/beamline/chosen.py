@@ -1,4 +1,4 @@
-"""A run of the fake instrument in passes, whose choices a test makes."""
+"""A run of the fake instrument in passes, in which the test makes the decisions."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,13 +19,13 @@ Chooser = Callable[[Passes], Choice | None]
 
 @contextmanager
 def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
-    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded; None is no answer.
+    """Scans in this context decide: `choose` is called after each pass, and its answer is recorded (None: no answer).
 
     Args:
-        pass_views: also in the configuration of the scans, by which their files are read.
+        pass_views: also set in the configuration of the scans, which is used to read their files.
     """
     recorders: list[Recorder] = []
-    pass_numbers = [0]  # of the newest pass of each scan, from 1; a resumed one counts on
+    pass_numbers = [0]  # number of the newest pass of each scan, from 1; a resumed scan continues counting
 
     def recorder(*given: Any, **more: Any) -> Recorder:
         recorders.append(Recorder(*given, **more))
@@ -59,7 +59,7 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
 
 
 class Scripted:
-    """Chooses by a script, and NEXT where that is not possible or over. Keeps what it was asked and what it chose."""
+    """Chooses according to a script, or NEXT if that is impossible or the script has ended; records all choices."""
 
     def __init__(self, script: Iterable[Choice]) -> None:
         self.script, self.asked, self.answers = iter(script), list[Passes](), list[Choice]()

@@ -1,8 +1,8 @@
-"""A device that can only be closed: it stands in for one on a port that this computer has not."""
+"""A device that can only be closed; it stands in for one on a port that this computer does not have."""
 
 
 class Closable:
-    """It counts how often it was closed."""
+    """A device that counts how often it was closed."""
 
     name = "stage"
 

@@ -1,4 +1,4 @@
-"""The smallest configuration that is good, written to a file and loaded; and what is said of one that is not."""
+"""The smallest valid configuration, written to a file and loaded; and the message about an invalid one."""
 
 from pathlib import Path
 

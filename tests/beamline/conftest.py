@@ -1,6 +1,6 @@
-"""Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time.
+"""Figures are drawn only in tests that look at them, because drawing would take most of the time of a report.
 
-The Zaber's wire is one of the tests: a fixture makes it the simulated controller of its kind.
+The simulated Zaber controller belongs to the tests; a fixture registers it for its kind.
 """
 
 import base64
@@ -14,7 +14,7 @@ _PIXEL = base64.b64decode(
 
 
 class BlankCanvas:
-    """A canvas that takes any figure and writes a picture of one pixel."""
+    """A canvas that accepts any figure and writes an image of one pixel."""
 
     def __init__(self, figure: object) -> None:
         pass
@@ -25,7 +25,7 @@ class BlankCanvas:
 
 @pytest.fixture
 def real_pictures() -> None:
-    """For tests of what a figure shows, and one of each report as a whole."""
+    """For tests of the content of a figure, and one test of each complete report."""
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture
 def simulated_zaber(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of scans with the Zaber's own driver: sim://zaber is a port of it."""
+    """For tests of scans with the Zaber driver: sim://zaber is a port of the simulated controller."""
     from beamline.instrument.simulated import WIRES
     from drivers.stages.zaber.settings import ZaberSettings
     from tests.simulators.wires.zaber.wire import ZaberBuild

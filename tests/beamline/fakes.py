@@ -1,4 +1,4 @@
-"""A fake instrument on a virtual clock; it writes what it was doing into its pixels: frames prove the choreography."""
+"""A fake instrument on a virtual clock that writes its state into its pixels, so that frames prove the sequence."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Set
@@ -29,8 +29,8 @@ from simulators.devices.motion import TrapezoidMove
 COUNTS_PER_TURN = 36000
 SHAPE = (8, 12)
 COUNT = 2 * math.pi / COUNTS_PER_TURN
-LEVEL = {False: 200, True: 20000}  # counts without and with light
-HOME = 100  # counts: where the stage stands at first
+LEVEL = {False: 200, True: 20000}  # counts without and with beam
+HOME = 100  # position of the stage at the start, in counts
 
 
 @dataclass(frozen=True)
@@ -43,25 +43,26 @@ class Exposed:
 
 @dataclass
 class Faults:
-    """By trigger number over the camera's life, counting every software and hardware trigger from 0."""
+    """Faults by trigger number; all software and hardware triggers of the camera are counted from 0."""
 
     lost: Set[int] = frozenset()
     ignored: Set[int] = frozenset()
-    extra_after: Set[int] = frozenset()  # hardware triggers after which a spurious one follows half a period on
-    noise: dict[int, float] = field(default_factory=dict)  # hardware trigger: exposure by noise, periods before it
-    errors: dict[int, int] = field(default_factory=dict)  # frame number: how often taking it raises DeviceError
-    repeats: Set[int] = frozenset()  # frames that are the one before, pixel for pixel
+    extra_after: Set[int] = frozenset()  # hardware triggers that are followed by a spurious one half a period later
+    # for a hardware trigger: an exposure caused by noise, in periods before it
+    noise: dict[int, float] = field(default_factory=dict)
+    errors: dict[int, int] = field(default_factory=dict)  # for a frame number: how often reading it raises DeviceError
+    repeats: Set[int] = frozenset()  # frames that are identical to the previous one
     stuck_shutter: bool = False
     stall_at: int | None = None  # count
 
 
 class FakeInstrument:
-    """Stage, camera, shutter and sample mover in one; `devices` is how acquisition sees it.
+    """Stage, camera, shutter and sample mover in one object; acquisition uses its `devices`.
 
-    Pixels hold the level of light and noise; in row 0, on top of the level, digits of the stage's count at the
-    trigger, whether the shutter was open and the sample in, and digits of the trigger's number; see `decode`.
-    `log` holds what the devices were told; when a frame is taken, `on_frame(number)` is called, and what stands in
-    `at` for its number.
+    Pixels contain the intensity and noise. Row 0 also encodes the stage position at the trigger in counts, whether the
+    shutter was open and the sample in the beam, and the number of the trigger; see `decode`. `log` contains the
+    commands to the devices. When a frame is taken, `on_frame(number)` is called, and the function in `at` for its
+    number.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class FakeInstrument:
     def timeline(
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
     ) -> Timeline:
-        """Work out `n` views over half a turn at `speed` (degrees/s, one pass) with 3 darks and 2 flats."""
+        """A timeline of `n` projections over 180° at `speed` (degrees/s, one pass) with 3 darks and 2 flats."""
         return self.worked_out(self.plan(n, mode, passes, at, speed))
 
     def worked_out(self, plan: ScanPlan) -> Timeline:
@@ -269,7 +270,7 @@ class Camera:
                 raise DeviceTimeout(self.name, f"no frame within {timeout} s")
             due = [time for time, _ in self.instrument.stage.pulses if time > now]
             due += [frame.time + delay for frame in self.ring[:1]]
-            # It looks every 10 ms; looks that would see nothing are left out.
+            # It checks every 10 ms; checks that would find nothing are skipped.
             looks = math.ceil((min([deadline, *due]) - now) / 0.01)
             clock.sleep(min(deadline - now, 0.01 * max(1, looks)))
 
@@ -332,12 +333,12 @@ class Sample:
 
 
 def digits(value: int) -> list[int]:
-    """Three digits to base 64, so that no pixel stands out by more than 63 counts."""
+    """Three digits in base 64, so that no pixel deviates by more than 63 counts."""
     return [value // 4096 % 64, value // 64 % 64, value % 64]
 
 
 def decode(counts: NDArray[np.uint16]) -> tuple[int, bool, bool, int]:
-    """What the instrument was doing: stage count, shutter open, sample in, trigger number."""
+    """The encoded state of the instrument: stage count, shutter open, sample in the beam, trigger number."""
     level = LEVEL[bool(counts[-1].mean() > 1000)]
     row = [int(v) - level for v in counts[0, :8]]
     count = row[0] * 4096 + row[1] * 64 + row[2]
@@ -345,7 +346,8 @@ def decode(counts: NDArray[np.uint16]) -> tuple[int, bool, bool, int]:
 
 
 def assert_true(frames: Iterable[Frame], within: float = COUNT) -> None:
-    """Each frame has the kind and the angle, to so many radians, that the camera wrote into its pixels."""
+    """Assert that each frame has the kind and (within `within` radians) the angle that the camera wrote into its
+    pixels."""
     for frame in frames:
         count, is_open, is_in, _ = decode(frame.counts)
         assert (is_open, is_in) == (frame.kind is not FrameKind.DARK, frame.kind is not FrameKind.FLAT)

@@ -1,4 +1,4 @@
-"""Parses a page of a report and fails if it is not well-formed or not self-contained."""
+"""Parses a report page; fails if it is not well-formed or not self-contained."""
 
 from html.parser import HTMLParser
 

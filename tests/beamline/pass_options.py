@@ -1,4 +1,4 @@
-"""What can be measured after a pass, as an event says it."""
+"""The choices of what to measure after a pass, as an event states them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def option(
     dose: float = 0.0,
     size: float = 0,
 ) -> dict[str, Any]:
-    """One option; `ends`: of the range of its gain, `size`: bytes."""
+    """One choice; `ends`: ends of the range of its gain; `size`: bytes."""
     costs = {"frames": frames, "seconds": seconds, "dose": dose, "bytes": size}
     return {"choice": choice, **costs, "gain": gain, "low": ends[0], "high": ends[1]}
 
 
 UNKNOWN = None, None
-"""Ends of the range of a gain that is not known."""
+"""Ends of the range of an unknown gain."""

@@ -1,4 +1,4 @@
-"""Prepared projections: of a scan as a reconstruction prepares it, or made of line integrals."""
+"""Prepared projections: from a scan as a reconstruction prepares it, or from given line integrals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recon.prep.projections import Projections
 def prepare(
     scan: Any, selection: Selection, buffer: DiskBuffer | None = None, **opened: Any
 ) -> tuple[PreparedProjections, list[str]]:
-    """The views of a source, or of a file that is `opened` so; and what was told of them."""
+    """The prepared projections of a source, or of a file opened with `opened`, and the messages about them."""
     told: list[str] = []
     with ExitStack() as until:
         source = until.enter_context(SourceOptions(scan, **opened).open()) if isinstance(scan, Path) else scan
@@ -31,14 +31,14 @@ def prepare(
 
 
 def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
-    """The evidence of a scan as a reconstruction of `selection` takes it."""
+    """The evidence of a scan as a reconstruction of `selection` uses it."""
     return ScanEvidence(source, evidence_request(source, selection))
 
 
 def prepared_views(
     data: NDArray[np.float32], geometry: Geometry, weights: NDArray[np.float32] | None = None, **more: Any
 ) -> PreparedProjections:
-    """The views of these line integrals [view, row, col], numbered in order; `more` fields by name."""
+    """Prepared projections from line integrals [view, row, col], numbered in order; `more`: further fields by name."""
     n = geometry.n_views
     masked = np.zeros(geometry.detector_shape, np.bool_)
     whole = Projections(data, np.arange(n), 0.0, np.ones(n, np.float32), masked, weights=weights)

@@ -1,4 +1,4 @@
-"""A run of the fake instrument and everything that it left, for tests of the run and of what runs beside it."""
+"""A run of the fake instrument and all its files, for tests of the run and of processes next to it."""
 
 import os
 import shutil
@@ -34,12 +34,12 @@ SMALL = (
 
 @cache
 def small(*overrides: str) -> Config:
-    """A value, read once."""
+    """A small configuration, read once."""
     return load(config_folder() / "simulated.yaml", [*SMALL, *overrides], environment={})
 
 
 class Ran:
-    """A run and everything it left."""
+    """A run and all its files."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Ran:
 
     @property
     def result(self) -> RunResult:
-        """What it came to; what it failed with is raised."""
+        """The result of the run; if it failed, its error is raised."""
         if self.error is not None:
             raise self.error
         assert self._result is not None
@@ -86,7 +86,8 @@ class Ran:
         return [event.data["state"] for event in self.of("state")]
 
     def assert_good_file(self, n: int, status: str, missing: Sequence[int] = ()) -> None:
-        """`n` rows, each with the angle that the fake camera wrote into its pixels, and nothing else."""
+        """Assert that the file has `n` rows, each with the angle that the fake camera wrote into its pixels, and no
+        others."""
         with open_scan(self.folder / "scan.h5") as source:
             assert source.finished
             frames = list(source.frames())
@@ -106,8 +107,8 @@ class Ran:
 
 @contextmanager
 def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a scan in the block writes is left as kill -9 would have, a while ago: marked as being written, and without
-    a last state."""
+    """Files of a scan in this context are left as after kill -9 some time ago: marked as being written, no last
+    state."""
     died, close, put = list[Path](), NXtomoWriter.close, RecordFile.put
 
     def put_none_of_an_end(file: RecordFile, record: RunRecord) -> None:
@@ -130,8 +131,10 @@ def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def ended_run(runs: Path, how: str, *overrides: str, at: int) -> Path:
-    """The folder of a run that was stopped, aborted or killed at a frame, or lost three views from there on: two of
-    them side by side, and the last of twelve."""
+    """The folder of a run that was stopped, aborted or killed at a frame, or lost three projections from there on.
+
+    The lost ones are two neighbours and the last of twelve.
+    """
     if how == "lossy":
         faults = Faults(lost={at}, ignored={at + 1, 16})
         return Ran(runs, FakeInstrument(faults), *overrides).folder

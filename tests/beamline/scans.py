@@ -1,4 +1,4 @@
-"""Small scans with a known answer: two cylinders along the rotation axis, seen by exact chords."""
+"""Small scans with a known answer: two cylinders along the rotation axis, projected with exact chords."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +21,7 @@ from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
 
 DARK, BEAM = 100.0, 20000.0
-# (x, y, radius, attenuation) in pixels and 1/pixel; the second one lies inside the first and adds to it.
+# (x, y, radius, attenuation) in pixels and 1/pixel; the second cylinder is inside the first and adds to it.
 CYLINDERS = ((0.0, 0.0, 13.0, 0.02), (5.0, 3.0, 3.0, 0.05))
 
 
@@ -35,7 +35,7 @@ class TwoCylinders:
     pixel_size_mm: float = 1.0
 
     def line_integrals(self) -> NDArray[np.float64]:
-        """[view, row, col], dimensionless, averaged over each pixel's width."""
+        """[view, row, col], dimensionless, averaged over the width of each pixel."""
         sub = (np.arange(8) + 0.5) / 8 - 0.5
         u = (np.arange(self.shape[1])[:, None] + sub - self.axis_col)[None]
         total = np.zeros((self.angles.size, self.shape[1]))
@@ -94,14 +94,14 @@ def write_nxtomo(path: Path, frames: NDArray[Any], keys: Any, degrees: Any) -> P
 
 
 def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -> list[Frame]:
-    """Two darks, two flats, then the views, as a camera would give them."""
+    """Two darks, two flats, then the projections, as a camera delivers them."""
     return frames_through(scan.counts(), scan.angles, time=time, period=period)
 
 
 def frames_through(
     counts: NDArray[Any], angles: NDArray[np.float64], *, beam: float = BEAM, time: float = 1.8e9, period: float = 0.1
 ) -> list[Frame]:
-    """Two darks, two flats, then these views [view, row, col]."""
+    """Two darks, two flats, then these projections [view, row, col]."""
     last = np.zeros(counts.shape[1:])
     last[-1, -1] = 1.0  # no camera takes the same image twice
     images = [np.full(last.shape, level) + bump for level in (DARK, DARK + beam) for bump in (0.0, last)]
@@ -115,7 +115,7 @@ def frames_through(
 
 
 def seal(file: h5py.File) -> None:
-    """Make what the columns of a scan file of ours say what was written: its rows get their checksums anew."""
+    """Recompute the checksums of the rows of our scan file, so that changed columns count as written."""
     with suppress(ValueError):  # a column of another length, which the readers refuse
         columns = {path: file[path][()] for path in layout.RECORDED}
         file[layout.RECORD_CHECKSUM][...] = record_checksums(columns)
@@ -129,7 +129,7 @@ def write_flagged(
     flags: Sequence[Flag] = (),
     energy_kev: float | None = None,
 ) -> Path:
-    """The frames as our scan file, in which the first check of the monitor flagged rows at these levels, or `flags`."""
+    """Write the frames as our scan file, with flags of the monitor's first check at these levels, or with `flags`."""
     with NXtomoWriter(
         path,
         ScanInfo("flagged", pixel_size_mm=pixel_size_mm, energy_kev=energy_kev),

@@ -121,7 +121,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
 def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path) -> None:
     row = 24
     with closing(ShownScan(open_scan(scan))) as shown:
-        assert shown.axis(row) == {"axis": AXIS, "said": "as the file states", "leans": False}
+        assert shown.axis(row) == {"axis": AXIS, "said": "from the file", "leans": False}
         tile = shown.fbp(row, AXIS, 0.0, TileRegion(0, 99, 0, 99), fast=False)
     step = PITCH * SOD / SDD
     z = (row - (SHAPE[0] - 1) / 2) * step
@@ -143,4 +143,4 @@ def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     for words in (("--dry-run",), ()):
         small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--memory", "1M", *words)
-        assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr
+        assert small.exit_code == 5 and "a cone-beam volume cannot be made in slabs" in small.stderr

@@ -1,4 +1,4 @@
-"""One name for one thing: no two public classes of the four packages have the same name."""
+"""No two public classes of the four packages have the same name."""
 
 import re
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""The same bits as before: line integrals, volumes and files of real scans and of scenes, against recorded digests.
+"""Bit-identical results: line integrals, volumes and files of real scans and scenes, compared with stored digests.
 
 The commands are those of users, so that the test holds whatever the inside looks like. A digest differs where a bit
 does: after a change that must not change results, no digest may differ. Where one was meant to change, say so in

@@ -1,4 +1,4 @@
-"""torch is loaded where it is needed: by fits of Gaussians and networks, and by nothing that computes on voxels."""
+"""torch is loaded only by Gaussian fits and neural networks, not by methods on voxels."""
 
 import subprocess
 import sys

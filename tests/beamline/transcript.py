@@ -1,4 +1,4 @@
-"""Transcripts: command lines, and what the command says where it refuses.
+"""Transcripts: command lines and the errors with which they end, as text files.
 
 A transcript is a text file of blocks, with an empty line between two:
 
@@ -6,12 +6,12 @@ A transcript is a text file of blocks, with an empty line between two:
     $ recon scan.h5 --config recipe.yaml (--dry-run)
     2 Error: ...
 
-Lines with `<` are files that the block has besides those of its world. The command is called with and without what is
-in brackets. The last line is the exit code and the sentence, its white space joined. Whatever is refused, stdout stays
-empty and no file changes.
+Lines with `<` define additional files for the block. The command is called with and without the part in brackets. The
+last line is the exit code and the message, with white space joined. In all cases stdout must stay empty and no file may
+change.
 
-`python -m tests.beamline.transcript [FILE ...]` writes the last lines anew, of all transcripts without a name; read
-their differences.
+`python -m tests.beamline.transcript [FILE ...]` rewrites the last lines (without a name: of all transcripts). Read the
+differences.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SCANS: dict[str, dict[str, np.ndarray | None]] = {
     "black": {"data": np.where(_IN_DARK, DARK, SCAN.counts()).astype(np.uint16)},
     "empty_field": {"data": np.full(SHAPE, DARK + BEAM, np.uint16)},
 }
-"""Good, and with what is wrong in it."""
+"""A valid scan, and scans with one fault each."""
 VOLUMES = {
     "scan": np.arange(8.0).reshape(2, 2, 2), "ramp": np.arange(120.0).reshape(4, 5, 6), "even": np.ones((4, 5, 6)),
     "holes": np.full((4, 5, 6), np.nan), "flat": np.ones((5, 6)), "scalar": np.float32(3),
@@ -61,7 +61,7 @@ VOLUMES = {
 
 @cache
 def world() -> Path:
-    """A folder with scans and what else a user may name."""
+    """A folder with scans and other files that a user may name."""
     folder = Path(_WORLD.name)
     for name, changes in SCANS.items():
         write_exchange(folder / f"{name}.h5", SCAN, changes)
@@ -79,12 +79,12 @@ def world() -> Path:
 
 
 _WORLD = TemporaryDirectory(prefix="world-")
-_LONG = re.compile(r"((?:[\w.-]+, ){4})(?:[\w.-]+, )+[\w.-]+")  # lists, to which features and add-ons add
+_LONG = re.compile(r"((?:[\w.-]+, ){4})(?:[\w.-]+, )+[\w.-]+")  # long lists, because features and add-ons extend them
 
 
 @dataclass(frozen=True)
 class Block:
-    """A command, what is in brackets, the files that it finds, and what it says with its exit code."""
+    """A command, its part in brackets, its files, and its exit code with the message."""
 
     command: str
     files: tuple[str, ...]
@@ -94,7 +94,7 @@ class Block:
         return [*self.files, f"$ {self.command}", self.said]
 
     def refused(self) -> Block:
-        """As the command refuses now."""
+        """The block with the present exit code and message."""
         plain, _, more = self.command.partition(" (")
         words = shlex.split(plain)
         said = {_said([*words, *rest]) for rest in ([], more.rstrip(")").split())}
@@ -103,7 +103,7 @@ class Block:
 
     @contextlib.contextmanager
     def in_its_world(self) -> Iterator[Path]:
-        """The current directory, as it was at the end."""
+        """The current directory; afterwards it is restored."""
         with contextlib.chdir(world()):
             for file in self.files:
                 name, _, content = file.partition(" < ")
@@ -116,7 +116,7 @@ class Block:
 
 
 def _said(words: list[str]) -> str:
-    """Exit code and sentence of a command that must not have done anything."""
+    """Exit code and message of a command, which must not have changed anything."""
     before = _stamps()
     done = beamline(*words)
     assert (done.stdout, _stamps()) == ("", before), f"{words}: {done.output}"
@@ -140,7 +140,7 @@ def read(path: Path) -> list[Block]:
 
 
 def refusals(beside: str) -> Callable[..., None]:
-    """The test of refusals.txt beside a file."""
+    """The test of the refusals.txt next to a file."""
     blocks = read(Path(beside).with_name("refusals.txt"))
 
     @pytest.mark.usefixtures("one_thread")

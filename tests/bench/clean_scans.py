@@ -1,7 +1,7 @@
-"""Clean scans: 240 of many kinds through all judgements of a reconstruction and of `info`.
+"""Clean scans: 240 of many kinds, run through all judgements of a reconstruction and of `info`.
 
-python -m tests.bench.clean_scans [FIRST [STOP]] prints every warning, and ends with 1 if there is one that no property
-of the scan explains (few views, a sample wider than the field and so on; see EXPLAINED).
+python -m tests.bench.clean_scans [FIRST [STOP]] prints every warning. It ends with exit code 1 if no property of the
+scan explains a warning (few projections, a sample wider than the field of view and so on; see EXPLAINED).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from tests.beamline.prepared_views import prepare
 COUNT = 240
 VIEWS = 2, 5, 12, 30, 45, 60, 90, 90, 120, 180, 360, 720
 EXPLAINED = {
-    "wide": r"beyond the field|wider than the field|continues? beyond|No column shows air|leaves the field",
+    "wide": r"beyond the field|wider than the field|continues? beyond|no detector column shows air|leaves the field",
     "few": r"limited angle|not a clear optimum|was not found|fewer than|at least|only",
-    "exposed": r"The projections were exposed for|The darks were exposed for",
-    "faint": r"less light through than the floor|leaves the field|No view looked at differs|zingers|dead or hot|"
-    r"All darks are 0|In places the views are brighter",
+    "exposed": r"The projections were exposed for|he darks were exposed for",
+    "faint": r"transmit less than the smallest|leaves the field|The projections show no sample|zingers|dead or hot|"
+    r"All darks are 0|locally brighter than the flats",
     "cone": r"rotation axis",
-    "always": r"got no beam, or is saturated|dead or hot|zingers",
+    "always": r"got no beam or is saturated|dead or hot|zingers",
 }
 
 Change = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
@@ -45,7 +45,7 @@ def lines_of(
 
     Args:
         sod: distance from source to axis, of a cone; the detector is at twice that distance, with pixels of 2.
-        change: the balls at a time from 0 to 1.
+        change: function that gives the balls at a time from 0 to 1.
     """
     u, v = np.meshgrid(np.arange(shape[1]) - axis_col, np.arange(shape[0]) - (shape[0] - 1) / 2)
     out = np.zeros((angles.size, *shape))
@@ -62,7 +62,7 @@ def lines_of(
 
 
 def clean_scan(seed: int, change: Change = lambda t, balls: balls, **fixed: object) -> tuple[ArraySource, set[str]]:
-    """A scan at rest in the light of its references, of random kind, and what explains words about it."""
+    """A scan of a random kind without faults, and the properties that explain messages about it."""
     rng = np.random.default_rng(seed)
     kind: dict[str, Any] = {
         "turns": 1,
@@ -134,14 +134,14 @@ def clean_scan(seed: int, change: Change = lambda t, balls: balls, **fixed: obje
     if kind["beam"] == "cone":
         source.cone, source.pixel_size_mm = (6 * half * 0.001, 12 * half * 0.001), 0.002
     why = {"always", *(name for name in ("wide", "exposed") if kind[name])}
-    directions = n // (2 if kind["beam"] == "full" and n % 2 == 0 else 1)  # half a turn apart they are the same
+    directions = n // (2 if kind["beam"] == "full" and n % 2 == 0 else 1)  # opposite directions are the same
     why |= {"few"} if directions < 30 or kind["order"] == "repeated" else set()
     why |= {"faint"} if kind["depth"] < 0.5 or kind["depth"] > 3 or kind["light"] < 300 else set()
     return source, why | {str(kind)}
 
 
 def told_of(source: ArraySource) -> list[str]:
-    """What a reconstruction, `validate` and `info` say of a scan, without what is said of every one."""
+    """The messages of a reconstruction, `validate` and `info` about a scan, without those that every scan gets."""
     told = [
         finding.message
         for finding in source_findings(ScanEvidence(cast(ScanSource, source)))
@@ -160,7 +160,7 @@ def unexplained(source: ArraySource, why: set[str]) -> list[str]:
 
 
 def main() -> int:
-    """Print the words on each scan."""
+    """Print the messages about each scan."""
     first, stop = [*map(int, sys.argv[1:]), 0, COUNT][:2] if len(sys.argv) < 3 else map(int, sys.argv[1:3])
     wrong = 0
     for seed in range(first, stop):
@@ -170,7 +170,7 @@ def main() -> int:
             print(seed, max(why, key=len))
             for sentence in said:
                 print("   ", sentence)
-    print(f"{wrong} of {stop - first} clean scans with a word")
+    print(f"{wrong} of {stop - first} clean scans with an unexplained message")
     return wrong > 0
 
 

@@ -1,23 +1,25 @@
-"""The first users' league: packed samples of many columns from few views, in the field and wider, by ours and peers.
+"""Benchmark of the first users' scan: packed samples from few projections, with our methods and other packages.
 
-python -m tests.bench.first_users SCORES.json --columns 512 --views 90 --best > tables.md
-adds what SCORES.json lacks, a volume at a time, and prints the tables of all cells asked for. Several calls may add to
-one file at once. Peers take part where they are installed, see tests.bench.league.
+python -m tests.bench.first_users SCORES.json --columns 512 --views 90 --best > tables.md adds the missing scores to
+SCORES.json, one volume at a time, and prints the tables of all requested cells. Several calls may add to one file at
+the same time. Other packages take part if they are installed, see tests.bench.league.
 
-Scenes: see tests.bench.first_users_scenes. 16 rows, 8 from 2048 columns on. The noise is that of so many photons a
-pixel in the open beam; seeds are of the noise alone, other packings of the sample have a number of their own. "wide"
-is a peer's own way to a sample wider than the field: slices as wide as the sample, of whose width it is told.
+Scenes: see tests.bench.first_users_scenes. A scan has 16 rows, or 8 from 2048 columns on. The noise is that of the
+    given number of photons per pixel in the open beam. Seeds are for the noise only; other packings of the sample have
+    their own numbers. "wide" is another package's own way to treat a sample wider than the field: it is given the width
+    of the sample and reconstructs slices of that width.
 
-dB: PSNR within 0.95 of the field's circle, over the largest density, values clipped at 0. Fraction: of voxels over half
-way between matrix and grains, inside the can's wall, over the true one's. Wrong: share of these voxels that are on the
-other side of half way than the truth. Cracks: depth over the true
-one, of 0.5 to 1, 1 to 1.5 and 1.5 to 2 voxels, see `crack_depths`. CPU seconds are of the volume alone, on one thread
-by default; what compiles did so before. Memory: peak of the process, which makes this volume alone, with all that it
-imports.
+dB: PSNR within 0.95 of the field's circle, over the largest density, values clipped at 0. Fraction: share of voxels
+    above the threshold (the middle between matrix and grains) inside the wall of the can, divided by the true share.
+    Wrong: share of these voxels that are on the other side of the threshold than in the ground truth. Cracks: depth
+    divided by the true depth, for widths of 0.5 to 1, 1 to 1.5 and 1.5 to 2 voxels, see `crack_depths`. CPU seconds:
+    for the volume alone, on one thread by default, after compilation. Memory: peak of the process that makes only this
+    volume, with its imports.
 
-The best setting is best by dB, which no user knows: from its first value the sweep climbs until it has seen lower
-quality on both sides, for the first seed; further seeds take that setting. Slices that do not know each other (ASTRA)
-are two of all rows, whose seconds count for all; of `cracks` all are made.
+The best setting is the one with the highest dB, which a user cannot know. For the first seed, the search starts at the
+first value and climbs until it has found lower quality on both sides; further seeds use that setting. If slices are
+independent (ASTRA), only two rows are reconstructed and their time is scaled to all rows; for `cracks` all rows are
+reconstructed.
 """
 
 from __future__ import annotations
@@ -55,15 +57,15 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Depths = tuple[float | None, float | None, float | None]
 VERSION = 3
-"""Of scenes and figures: scores of another one do not belong into the same table."""
+"""Version of scenes and figures; scores of different versions must not be in the same table."""
 BESIDE, ACROSS, POINTS, FEWEST = 2.5, 0.6, 60, 15
-"""Planes beside a plane, voxels away; disc over the plane's; points, and fewest."""
+"""Distance in voxels of the planes next to a crack; size of the disc divided by that of the crack; points; fewest."""
 WIDTHS = 0.5, 1.0, 1.5, 2.0
-"""Widths of cracks in voxels, between which depths are told apart."""
+"""Limits, in voxels, between the width classes of cracks."""
 
 
 class Cell(NamedTuple):
-    """One noisy scan; `over`: width of the sample over the field."""
+    """One noisy scan; `over`: width of the sample divided by the field of view."""
 
     scene: str
     columns: int
@@ -82,7 +84,7 @@ class Cell(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Figures of a volume, see above; without a quality it was ended after so many seconds."""
+    """Figures of a volume, see above; without a quality, it was ended after these seconds."""
 
     quality: float | None
     fraction: float | None
@@ -95,7 +97,7 @@ class Score(NamedTuple):
 
 
 def crack_depths(volume: F32, truth: F32, planes: Planes) -> Depths:
-    """Depth of cracks over the true one, by width as `WIDTHS`; None: there is no crack so wide.
+    """Depth of cracks divided by the true depth, for each width class of `WIDTHS`; None: there is no such crack.
 
     The depth is the mean of a disc in the crack below that of two discs `BESIDE` voxels beside it, all within the same
     ball, by linear interpolation. Discs of which fewer than 15 of 60 points lie in the rows and within 0.95 of the
@@ -127,8 +129,8 @@ def crack_depths(volume: F32, truth: F32, planes: Planes) -> Depths:
 
 
 def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, float, *Depths]:
-    """dB, fraction of grains over the true one, share of wrong voxels, and depths of cracks by width (all rows of such
-    a scene only)."""
+    """dB, fraction of grains divided by the true one, share of wrong voxels, and depths of cracks (if all rows
+    exist)."""
     volume, truth = np.maximum(volume, 0), scene.truth[list(rows)]
     x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
     away, field = np.hypot(x[:, None], x), 0.95 * truth.shape[2] / 2
@@ -142,7 +144,7 @@ def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float
 
 
 def noisy(cell: Cell, scene: Scene) -> F32:
-    """Line integrals [view, row, col] as so many photons see them."""
+    """Line integrals [view, row, col] with the noise of the cell's number of photons."""
     rng = np.random.default_rng([cell.seed, cell.columns, cell.views])
     counts = rng.poisson(cell.photons * np.exp(-scene.clean.astype(np.float64)))
     return -np.log(np.maximum(counts, 1) / cell.photons).astype(np.float32)
@@ -150,7 +152,7 @@ def noisy(cell: Cell, scene: Scene) -> F32:
 
 def _child(name: str, value: Value, over: float, case: Case, limit: float, into: Path, answer: Connection) -> None:
     warnings.simplefilter("ignore")
-    os.dup2(2, 1)  # what peers print does not belong in the table
+    os.dup2(2, 1)  # output of other packages must not go into the table
     competitor = ENTRANTS[name].of(value, over)
     make = competitor.settings[DEFAULT]
     competitor.prepare(case)
@@ -165,7 +167,7 @@ def _child(name: str, value: Value, over: float, case: Case, limit: float, into:
 
 
 def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
-    """One volume in a process of its own; None: it failed, as stderr says."""
+    """Make one volume in a separate process; None: it failed, and stderr gives the reason."""
     scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views, cell.packing)
     rows, views = list(range(cell.rows)), noisy(cell, scene)
     case = Case(cell.scene, views, scene.geometry, Grid.matching(scene.geometry), np.empty((cell.rows, 0, 0), "f4"), 1)
@@ -189,7 +191,7 @@ def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
 
 
 class Kept:
-    """Scores in a file, which several processes may add to."""
+    """Scores in a file to which several processes may add."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -222,7 +224,7 @@ class Kept:
         return {key: Score(*row) for key, row in rows.items()}
 
     def change(self, change: Callable[[dict[str, Score]], dict[str, Score]]) -> None:
-        """Change what is in the file now, which others may have added to."""
+        """Change the present content of the file; other processes may have added to it."""
         with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             self.scores = change(self._read())
@@ -231,7 +233,8 @@ class Kept:
             part.replace(self.path)
 
     def score(self, cell: Cell, name: str, setting: Value, limit: float) -> Score | None:
-        """Of the file, or made now; one that was ended is made again if the limit is higher by now."""
+        """The score in the file, or a new one; a score that was ended by the limit is repeated if the limit is higher
+        now."""
         key = f"{cell}|{name}|{setting}"
         kept = self.scores.get(key)
         if kept is None or (kept.quality is None and kept.seconds < limit):
@@ -243,13 +246,13 @@ class Kept:
         return kept
 
     def of(self, cell: Cell, name: str) -> dict[str, Score]:
-        """Scores of a method by setting."""
+        """The scores of a method by setting."""
         start = f"{cell}|{name}|"
         return {key.removeprefix(start): score for key, score in self.scores.items() if key.startswith(start)}
 
 
 def climb(quality: Callable[[Value], float], at: Callable[[int], Value]) -> Value:
-    """The best setting: from number 0 up or down until quality is lower on both sides, or there is none further."""
+    """The best setting: from number 0 up or down until the quality is lower on both sides, or there are no more."""
 
     def of(k: int) -> float:
         value = at(k)
@@ -260,7 +263,7 @@ def climb(quality: Callable[[Value], float], at: Callable[[int], Value]) -> Valu
         while (higher := of(best + step)) > top:
             best, top = best + step, higher
         if best > 0:
-            break  # what lies below was passed on the way
+            break  # lower values were already tried
     return at(best)
 
 
@@ -321,7 +324,7 @@ def tables(kept: Kept, cells: Sequence[Cell]) -> str:
             texts, memory = [], 0.0
             for n in views:
                 by_seed = [kept.of(cell, name) for cell in here if cell.views == n]
-                # A best setting is that of all seeds which have it.
+                # The best setting, for all seeds that have it.
                 setting = best_of(by_seed[0]) if best and len(by_seed[0]) > 1 else None if best else DEFAULT
                 scores = [one[setting] for one in by_seed if setting in one] if setting else []
                 memory = max([memory, *(score.memory for score in scores)])

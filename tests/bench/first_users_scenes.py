@@ -1,11 +1,13 @@
-"""Scans of the first users' samples, whose truth is known: a packed can by exact chords, with cracks or without, and
-the simulator's cathode, with fringes or without; and the bodies of tests.bench.first_users_shapes.
+"""Scans of the first users' samples with known ground truth: packed cans (exact chords) and the simulator's cathode.
 
-Lengths are in pixels of the detector, which are as wide as voxels, and densities in 1/pixel. A line integral is the
-mean of nine rays of a pixel. In the field a can is 0.96 times as wide as the field; wider cans are `over` times as
-wide. The darkest ray keeps exp(-2), of the cathode about a twentieth, for any width. Of the same cans as `packed`,
-`drift` moves across by a pixel during the scan, `rings` have pixels whose gains are off by 1 %, a few by 5 %,
-`hardening` is seen by two energies, and `cone` are ellipsoids in a cone beam from four widths of the field.
+The cans have cracks or not, the cathode has fringes or not. Other bodies are in tests.bench.first_users_shapes.
+
+Lengths are in detector pixels (voxels have the same size), densities in 1/pixel. A line integral is the mean of nine
+rays per pixel. A can within the field of view is 0.96 times as wide as the field; wider cans are `over` times as wide.
+The darkest ray has a transmission of exp(-2) for any width (cathode: about a twentieth). `drift`, `rings` and
+`hardening` use the same cans as `packed`: `drift` moves sideways by a pixel during the scan, `rings` has pixel
+sensitivities that are wrong by 1 % (a few by 5 %), `hardening` has two energies. `cone` are ellipsoids in a cone beam
+whose source is four field widths away.
 """
 
 from __future__ import annotations
@@ -37,27 +39,27 @@ from tests.simulators import shots
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 MATRIX, WALL, THICK, FILLED, DEPTH = 0.25, 0.9, 3.0, 0.4, 2.0
-"""Densities of electrolyte and wall, the wall's thickness, grains' share of the can, and the largest line integral."""
+"""Densities of electrolyte and wall, thickness of the wall, share of grains in the can, largest line integral."""
 SMALL, LARGE, PLATES, FLAT, GAP = 4.0, 13.0, 0.2, 0.25, 0.5
-"""Least and largest radius, share of plates in the grains' volume, their half thickness over radius, least distance."""
+"""Smallest and largest radius, share of plates in the grain volume, half thickness / radius, smallest distance."""
 CRACKED, OFF, WIDTHS = 8.0, 0.3, (0.5, 2.0)
-"""Least radius of a ball with a crack (of those, every second has one), its largest distance from the middle over the
-radius, and widths."""
+"""Smallest radius of a ball with a crack (every second such ball has one); largest distance of the crack from the
+middle, divided by the radius; widths of cracks."""
 SUB, TRIES = 3, 4000
 MOVED, GAINS, FEW, SOFT, SOURCE = 1.0, (0.01, 0.05), 0.02, 0.3, 4.0
-"""Pixels of a drift, errors of most and of a few gains, share of these, attenuation of two energies over their mean,
-less and more, and distance of a cone's source over the columns."""
+"""Drift in pixels; errors of most and of a few pixel sensitivities; share of these few; deviation of the two
+attenuations from their mean; distance of a cone's source, divided by the number of columns."""
 PITCH, ENERGY, DISTANCE, DELTA_BETA, FIELD = 4.6e-3, 25.0, 30.0, 90.0, 0.96
-"""Of the cathode: pixel in mm, keV, mm behind it and delta/beta of the fringes. FIELD: can over field where it fits."""
+"""Cathode: pixel in mm, energy in keV, distance in mm and delta/beta of the fringes. FIELD: width of can / field."""
 
 
 class Bodies(NamedTuple):
-    """Balls, those cut to plates by two planes around their middle, and those with a crack between two planes.
+    """Balls; some are cut to plates by two planes around their middle, some have a crack between two planes.
 
     Attributes:
         centre: [body, 3], x, y, z.
         radius: [body].
-        density: [body], over the matrix.
+        density: [body], difference from the matrix.
         plate: [body, 5], unit normal, 0, half thickness (infinite: a ball).
         crack: [body, 5], unit normal, distance from the centre, half width (0: none).
     """
@@ -71,7 +73,8 @@ class Bodies(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """Discs through balls, [disc, 3] centres and unit normals, [disc] radii, widths; width 0: a control, no crack."""
+    """Discs through balls: [disc, 3] centres and unit normals, [disc] radii and widths; width 0: no crack, for
+    control."""
 
     centre: F64
     normal: F64
@@ -81,14 +84,14 @@ class Planes:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A sample as it is, and its views.
+    """A sample with its ground truth and its projections.
 
     Attributes:
         clean: line integrals [view, row, col].
-        truth: densities [z, y, x] in the field, means over voxels.
+        truth: densities [z, y, x] in the field of view, averaged over voxels.
         levels: densities of matrix and grains.
-        inner: pixels from the axis to the can's inside.
-        planes: where cracks are looked for; None: in no scene but `cracks`.
+        inner: inner radius of the can in pixels.
+        planes: where crack depths are measured; None: the scene is not `cracks`.
     """
 
     clean: F32
@@ -109,10 +112,10 @@ def _place(
     half: float,
     wanted: float,
 ) -> F64:
-    """Places [body, 3] of bodies that do not meet, by trial, until their volumes are `wanted` (NaN: no room).
+    """Positions [body, 3] of bodies that do not touch, found by trial until their volume is `wanted` (NaN: no room).
 
-    `spheres` [sphere, 4] cover them: body b at the origin is within spheres first[b] to first[b + 1]. The space comes
-    again above and below, after 2 half."""
+    `spheres` [sphere, 4] cover them: body b at the origin is within spheres first[b] to first[b + 1]. The space repeats
+    above and below with the period 2 half."""
     cell = 2 * spheres[:, 3].max() + GAP
     across, tall = int(2 * can / cell) + 3, max(1, int(2 * half / cell))
     head = np.full(across * across * tall, -1)
@@ -181,7 +184,8 @@ def _add_view(bodies: Bodies, angle: float, u: F64, v: F64, out: F64) -> None:
 
 @njit(cache=True)
 def _between(du: float, dv: float, c: float, s: float, n: F64, low: float, high: float) -> tuple[float, float]:
-    """The part of low to high, along a ray at (du, dv) from the body's centre, between two planes as of `Bodies`."""
+    """The part of the range low to high, on a ray at (du, dv) from the body's centre, between two planes of
+    `Bodies`."""
     at, slope = du * (n[0] * c + n[1] * s) + dv * n[2] - n[3], n[1] * c - n[0] * s
     if abs(slope) < 1e-9:
         return (low, high) if abs(at) <= n[4] else (low, low)
@@ -192,7 +196,8 @@ def _between(du: float, dv: float, c: float, s: float, n: F64, low: float, high:
 
 @njit(cache=True)
 def _fill(bodies: Bodies, x: F64, z: F64, sub: int, out: F32) -> None:
-    """Add the bodies' densities to voxels [z, y, x], means of sub³ points of each that a surface may cross."""
+    """Add the densities of the bodies to voxels [z, y, x]; a voxel that a surface may cross is the mean of sub³
+    points."""
     for b in range(len(bodies.radius)):
         middle, r, plate, crack = bodies.centre[b], bodies.radius[b], bodies.plate[b], bodies.crack[b]
         for k in range(max(0, math.ceil(middle[2] - r - z[0] - 0.5)), min(len(z), int(middle[2] + r - z[0] + 1.5))):
@@ -221,8 +226,10 @@ def _directions(rng: np.random.Generator, n: int) -> F64:
 
 
 def packed_bodies(rng: np.random.Generator, can: float, half: float) -> Bodies:
-    """Balls and plates in a can of this inner radius and half height, plates and large balls first; small balls make up
-    for those that find no room."""
+    """Balls and plates in a can of this inner radius and half height; plates and large balls are placed first.
+
+    Small balls replace those that find no room.
+    """
     volume = np.pi * can**2 * 2 * half
     radii: list[F64] = []
     for share, low, high, flat in (
@@ -243,12 +250,12 @@ def packed_bodies(rng: np.random.Generator, can: float, half: float) -> Bodies:
 
 
 def _volume(radius: F64, flat: float | F64) -> F64:
-    """Of balls between two planes `flat` radii from their middles."""
+    """Volume of balls between two planes at `flat` radii from their middles."""
     return 2 * np.pi * radius**3 * (flat - flat**3 / 3)
 
 
 def _cover(radius: float, plate: F64) -> F64:
-    """Spheres [sphere, 4] that hold a ball or plate at the origin."""
+    """Spheres [sphere, 4] that together contain a ball or plate at the origin."""
     half = float(plate[4])
     if half >= radius:
         return np.array([[0, 0, 0, radius]])
@@ -263,7 +270,7 @@ def _cover(radius: float, plate: F64) -> F64:
 
 
 def _cracked(rng: np.random.Generator, bodies: Bodies, controls: int = 5) -> tuple[Bodies, Planes]:
-    """Cracks through every second large ball, and `controls` planes drawn likewise through each of the others."""
+    """Add cracks to every second large ball, and choose `controls` planes in the same way in each of the others."""
     large = np.flatnonzero((bodies.radius > CRACKED) & (bodies.plate[:, 4] >= bodies.radius))
     with_crack, without = large[::2], np.repeat(large[1::2], controls)
     ball = np.concatenate((with_crack, without))
@@ -338,18 +345,19 @@ def _hardening(cols: int, rows: int, over: float, geometry: Geometry, packing: i
 
 
 def can_radius(cols: int, over: float) -> float:
-    """Outer radius in pixels of a can `over` times as wide as the field; over 1: of one that fits."""
+    """Outer radius in pixels of a can `over` times as wide as the field; `over` 1: a can that fits into the field."""
     return cols / 2 * (over if over > 1 else FIELD)
 
 
 def _cathode(cols: int, rows: int, over: float, geometry: Geometry, packing: int, fringes: bool) -> Scene:
-    """The simulator's, whose lengths grow with the columns; a wider one has more grains of the same size."""
+    """The simulator's cathode; its lengths grow with the columns; a wider one has more grains of the same size."""
     text = (Path(__file__).parents[2] / "configs" / "scenes" / "cathode.yaml").read_text(encoding="utf-8")
     keys = yaml.safe_load(text)["phantom"]
     factor = 2 * can_radius(cols, 1) * PITCH / keys["diameter"]
     larger = {name: factor * value for name, value in keys.items() if name.endswith("_um") or name == "height"}
     keys |= {**larger, "diameter": 2 * can_radius(cols, over) * PITCH, "seed": keys["seed"] + packing}
-    sample, edge = build_sample("phantom", keys, Beam(1e5)), 2  # rows beyond, whose light the fringes move
+    # additional rows, because the fringes move intensity between rows
+    sample, edge = build_sample("phantom", keys, Beam(1e5)), 2
     detector = Detector.centred(((rows + 2 * edge) * SUB, cols * SUB), PITCH / SUB)
     effect = PhaseFringes(DELTA_BETA, DISTANCE, ENERGY, method="transport")
     shot = shots.shot(detector=Detector.centred((rows + 2 * edge, cols), PITCH))
@@ -376,12 +384,11 @@ SCENES: dict[str, Callable[[int, int, float, Geometry, int], Scene]] = {
     "pores": partial(_shapes, kind="ellipsoids", densities=(-0.85,), matrix=0.85),
     "cone": partial(_shapes, kind="ellipsoids", densities=(0.65,)),
 }
-MOST = 180  # views of a scan that is kept; 90 and 45 are every second and fourth
+MOST = 180  # projections of a stored scan; 90 and 45 are every second and fourth of them
 
 
 def scene_of(name: str, cols: int, rows: int, over: float, views: int, packing: int = 0) -> Scene:
-    """A scene's views over half a turn (a cone's: a turn), from the folder for temporary files if it was made before by
-    the same code."""
+    """A scene with projections over 180° (cone: 360°); stored in the temporary folder for reuse by the same code."""
     every = MOST // views if MOST % views == 0 else 1
     angles, shape = np.arange(views * every) * np.pi / (views * every), (rows, cols)
     source = SOURCE * cols

@@ -1,6 +1,6 @@
 """Scenes of ellipsoids, polyhedra and pores in a can, by a parallel beam or a cone: exact chords of convex bodies.
 
-Nothing in the project was tuned on them. Units, rays and voxels are those of tests.bench.first_users_scenes.
+Nothing in the project was tuned on these scenes. Units, rays and voxels are those of tests.bench.first_users_scenes.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 SUB = 3
 FACES = 9
-"""Of a polyhedron, at distances of 0.55 to 0.8 of its radius; an ellipsoid has none."""
+"""Number of faces of a polyhedron, at distances of 0.55 to 0.8 of its radius; an ellipsoid has none."""
 
 
 class Shapes(NamedTuple):
-    """Convex bodies: an ellipsoid cut by planes each.
+    """Convex bodies; each one is an ellipsoid cut by planes.
 
     Attributes:
         centre: [body, 3], x, y, z.
-        radius: [body], of a ball around it.
-        density: [body], over what is around it.
+        radius: [body], radius of the enclosing ball.
+        density: [body], difference from the surroundings.
         axes: [body, 3, 3], M of |M (x - centre)| <= 1.
         faces: [body, face, 4], n and d of n (x - centre) <= d.
     """
@@ -40,7 +40,7 @@ class Shapes(NamedTuple):
 
 
 def shapes_of(rng: np.random.Generator, kind: str, centre: F64, radius: F64, densities: tuple[float, ...]) -> Shapes:
-    """Bodies of a kind in balls that do not meet; each has one of the densities, within 4 %."""
+    """Bodies of a kind in balls that do not touch; each one has one of the densities, within 4 %."""
     n = len(radius)
     turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
     flat = np.column_stack((np.ones(n), rng.uniform(0.5, 1, n), rng.uniform(0.35, 1, n)))
@@ -87,7 +87,7 @@ def _chord(shapes: Shapes, b: int, p: F64, d: F64) -> float:
 
 @njit(cache=True)
 def _tube(radius: float, p: F64, d: F64) -> float:
-    """Length of the ray p + t d within so far of the axis."""
+    """Length of the ray p + t d within `radius` of the axis."""
     dd, qd = d[0] * d[0] + d[1] * d[1], p[0] * d[0] + p[1] * d[1]
     root = qd * qd - dd * (p[0] * p[0] + p[1] * p[1] - radius * radius)
     return 2 * math.sqrt(root) / dd if root > 0 else 0.0
@@ -95,7 +95,7 @@ def _tube(radius: float, p: F64, d: F64) -> float:
 
 @njit(cache=True)
 def _ray(angle: float, u: float, v: float, source: float, p: F64, d: F64) -> None:
-    """A ray through (u, v) of the axis' plane, from a source at this distance (0: parallel); d has length 1."""
+    """A ray through (u, v) in the plane of the axis, from a source at this distance (0: parallel); d has length 1."""
     c, s = np.cos(angle), np.sin(angle)
     p[0], p[1], p[2], d[0], d[1], d[2] = u * c, u * s, v, -s, c, 0.0
     if source > 0:
@@ -166,7 +166,7 @@ def _fill(shapes: Shapes, x: F64, z: F64, sub: int, out: F32) -> None:
 
 
 def views_of(shapes: Shapes, can: tuple[float, ...], geometry: Geometry) -> F64:
-    """Line integrals [view, row, col], means of nine rays of a pixel; `can` as of `_view`."""
+    """Line integrals [view, row, col], each the mean of nine rays in a pixel; `can` as in `_view`."""
     rows, cols = geometry.detector_shape
     u, v = (((np.arange(n * SUB) + 0.5) / SUB - n / 2) for n in (cols, rows))
     source = float(geometry.sod or 0) if geometry.is_cone else 0.0

@@ -1,10 +1,10 @@
-"""Fringes behind cathodes: dB and CPU seconds by default, by no filter, by the filter of the truth, and by that chosen.
+"""Phase fringes of cathodes: dB and CPU seconds by default, without a filter, with the right and the chosen filter.
 
     python -m tests.bench.fringes [--seeds 0,100] [--method fista-tv]
 
-Scenes `cathode` of 256 columns x 16 rows x 90 views, whose transport moves light as the wave does between sample and
-detector. PSNR in dB inside the cylinder that all views see, values clipped at 0. The seeds are added to those of the
-cases; 0 are the packings that the search was tuned on.
+Scenes `cathode` with 256 columns, 16 rows and 90 projections; the simulated propagation moves intensity as the wave
+does between sample and detector. PSNR in dB inside the cylinder that all projections see, with values clipped at 0. The
+seeds are added to those of the cases; seed 0 gives the packings on which the search was tuned.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ENERGY, PIXEL_UM, FLOOR = 25.0, 4.6, 1e-6
 
 
 class FringeCase(NamedTuple):
-    """A scan: ratio delta / beta (0: no fringes), distance in mm, photons a pixel and exposure, seed of the packing."""
+    """A scan: delta / beta (0: no fringes), distance in mm, photons per pixel and exposure, seed of the packing."""
 
     delta_beta: float
     distance_mm: float
@@ -82,7 +82,7 @@ def scan_of(case: FringeCase, cols: int = 256, rows: int = 16, views: int = 90) 
 
 
 def length_shown(views: F32, geometry: Geometry) -> float:
-    """Of the filter that `--phase auto` applies, in pixels; 0 for none."""
+    """Length, in pixels, of the filter that `--phase auto` applies; 0: no filter."""
     if not Overshoot.of(views).certain:
         return 0.0
     shown = length_by_held_out_views(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
@@ -90,7 +90,7 @@ def length_shown(views: F32, geometry: Geometry) -> float:
 
 
 def quality(views: F32, geometry: Geometry, truth: F32, method: str, length: float) -> float:
-    """dB after the filter of this length."""
+    """PSNR in dB after the filter with this length."""
     views = views.copy()
     if length:
         Paganin(length).retrieve(views, FLOOR)

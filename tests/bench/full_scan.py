@@ -1,11 +1,11 @@
-"""Makes a scan of full size, and judges the volume made of it.
+"""Makes a scan of full size and measures the quality of its volume.
 
     python tests/bench/full_scan.py make FOLDER [SIDE VIEWS]
     beamline recon FOLDER/scan.tif -m fbp --quantity line-integrals --angles FOLDER/angles.txt --axis C ...
     python tests/bench/full_scan.py judge FOLDER VOLUME.h5
 
 The scan is one BigTIFF of float32 line integrals, 1800 x 2048 x 2048: 30 GB, sparse on disk. Three bands of rows show
-ellipsoids in a cylinder; the others are holes in the file, which read as zeros.
+ellipsoids in a cylinder; the other rows are holes in the sparse file, which read as zeros.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def make(folder: Path, side: int = 2048, views: int = 1800) -> None:
 
 
 def judge(folder: Path, volume: Path) -> None:
-    """Root mean square error against the truth in each band, in parts of a grain's density; zeros between bands."""
+    """Print the RMS error in each band as a share of a grain's density, and the largest value between the bands."""
     with h5py.File(volume) as file:
         data = file["entry/data/data"]
         side = data.shape[0]

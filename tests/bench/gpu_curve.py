@@ -2,9 +2,9 @@
 
 python -m tests.bench.gpu_curve DATA teapot:75 "published 3000" "ours 1600 0" ours auto fista-tv "naf 3000"
 
-A row is `published STEPS`, `ours [STEPS [SWEEPS]]`, or another method that computes there, `METHOD [STEPS]`. DATA is
-the folder of the volumes. Each row is made once before it is measured, with few steps, so that nothing is compiled in
-its seconds. PROFILE=1 prints what the host did.
+A row is `published STEPS`, `ours [STEPS [ITERATIONS]]`, or another method that runs on the device, `METHOD [STEPS]`.
+DATA is the folder of the volumes. Each row is run once with few steps before it is measured, so that its time contains
+no compilation. PROFILE=1 prints a profile of the host.
 """
 
 from __future__ import annotations

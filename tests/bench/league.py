@@ -1,15 +1,16 @@
-"""A league: our methods and every peer that is installed, on the same scans, by default and by the best setting.
+"""Benchmark: our methods and all installed packages on the same scans, with default and best settings.
 
-python -m tests.bench.league SCORES.json [--scans "bone;Diamond"] [--of svmbir] [--small] > table.md
-adds scores to the file, and prints the table of all that are in it. pip install ".[league]" brings the peers that need
-no compiler. ASTRA (GPL) and mbirjax (JAX) take part where they are installed.
+python -m tests.bench.league SCORES.json [--scans "bone;Diamond"] [--of svmbir] [--small] > table.md adds scores to the
+file and prints the table of all scores in it. pip install ".[league]" installs the other packages that need no
+compiler. ASTRA (GPL) and mbirjax (JAX) take part if they are installed.
 
-50 views of 10⁵ photons by exact strip integrals through voxels half as wide (a cone: four rays a pixel, through voxels
-a quarter as wide), and Diamond's scan. 129 columns, so that the axis lies on the middle of a pixel, which scikit-image
-takes for granted. PSNR in dB inside the cylinder that all views see, values clipped at 0; of Diamond -20 log10 of the
-RMS that is left of views never seen, by strip integrals through the volume, which are no method's own. The best setting
-is best by these, which no user knows. Two threads; each competitor has a process of its own, whose peak memory counts
-with all that it imports. CPU seconds of the volume alone; what compiles did so before.
+The scans have 50 projections with 10⁵ photons, from exact strip integrals through voxels half as wide (a cone: four
+rays per pixel through voxels a quarter as wide); in addition, Diamond's scan. There are 129 columns, so that the axis
+is in the middle of a pixel, as scikit-image assumes. PSNR in dB inside the cylinder that all projections see, with
+values clipped at 0. For Diamond: -20 log10 of the RMS residual in projections that were never used, from strip
+integrals through the volume, which no method uses itself. The best setting is the one with the highest of these values,
+which a user cannot know. Two threads; each competitor has its own process, whose peak memory includes its imports. CPU
+seconds are for the volume alone, after compilation.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ from tests.bench.quality_cases import (
 
 F32 = NDArray[np.float32]
 VIEWS, PHOTONS, THREADS = 50, 1e5, 2
-SLICES = 2  # that a competitor makes who treats them alone
+SLICES = 2  # number of slices for a competitor that treats slices independently
 DATA = Path("../shared/data")
 
 
 class Score(NamedTuple):
-    """`setting` by its quality in dB, CPU seconds and peak memory of the process in MB."""
+    """A setting with its quality in dB, CPU seconds and peak memory of the process in MB."""
 
     setting: str
     quality: float
@@ -58,7 +59,7 @@ class Score(NamedTuple):
 
 
 def _odd(name: str) -> Callable[[Path], Case]:
-    """`slab` of one column and row more."""
+    """The `slab` with one more column and row."""
 
     def load(folder: Path) -> Case:
         fine = {**quality_cases.SLABS, **TEXTURED}[name]
@@ -80,7 +81,7 @@ SCANS: dict[str, Callable[[Path], Case]] = {
 
 
 def smaller(case: Case, rows: int = 4) -> Case:
-    """The middle rows alone, for a test; a cone as it is."""
+    """Only the middle rows, for a test; a cone is unchanged."""
     geometry = case.geometry
     if geometry.is_cone:
         return case
@@ -89,7 +90,7 @@ def smaller(case: Case, rows: int = 4) -> Case:
 
 
 def judged(case: Case, volume: F32) -> float:
-    """dB of a volume [z, y, x] in 1/pixel."""
+    """Quality in dB of a volume [z, y, x] in 1/pixel."""
     volume = (np.maximum(volume, 0) / np.float32(case.geometry.sample_pitch)).astype(np.float32)
     if case.unseen is not None:
         views, geometry, counts = case.unseen
@@ -101,13 +102,13 @@ def judged(case: Case, volume: F32) -> float:
 
 
 def peak_memory() -> float:
-    """Of this process, MB."""
+    """Peak memory of this process in MB."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
 
 
 def play(name: str, case: Case) -> list[Score]:
-    """One competitor on one case, by each setting."""
+    """Run one competitor on one case with each setting."""
     competitor, share = LEAGUE[name], 1.0
     rows = case.geometry.detector_shape[0]
     if competitor.slice_by_slice and not case.geometry.is_cone and rows > SLICES:
@@ -129,7 +130,7 @@ def play(name: str, case: Case) -> list[Score]:
 
 def _child(name: str, case: Case) -> list[Score]:
     warnings.simplefilter("ignore")
-    os.dup2(2, 1)  # what peers print does not belong in the table
+    os.dup2(2, 1)  # output of other packages must not go into the table
     return play(name, case)
 
 
@@ -139,7 +140,7 @@ def _cell(score: Score) -> str:
 
 
 def table(scores: dict[str, dict[str, list[Score]]]) -> str:
-    """Markdown: a competitor by default, and below it by its best setting; the memory is the largest of all scans."""
+    """Markdown: each competitor with its default and below it with its best setting; memory: largest of all scans."""
     scans = list(scores)
     lines = ["| | " + " | ".join(scans) + " | MB |", "|---" * (len(scans) + 2) + "|"]
     for name in LEAGUE:
@@ -164,7 +165,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--small", action="store_true", help="four rows each")
     asked = parser.parse_args(arguments)
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = str(THREADS)  # of the competitors' processes
+        os.environ[variable] = str(THREADS)  # for the processes of the competitors
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
     kept = json.loads(asked.scores.read_text()) if asked.scores.exists() else {}
     for scan in asked.scans.split(";"):

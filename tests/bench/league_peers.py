@@ -1,7 +1,7 @@
-"""Who plays in the league: our methods and peers, each by default first, then by other values of its main setting.
+"""The methods of the benchmark: ours and other packages, each with its default and other values of its main setting.
 
-A volume is [z, y, x] in 1/pixel. The second axis of the peers' volumes runs against ours. A setting that does not take
-a geometry on the CPU raises NotImplementedError.
+A volume is [z, y, x] in 1/pixel. The second axis of other packages' volumes has the opposite direction to ours. A
+setting that does not support a geometry on the CPU raises NotImplementedError.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from recon.warm_up import warm_up
 from tests.bench.quality_cases import Case
 
 F32 = NDArray[np.float32]
-Value = Any  # of a method's main setting, a number or a name; None: the default
+Value = Any  # value of a method's main setting, a number or a name; None: the default
 DEFAULT = "default"
 WEIGHTS = 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2
 THRESHOLDS = 0.01, 0.02, 0.04, 0.08
@@ -32,14 +32,14 @@ THRESHOLDS = 0.01, 0.02, 0.04, 0.08
 
 @dataclass(frozen=True)
 class Competitor:
-    """A program with a way to reconstruct.
+    """A program and its reconstruction method.
 
     Attributes:
-        settings: by what distinguishes them, the default first; each makes the volume of a case.
-        module: that must be installed.
-        slice_by_slice: slices do not know each other, so that some of them tell quality and time of all.
-        compiles: the first volume compiles for its shape, and does not count.
-        prepare: is called before time is taken.
+        settings: functions that make the volume of a case, by the label of the setting, the default first.
+        module: module that must be installed.
+        slice_by_slice: True: slices are independent, so that a few of them suffice for quality and time.
+        compiles: True: the first volume of a shape includes compilation and does not count.
+        prepare: called before the time is measured.
     """
 
     settings: Mapping[str, Callable[[Case], F32]]
@@ -109,18 +109,18 @@ def _iradon_sart(sweeps: int) -> Callable[[Case], F32]:
 
 
 def _within(volume: F32, side: int) -> F32:
-    """The middle of slices [z, y, x] that are wider."""
+    """The middle part of wider slices [z, y, x]."""
     first = (volume.shape[2] - side) // 2
     return volume[:, first : first + side, first : first + side]
 
 
 def _wider(side: int, by: float) -> int:
-    """An even number more."""
+    """The width of wider slices; the difference is even."""
     return side + 2 * round((by - 1) * side / 2)
 
 
 def _astra(algorithm: str, iterations: int = 1, widen: float = 1) -> Callable[[Case], F32]:
-    """`widen`: the slices that it makes are so many times as wide as the field."""
+    """`widen`: width of the slices divided by that of the field of view."""
 
     def volume(views: F32, geometry: Geometry) -> F32:
         import astra
@@ -146,7 +146,7 @@ def _astra(algorithm: str, iterations: int = 1, widen: float = 1) -> Callable[[C
 
 
 def _svmbir(widen: float = 1, **settings: float) -> Callable[[Case], F32]:
-    """`widen`: the slices that it makes are so many times as wide as the field, its own way to a wider sample."""
+    """`widen`: width of the slices divided by that of the field of view; svmbir's own way to treat a wider sample."""
 
     def volume(case: Case) -> F32:
         import svmbir
@@ -155,7 +155,8 @@ def _svmbir(widen: float = 1, **settings: float) -> Callable[[Case], F32]:
             raise NotImplementedError
         side = case.geometry.detector_shape[1]
         whole, threads = _wider(side, widen), int(os.environ.get("OMP_NUM_THREADS", 2))
-        with tempfile.TemporaryDirectory() as folder:  # system matrices of earlier scans
+        # a new folder, because it stores system matrices of earlier scans
+        with tempfile.TemporaryDirectory() as folder:
             found = svmbir.recon(
                 case.projections, case.geometry.angles, weights=case.weights, center_offset=off_middle(case.geometry),
                 num_rows=whole, num_cols=whole, num_threads=threads, verbose=0, svmbir_lib_path=folder, **settings,
@@ -173,7 +174,7 @@ def _mbirjax(**settings: float) -> Callable[[Case], F32]:
 
         geometry, grid = case.geometry, case.grid
         if not geometry.is_cone:
-            raise NotImplementedError  # as svmbir, of the same authors, but slower
+            raise NotImplementedError  # the same method as svmbir, by the same authors, but slower
         distances = geometry.sdd / geometry.pixel_pitch, geometry.sod / geometry.pixel_pitch
         np.random.seed(0)  # noqa: NPY002 - the order of its updates
         model = mbirjax.ConeBeamModel(case.projections.shape, geometry.angles, *distances)
@@ -190,7 +191,7 @@ def _mbirjax(**settings: float) -> Callable[[Case], F32]:
 
 
 def _mbir_parallel(module: str, widen: float = 1, **settings: float) -> Callable[[Case], F32]:
-    """mbirjax or mbirtorch, of the authors of svmbir, by a parallel beam; `widen` as there."""
+    """mbirjax or mbirtorch, by the authors of svmbir, for a parallel beam; `widen` as for svmbir."""
 
     def volume(case: Case) -> F32:
         if case.geometry.is_cone or case.grid.shape[1] != case.geometry.detector_shape[1]:
@@ -207,7 +208,7 @@ def _mbir_parallel(module: str, widen: float = 1, **settings: float) -> Callable
 
 
 def _corrct(weight: float | None, iterations: int) -> Callable[[Case], F32]:
-    """By scikit-image's projector where there is no CUDA."""
+    """corrct, with scikit-image's projector if there is no CUDA."""
 
     def volume(views: F32, geometry: Geometry) -> F32:
         from corrct import projectors, regularizers, solvers
@@ -260,13 +261,14 @@ LEAGUE: dict[str, Competitor] = {
 
 
 class Entrant(NamedTuple):
-    """A method, volume by volume.
+    """A method in tests.bench.first_users.
 
     Attributes:
-        of: by a value of its main setting, for a sample so many times as wide as the field.
-        setting: its name.
-        at: value k of a sweep, in order; None: there is none.
-        wide_alone: takes part only where the sample is wider than the field.
+        of: function that gives the competitor for a value of its main setting and a sample width (divided by the
+            field).
+        setting: name of the main setting.
+        at: function that gives value k of the search, in order; None: there is no further value.
+        wide_alone: True: takes part only if the sample is wider than the field.
     """
 
     of: Callable[[Value, float], Competitor]
@@ -324,4 +326,4 @@ ENTRANTS: dict[str, Entrant] = {
     "auto": Entrant(_own(lambda value: recon.Auto())),
     **dict(_peers()),
 }
-"""Of tests.bench.first_users, in the order of its tables."""
+"""The entrants of tests.bench.first_users, in the order of its tables."""

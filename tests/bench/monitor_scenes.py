@@ -1,8 +1,8 @@
-"""Scenes for the monitor's figures: clean scans that are hard, anomalies of a stated strength, and their playback
-without a file.
+"""Scenes for the monitor's detection rates: difficult clean scans, and anomalies of a stated strength, without files.
 
-A frame is the simulator's; it is digested and looked at as in a scan. Anomalies come from the simulator's own effects,
-whose labels say where they are; what no effect does (dark rows, a step of the gain) is done to the counts here.
+Frames come from the simulator and are processed as in a scan. Anomalies come from the simulator's effects, whose labels
+state their positions. Anomalies for which there is no effect (dark rows, a step of the gain) are added to the counts
+here.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PROFILE = {"kind": "beam_profile", "sigma": [1.6, 0.8], "stripes": 0.03, "stripe
 
 
 def battery(width: float = 1.2, n_particles: int = 400, seed: int = 11) -> dict[str, Any]:
-    """As high as the frame is: the can fills all rows, as a stack of slices out of a longer can does."""
+    """A battery that fills all rows, as a part of a longer can does."""
     return {"kind": "battery", "field_of_view": [width, 1.2], "n_particles": n_particles, "seed": seed}
 
 
@@ -65,19 +65,19 @@ def _solids(*solids: Mapping[str, Any]) -> dict[str, Any]:
 
 
 SPARSE = _solids(
-    {"kind": "cylinder", "radius": 0.6, "height": 1.2, "attenuation": 1.5},  # a tube: its bore is taken off
+    {"kind": "cylinder", "radius": 0.6, "height": 1.2, "attenuation": 1.5},  # a tube: its bore is subtracted
     {"kind": "cylinder", "radius": 0.57, "height": 1.2, "attenuation": -1.5},
     {"kind": "ellipsoid", "semi_axes": [0.03, 0.03, 0.03], "attenuation": 9.0, "centre": [0.4, 0.1, 0.02]},
     {"kind": "ellipsoid", "semi_axes": [0.02, 0.02, 0.02], "attenuation": 9.0, "centre": [-0.2, 0.45, -0.05]},
     {"kind": "box", "edges": [0.12, 0.1, 0.14], "attenuation": 4.0, "centre": [-0.2, -0.12, 0.05]},
 )
-FLAT_FACES = _solids(  # faces in the beam's direction: the silhouette changes at once
+FLAT_FACES = _solids(  # faces along the beam, so that the silhouette changes abruptly
     {"kind": "box", "edges": [0.9, 0.5, 1.2], "attenuation": 1.5},
     {"kind": "box", "edges": [0.3, 0.1, 0.14], "attenuation": 5.0, "centre": [-0.2, -0.12, 0.05]},
 )
 
 CLEAN: dict[str, Callable[[int], dict[str, Any]]] = {
-    # n: 0, 1, ... gives other samples
+    # n = 0, 1, ... gives different samples
     "battery": lambda n: scene(battery(seed=100 + n), PROFILE, {"kind": "ring_current", "lifetime": 36000.0}),
     "coarse": lambda n: scene(battery(seed=200 + n), PROFILE, views=180),
     "sparse": lambda n: scene(SPARSE, PROFILE),
@@ -114,11 +114,11 @@ CLEAN: dict[str, Callable[[int], dict[str, Any]]] = {
         PROFILE | {"wander": [0.0, 1.0e-3]},
     ),
 }
-"""Clean scans by the difficulty that they hold."""
+"""Clean scans, by the difficulty they contain."""
 
 
 class Remembered:
-    """A sample whose line integrals are kept for each pose: many scans of it cost one."""
+    """A sample whose line integrals are stored for each pose, so that many scans take the time of one."""
 
     def __init__(self, sample: Sample) -> None:
         self._sample, self._kept = sample, dict[bytes, NDArray[np.float32]]()
@@ -148,7 +148,7 @@ class Remembered:
 
 @dataclass(frozen=True)
 class Several:
-    """Several effects of one kind as one: a scene names each kind once."""
+    """Several effects of one kind combined, because a scene may contain each kind only once."""
 
     parts: tuple[Any, ...]
 
@@ -170,7 +170,7 @@ class Several:
 
 @dataclass(frozen=True)
 class Steps:
-    """The light, or the gain, steps by `share` at the view and stays. Labelled for one view."""
+    """The intensity or the gain changes by `share` at one projection and stays. The label is for that projection."""
 
     view: int
     share: float
@@ -191,7 +191,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Blurred:
-    """The light is blurred by a Gaussian of (down, across) pixels in a range of views."""
+    """The intensity is blurred by a Gaussian of (down, across) pixels in a range of projections."""
 
     sigma: tuple[float, float]
     views: tuple[int, int]
@@ -213,7 +213,7 @@ class Blurred:
 
 @dataclass(frozen=True)
 class DarkLines:
-    """Rows, or columns, without light in a range of views; the offset and its noise stay."""
+    """Rows or columns without intensity in a range of projections; the offset and its noise stay."""
 
     lines: slice
     axis: int
@@ -239,7 +239,7 @@ class DarkLines:
 
 @dataclass(frozen=True)
 class Storm:
-    """Zingers in a range of views, beside those of the scene."""
+    """Zingers in a range of projections, in addition to those of the scene."""
 
     zingers: Zingers
     views: tuple[int, int]
@@ -258,8 +258,8 @@ class Storm:
 
 
 Make = Callable[[np.random.Generator, int], Any]
-"""An anomaly, drawn from a generator, for a scan of so many views."""
-CALIBRATION = 40  # views before the first anomaly
+"""Function that draws an anomaly from a generator, for a scan with a given number of projections."""
+CALIBRATION = 40  # projections before the first anomaly
 
 
 def _views(rng: np.random.Generator, views: int, least: int = CALIBRATION, spare: int = 30) -> int:
@@ -267,8 +267,10 @@ def _views(rng: np.random.Generator, views: int, least: int = CALIBRATION, spare
 
 
 def floater(radius: float, depth: float, motion: str = "turning", away: tuple[float, float] = (1.5, 3.75)) -> Make:
-    """A cloud of the standard deviation of a ball of `radius` px (radius / 2 along each axis), `depth` through its
-    middle. Turning: `away` times as far from the axis as the frame's edge; loose: 2 to 20 px a view."""
+    """A cloud with the standard deviation of a ball of `radius` px (radius / 2 along each axis), `depth` at its middle.
+
+    "turning": `away` times as far from the axis as the edge of the frame; loose: it moves 2 to 20 px per projection.
+    """
 
     def make(rng: np.random.Generator, views: int) -> Floaters:
         seed, half = int(rng.integers(2**31)), WIDTH / 2
@@ -292,7 +294,7 @@ def floater(radius: float, depth: float, motion: str = "turning", away: tuple[fl
 
 
 def ghost(gain: float) -> Make:
-    """As wide as an eighth to a third of the frame; it crosses it in 10 to 60 views."""
+    """A ghost that is an eighth to a third of the frame wide and crosses it in 10 to 60 projections."""
 
     def make(rng: np.random.Generator, views: int) -> Ghost:
         width = WIDTH * rng.uniform(0.125, 0.33)
@@ -303,7 +305,7 @@ def ghost(gain: float) -> Make:
 
 
 def jump(pixels: float, down: bool) -> Make:
-    """Across the beam, as it is when it happens, or vertically."""
+    """A jump across the beam (at the angle at which it happens) or vertically."""
 
     def make(rng: np.random.Generator, views: int) -> Jump:
         view = _views(rng, views)
@@ -343,7 +345,7 @@ def band(lines: int, axis: int) -> Make:
 
 
 def storm(share: float, charge: float) -> Make:
-    """On average so many zingers a pixel, of so many electrons on average (exponentially distributed)."""
+    """`share` zingers per pixel on average, with `charge` electrons on average (exponentially distributed)."""
 
     def make(rng: np.random.Generator, views: int) -> Storm:
         first = _views(rng, views)
@@ -355,7 +357,7 @@ def storm(share: float, charge: float) -> Make:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A frame as the monitor sees it, and its labels."""
+    """A frame as the monitor sees it, with its labels."""
 
     frame: Frame
     digest: FrameDigest
@@ -363,7 +365,7 @@ class Seen:
 
 
 def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
-    """The scene with anomalies before the noise, each in its domain."""
+    """The scene with anomalies inserted before the noise, each in its domain."""
     effects: list[AnyEffect] = list(base.chain.effects)
     for domain in {anomaly.domain for anomaly in anomalies}:
         added = [anomaly for anomaly in anomalies if anomaly.domain == domain]
@@ -380,7 +382,7 @@ def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
 
 
 def seen(scene: Scene, seed: int, preview_bin: int = BIN, views: Sequence[int] | None = None) -> Iterator[Seen]:
-    """The frames of a scan of the scene, or of some of its `views` after the darks and flats."""
+    """The frames of a scan of the scene, or only some `views` after the darks and flats."""
     row, scan = 0, Scan.of(scene, seed)
     for planned in scan:
         shot, projection = planned.shot, planned.kind is FrameKind.PROJECTION

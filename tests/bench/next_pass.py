@@ -1,13 +1,13 @@
-"""The next pass: what a scan's volume gains by each pass, and how few frames the best choice in hindsight takes.
+"""The next pass: the gain of each pass, and the fewest frames of the best choice, known afterwards.
 
-python -m tests.bench.next_pass SCORES.json --scenes 0,1,2
-adds the volumes that SCORES.json lacks, and prints a table. Several calls may add to one file at once.
+python -m tests.bench.next_pass SCORES.json --scenes 0,1,2 adds the missing volumes to SCORES.json and prints a table.
+Several calls may add to one file at the same time.
 
-Scenes: see tests.bench.next_pass_scenes. A state of a scan is the passes that it has, with those taken twice, wide
-views and views taken again where it has them. Its quality is that of the volume that the default method makes of these
-views, with the diameter of a sample wider than the field as the configuration states it: PSNR in dB within 0.95 of the
-field's circle, over the largest density, values clipped at 0. Middle: mean density within 0.3 of the field over the
-true one.
+Scenes: see tests.bench.next_pass_scenes. A state of a scan is the passes it has, including passes taken twice,
+    laterally offset projections and repeated projections. Its quality is that of the volume of the default method from
+    these projections, with the sample diameter from the configuration if the sample is wider than the field: PSNR in dB
+    within 0.95 of the field's circle, relative to the largest density, with values clipped at 0. Middle: mean density
+    within 0.3 of the field, divided by the true one.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from tests.bench.next_pass_scenes import COLS, CRUMBED, DEV, PASS, PASSES, RECIP
 
 F32 = NDArray[np.float32]
 VERSION = 1
-"""Of scenes and figures: scores of another one do not belong into the same table."""
+"""Version of scenes and figures; scores of different versions must not be in the same table."""
 SEEN, MIDDLE, WISH = 0.95, 0.3, 1.0
-"""Of the field's radius: what is judged, and the middle; dB that may lack."""
+"""Shares of the field's radius: evaluated region, and middle; dB that may be missing."""
 
 
 class State(NamedTuple):
-    """What a scan has of the plan: `passes` in its order, those of `again` once more, and what it took beside them."""
+    """The measured part of the plan: `passes` in order, those of `again` a second time, and further projections."""
 
     passes: int
     again: tuple[int, ...] = ()
@@ -57,13 +57,13 @@ class State(NamedTuple):
         return f"{self.passes}{again}{'w' if self.wide else ''}{'r' if self.retaken else ''}"
 
     def frames(self, number: int) -> int:
-        """Exposures of the sample."""
+        """Number of exposures of the sample."""
         wide = scene_of(number).geometry.n_views - VIEWS if self.wide else 0
         return (self.passes + len(self.again)) * PASS + wide + (len(CRUMBED) if self.retaken else 0)
 
 
 class Score(NamedTuple):
-    """Of a volume: dB, density of the middle over the true one, and CPU seconds."""
+    """Score of a volume: dB, density of the middle divided by the true one, and CPU seconds."""
 
     quality: float
     middle: float
@@ -71,18 +71,18 @@ class Score(NamedTuple):
 
 
 def whole_plan(number: int) -> State:
-    """All that the plan of a scene has."""
+    """The state after the whole plan of a scene."""
     recipe = RECIPES[number]
     return State(PASSES, wide=recipe.over > 1, retaken=recipe.crumb)
 
 
 def views_of(number: int, seed: int, state: State) -> tuple[F32, Geometry]:
-    """Line integrals and geometry of the views of a state, in the order taken, without those that a crumb spoils."""
+    """Line integrals and geometry of the projections of a state, in order, without those that a particle spoils."""
     scene, n_planned = _scene(number), state.passes * PASS
     spoilt = np.zeros(scene.geometry.n_views, np.bool_)
     if RECIPES[number].crumb:
         spoilt[CRUMBED.start : CRUMBED.stop] = True
-    parts = [(0, np.flatnonzero(~spoilt[:n_planned]))]  # take, and numbers of its views
+    parts = [(0, np.flatnonzero(~spoilt[:n_planned]))]  # measurement, and numbers of its projections
     for k, repeated in enumerate(state.again):
         take = 1 + state.again[:k].count(repeated)
         parts.append((take, np.arange(repeated * PASS, (repeated + 1) * PASS)))
@@ -109,7 +109,7 @@ def use_of(number: int) -> DataUse:
 
 
 def judged(volume: F32, truth: F32) -> tuple[float, float]:
-    """dB, and the density of the middle over the true one."""
+    """dB, and the density of the middle divided by the true one."""
     x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
     away = np.hypot(x[:, None], x) / (truth.shape[2] / 2)
     error = np.mean(np.square(np.maximum(volume, 0) - truth, dtype=np.float64)[:, away < SEEN])
@@ -128,7 +128,7 @@ def measured(number: int, seed: int, state: State, method: str) -> Score:
 
 
 class Law(NamedTuple):
-    """The values of an `ErrorLaw`, dB by the last pass as it measures them, and CPU seconds."""
+    """The values of an `ErrorLaw`, the gain of the last pass in dB according to it, and CPU seconds."""
 
     n_views: int
     exponent: float
@@ -140,7 +140,7 @@ class Law(NamedTuple):
 
 
 def law_of(number: int, seed: int, state: State) -> Law:
-    """The law at the end of a pass, of the views that a live reconstruction has then."""
+    """The error model at the end of a pass, from the projections that a live reconstruction has then."""
     views, geometry = views_of(number, seed, state)
     earlier = (views_of(number, seed, State(passes))[0] for passes in range(1, state.passes))
     sizes = [*map(len, earlier), len(views)]
@@ -156,7 +156,7 @@ def _law_code() -> str:
 
 
 class ScoreFile:
-    """Scores and laws in a file, which several processes may add to."""
+    """Scores and error models in a file to which several processes may add."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -177,7 +177,7 @@ class ScoreFile:
         return scores, laws
 
     def _add(self, scores: dict[str, Score], laws: dict[str, Law]) -> None:
-        """Add to what is in the file by now."""
+        """Add to the present content of the file."""
         with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             before = self._read()
@@ -188,7 +188,7 @@ class ScoreFile:
             part.replace(self.path)
 
     def score(self, number: int, state: State, seed: int = 0, method: str = DEFAULT) -> Score:
-        """Of the file, or made now."""
+        """The score in the file, or a new one."""
         key = f"{number}|{seed}|{method}|{state}"
         if key not in self.scores:
             score = measured(number, seed, state, method)
@@ -201,7 +201,7 @@ class ScoreFile:
         return f"{number}|0|{DEFAULT}|{state}" in self.scores
 
     def law(self, number: int, seed: int, state: State) -> ErrorLaw:
-        """Of the file, or measured now; its key has a sum of the code that measures."""
+        """The error model in the file, or a new one; the key contains a checksum of the code that measures it."""
         key = f"{number}|{seed}|{_law_code()}|{state}"
         if key not in self.laws:
             law = law_of(number, seed, state)
@@ -211,10 +211,10 @@ class ScoreFile:
 
 
 def hindsight(number: int, scores: ScoreFile, below: float = WISH) -> State:
-    """The state of the fewest frames that is at most `below` dB under the whole plan's.
+    """The state with the fewest frames whose quality is at most `below` dB lower than that of the whole plan.
 
-    Each of the plan's passes is taken to improve the volume, so that few states are looked at. States with passes taken
-    twice count where the file has them.
+    Each pass is assumed to improve the volume, so that few states are examined. States with passes taken twice count if
+    the file contains them.
     """
     whole = whole_plan(number)
     least = scores.score(number, whole).quality - below
@@ -235,12 +235,12 @@ def hindsight(number: int, scores: ScoreFile, below: float = WISH) -> State:
 
 
 def _with(state: State, passes: int) -> State:
-    """A state of so many passes; before the crumb there is nothing to take again."""
+    """The state with this number of passes; before the particle appears, nothing is repeated."""
     return state._replace(passes=passes, retaken=state.retaken and passes * PASS > CRUMBED.start)
 
 
 def fixed(number: int, scores: ScoreFile, frames: int) -> float:
-    """dB of the fixed plan of so many frames, between those of whole passes; offset views and retakes come last."""
+    """dB of the fixed plan with this number of frames (interpolated); offset and repeated projections come last."""
     whole = whole_plan(number)
     if frames >= VIEWS:
         return scores.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality
@@ -251,7 +251,7 @@ def fixed(number: int, scores: ScoreFile, frames: int) -> float:
 
 
 def table(scores: ScoreFile, numbers: Sequence[int]) -> str:
-    """Markdown: dB by passes, the fewest frames in hindsight, and the density of the middle with the whole plan."""
+    """Markdown: dB by passes, the fewest frames known afterwards, and the density of the middle with the whole plan."""
     heads = [f"{PASS * passes}" for passes in range(1, PASSES + 1)]
     lines = ["| scene | " + " | ".join(heads) + " | whole plan | hindsight | middle |", "|---" * (len(heads) + 4) + "|"]
     for number in numbers:

@@ -1,8 +1,7 @@
-"""The scenes of next_pass as whole scans with simulated devices and a virtual clock, which decide for themselves.
+"""The scenes of next_pass as complete scans with simulated devices and a virtual clock, which decide themselves.
 
-python -m tests.bench.next_pass_devices FOLDER --scenes 0,2,4,5
-runs `beamline scan` with `scan.decide: do` in FOLDER, and prints what the file says: decisions, frames, and the real
-seconds from the last frame of a pass to the decision.
+python -m tests.bench.next_pass_devices FOLDER --scenes 0,2,4,5 runs `beamline scan` with `scan.decide: do` in FOLDER,
+and prints from its file: decisions, frames, and the real time in s from the last frame of a pass to the decision.
 """
 
 from __future__ import annotations
@@ -46,11 +45,11 @@ from tests.bench.next_pass_scenes import (
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "simulated.yaml"
 EXPOSURE, SENSOR, MOST_PHOTONS = 0.05, (2304, 4096), 6e3
-"""s; rows and columns; what a pixel of the camera holds with room for noise, so that bright scenes are less so here."""
+"""s; rows and columns; photons that fit into a pixel with room for noise (bright scenes are darker here)."""
 
 
 def scene_of(number: int) -> dict[str, Any]:
-    """The scene in the beam, as keys; a loose crumb stands for the bench's, and nothing for its drift."""
+    """The scene as configuration keys; a floating particle replaces that of the benchmark; there is no drift."""
     recipe = RECIPES[number]
     effects: list[Any] = ["pixel_area"]
     if recipe.fringes:
@@ -70,7 +69,7 @@ def scene_of(number: int) -> dict[str, Any]:
 
 
 def config_of(number: int, **more: object) -> Config:
-    """The scan of a scene; `more` are other values of the configuration."""
+    """The scan of a scene; `more`: further values of the configuration."""
     recipe, (rows, cols) = RECIPES[number], SENSOR
     values: dict[str, object] = {
         "sample.name": f"next_pass_{number}",
@@ -91,7 +90,8 @@ def config_of(number: int, **more: object) -> Config:
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """A scan that decided: its file's decisions, rows, and real seconds from the last frame of a pass to each."""
+    """A scan that decided: decisions and rows of its file, and real seconds from the last frame of a pass to each
+    decision."""
 
     decisions: tuple[Mapping[str, Any], ...]
     rows: int

@@ -1,12 +1,12 @@
-"""Scans that decide after each pass, on the curves of next_pass: what `do` chooses, and what it reaches.
+"""Scans that decide after each pass, on the curves of next_pass: the choices of `do`, and the result.
 
-python -m tests.bench.next_pass_policy SCORES.json --scenes 0,1,2 --seeds 0,1,2
-adds the laws and volumes that SCORES.json lacks, and prints the tables; see next_pass for both.
+python -m tests.bench.next_pass_policy SCORES.json --scenes 0,1,2 --seeds 0,1,2 adds the missing error models and
+volumes to SCORES.json and prints the tables; see next_pass for both.
 
-The law of a pass end is measured from the views of three noise seeds, in the geometry of the scan, with no more than a
-live reconstruction has; quality is that of volumes of seed 0, which other noise changes by some hundredths of a dB. The
-plan is that of the same scan with simulated devices. A prediction is of the next pass of the plan, also where another
-choice was made, and is right within 0.3 dB or 30 % of the gain in the curve.
+The error model at the end of a pass is measured from the projections with three noise seeds, in the geometry of the
+scan, with only the data that a live reconstruction has. The quality is that of volumes with seed 0; other noise changes
+it by some hundredths of a dB. The plan is that of the same scan with simulated devices. A prediction is for the next
+pass of the plan, even if another choice was made. It counts as right within 0.3 dB or 30 % of the gain in the curve.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CLOSE_DB, CLOSE_SHARE = 0.3, 0.3
 
 @dataclass(frozen=True)
 class Step:
-    """A pass end: the passes so far, the law of their error, what is chosen, and dB by all that the plan still has."""
+    """The end of a pass: passes so far, their error model, the choice, and the gain in dB of the rest of the plan."""
 
     state: State
     law: ErrorLaw
@@ -89,14 +89,14 @@ def _retakes(number: int, state: State) -> int:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a scan that decides came to, beside fixed plans and the best choice in hindsight.
+    """The result of a scan that decides, compared with fixed plans and with the best choice, known afterwards.
 
     Attributes:
-        ratio: frames over those of hindsight.
-        below: dB under the whole plan.
-        over_fixed: dB over the fixed plan of as many frames.
-        right: of each prediction, whether it was.
-        middle: density there over the true one.
+        ratio: frames, divided by those of the best choice.
+        below: dB below the whole plan.
+        over_fixed: dB above the fixed plan with as many frames.
+        right: for each prediction, whether it was right.
+        middle: density in the middle, divided by the true one.
     """
 
     state: State
@@ -131,7 +131,7 @@ def outcome(number: int, seed: int, scores: ScoreFile, target: ScanTarget) -> Ou
 
 
 def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], target: ScanTarget) -> str:
-    """Markdown: medians of the seeds for each scene, and in the last line what was asked of all."""
+    """Markdown: medians over the seeds for each scene; the last line summarises all scenes."""
     lines = [
         "| scene | ends with | frames | over hindsight | below all, dB | over fixed, dB | predictions | middle |",
         "|---" * 8 + "|",

@@ -1,20 +1,20 @@
-"""Twenty frozen scenes of scans in passes: ten to build on, ten to look at once.
+"""Twenty fixed scenes of scans in passes: ten for development, ten to be used once.
 
-Lengths are in pixels of the detector, which are as wide as voxels, and densities in 1/pixel. 128 columns x 8 rows, 720
-views over half a turn in 8 interlaced passes, line integrals as means of nine rays of a pixel, the noise of so many
-photons a pixel in the open beam. A sample that is wider than the field has offset views too: at 4 angles it is stepped
-aside by 0.9 of the field to either side. A drifting sample moves across the beam, steadily, by `DRIFT` pixels from the
-first view to the last. A crumb crosses the field in `CRUMBED` views of the third pass; they are flagged, and no volume
-uses them unless they were taken again.
+Lengths are in detector pixels (voxels have the same size), densities in 1/pixel. A scan has 128 columns x 8 rows and
+720 projections over 180° in 8 interlaced passes. Line integrals are means of nine rays per pixel, with the noise of the
+given number of photons per pixel in the open beam. A sample that is wider than the field also has laterally offset
+projections: at 4 angles it is moved by 0.9 of the field to either side. A drifting sample moves steadily across the
+beam by `DRIFT` pixels from the first projection to the last. A particle crosses the field in `CRUMBED` projections of
+the third pass; these are flagged, and no volume uses them unless they were repeated.
 
-The truth is the density, mean over each voxel, of a drifting sample where it stands at the first view. Views with
-fringes show more than the density: bright rims, which a volume of more views shows better, not worse, and which are no
-error of it. So the truth of such a scene is the density plus what the fringes add to a volume without noise, where
-nothing but the fringes differs: FISTA-TV of noiseless views with them at twice as many angles, less the same of views
-without them, clipped at 0 like the volumes that are judged. The volume of views with fringes alone would not do: as the
-method's own limit it has no error of the method, and gains would seem larger than of scenes without fringes. Filtered
-back projection of the fringes alone would not do either: it is smoother than the methods' volumes, and all of them
-move away from it with more views.
+The ground truth is the density, averaged over each voxel; for a drifting sample, at its position in the first
+projection. Projections with fringes show more than the density: bright rims, which a volume from more projections shows
+better, and which are not an error. So the ground truth of such a scene is the density plus the contribution of the
+fringes to a volume without noise. This contribution is the FISTA-TV volume of noiseless projections with fringes at
+twice as many angles, minus that without fringes, clipped at 0 like the evaluated volumes. The volume with fringes alone
+would not be suitable: it is the limit of the method itself and contains no error of the method, so gains would seem
+larger than in scenes without fringes. FBP of the fringes alone would not be suitable either, because it is smoother
+than the volumes of the methods, and all of them differ more from it with more projections.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ F64 = NDArray[np.float64]
 COLS, ROWS, VIEWS, PASSES, WIDE_ANGLES = 128, 8, 720, 8, 4
 PASS = VIEWS // PASSES
 PITCH, FIELD, SUB, EDGE = 4.6e-3, 0.96, 3, 2
-"""Pixel in mm, sample over field where it fits, rays a pixel and axis, pixels beyond whose light the fringes move."""
+"""Pixel in mm; width of a fitting sample / field; rays per pixel and axis; extra pixels, because fringes move
+intensity."""
 DRIFT, CRUMBED, CRUMB_DEPTH, CRUMB_SIZE = 0.1, range(200, 224), 0.8, 6.0
 PARTICLE, TALL = 6.0, 100.0
-"""Of batteries: median radius of a particle, and height of the electrolyte."""
+"""Batteries: median radius of a particle, and height of the electrolyte."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene; `over`: width of the sample over the field, `photons`: of a pixel in the open beam."""
+    """A scene; `over`: width of the sample / field, `photons`: per pixel in the open beam."""
 
     sample: str
     over: float = 1.0
@@ -93,8 +94,10 @@ RECIPES = (
 )
 DEV, ONCE = range(10), range(10, 20)
 OPTICS = {"battery": (5.0, 30.0, 8.3485), "cathode": (90.0, 10.0, 25.0)}
-"""delta/beta, mm behind the sample and keV of the fringes, as of the scenes shipped, the cathode nearer: at 30 mm
-some pixels of its rims would have no light left, whose line integrals mean nothing."""
+"""delta/beta, distance in mm and energy in keV of the fringes, as in the shipped scenes.
+
+The cathode is nearer: at 30 mm, some pixels at its rims would have no intensity left, and no meaningful line integral.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +105,11 @@ class Scene:
     """A scan without noise.
 
     Attributes:
-        clean: line integrals [view, row, col] in the order of acquisition, then of the offset views; without crumb.
-        crumb: [view, row, col], what a crumb adds to the views of `CRUMBED`; of no view in other scenes.
-        truth: [z, y, x], see the module.
-        geometry: of the views, then of the offset views.
+        clean: line integrals [view, row, col] in the order of acquisition, then of the offset projections; without
+            particle.
+        crumb: [view, row, col], contribution of the particle to the projections `CRUMBED`; empty in other scenes.
+        truth: ground truth [z, y, x], see the module.
+        geometry: of the projections, then of the offset ones.
     """
 
     clean: F32
@@ -115,7 +119,7 @@ class Scene:
 
 
 def geometry_of(over: float, angles: F64) -> Geometry:
-    """Views at these angles, and the offset views of a sample that is wider than the field."""
+    """Geometry at these angles, with the offset projections of a sample that is wider than the field."""
     places = (-0.9 * COLS, 0.9 * COLS) if over > 1 else ()
     wide = np.arange(WIDE_ANGLES) * np.pi / WIDE_ANGLES
     shifts = np.zeros((angles.size + len(places) * WIDE_ANGLES, 2))
@@ -124,7 +128,7 @@ def geometry_of(over: float, angles: F64) -> Geometry:
 
 
 def mapping_of(recipe: Recipe, number: int) -> dict[str, object]:
-    """The phantom as keys of a scene; wider samples have more grains of the same size."""
+    """The phantom as keys of a scene; a wider sample has more grains of the same size."""
     radius = COLS / 2 * (recipe.over if recipe.over > 1 else FIELD)
     if recipe.sample == "battery":
         inside = 0.95 * radius
@@ -139,7 +143,7 @@ def mapping_of(recipe: Recipe, number: int) -> dict[str, object]:
 
 
 def _lines(sample: Sample, geometry: Geometry, moved: F64, fringes: ImageEffect | None) -> tuple[F32, F32 | None]:
-    """Line integrals [view, row, col] of a sample that stands `moved` [view] pixels aside, and with fringes."""
+    """Line integrals [view, row, col] of a sample that is displaced by `moved` [view] pixels, with fringes."""
     rows, cols = ROWS + 2 * EDGE, COLS + 2 * EDGE
     shot = shots.shot(detector=Detector.centred((rows, cols), PITCH))
     plain = np.empty((geometry.n_views, ROWS, COLS), np.float32)
@@ -173,7 +177,7 @@ def made(number: int) -> Scene:
 
 
 def _shown_by(fringes: ImageEffect, sample: Sample) -> F32:
-    """[z, y, x], what fringes add to a volume of noiseless views at twice as many angles."""
+    """[z, y, x] contribution of fringes to a volume of noiseless projections at twice as many angles."""
     twice = Geometry.parallel(np.arange(2 * VIEWS) * np.pi / (2 * VIEWS), (ROWS, COLS))
     without, with_fringes = _lines(sample, twice, np.zeros(2 * VIEWS), fringes)
     assert with_fringes is not None
@@ -182,7 +186,7 @@ def _shown_by(fringes: ImageEffect, sample: Sample) -> F32:
 
 
 def _crumb(number: int) -> F32:
-    """The optical depth of a loose crumb in the views of `CRUMBED`, from one side of the field to the other."""
+    """The line integrals of a particle that crosses the field in the projections `CRUMBED`."""
     rng = np.random.default_rng(number)
     height, side = rng.uniform(0, ROWS), rng.choice((-1, 1))
     at = side * np.linspace(-COLS / 2, COLS / 2, len(CRUMBED)) + COLS / 2
@@ -192,7 +196,7 @@ def _crumb(number: int) -> F32:
 
 
 def scene_of(number: int) -> Scene:
-    """A scene, from the folder for temporary files if it was made before by the same code."""
+    """A scene; it is stored in the temporary folder for reuse by the same code."""
     code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
     kept = Path(tempfile.gettempdir()) / "next_pass" / f"{number}_{code}.npz"
     geometry = geometry_of(RECIPES[number].over, interlaced(VIEWS, PASSES))
@@ -207,9 +211,9 @@ def scene_of(number: int) -> Scene:
 
 
 def noisy(number: int, scene: Scene, seed: int, take: int = 0) -> F32:
-    """Line integrals [view, row, col] as so many photons see them; seeds are of the noise alone, and so are takes.
+    """Line integrals [view, row, col] with photon noise; seeds and takes change only the noise.
 
-    Take 0 has the crumb. Views that are taken again are of take 1, 2, ..., which have other noise and no crumb.
+    Take 0 contains the particle. Repeated projections are takes 1, 2, ..., with other noise and without the particle.
     """
     photons, lines = RECIPES[number].photons, scene.clean.copy()
     if scene.crumb.size and take == 0:
@@ -219,7 +223,7 @@ def noisy(number: int, scene: Scene, seed: int, take: int = 0) -> F32:
 
 
 def open_beam(number: int, seed: int, frames: int = 20) -> F32:
-    """Line integrals [frame, row, col] of frames without the sample, noise alone."""
+    """Line integrals [frame, row, col] of frames without the sample (only noise)."""
     photons = RECIPES[number].photons
     counts = np.random.default_rng([number, seed, 99]).poisson(photons, (frames, ROWS, COLS))
     return -np.log(np.maximum(counts, 1) / counts.mean(axis=0)).astype(np.float32)

@@ -1,9 +1,9 @@
-"""Scans for quality tables: real volumes seen by a cone as in the published protocol, a measured walnut, a battery.
+"""Scans for quality tables: real volumes in a cone as in the published protocol, a measured walnut, a battery.
 
 The published protocol (Zha et al. 2024): DSO 5, DSD 7, a detector of 4 x 4 of 512² pixels, the volume a cube of edge 2
-with 256³ voxels; Poisson noise of 1e5 photons plus normal noise of 10 on views scaled to a largest value of 1. Half the
-size (256² pixels, 128³ voxels) keeps all ratios; its data come from the volume of twice the resolution, so that no
-method is given data of its own making.
+with 256³ voxels; Poisson noise of 1e5 photons plus normal noise of 10, on projections scaled to a largest value of 1.
+Half the size (256² pixels, 128³ voxels) keeps all ratios. Its data come from the volume with twice the resolution, so
+that no method gets data from its own projector.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Views and what they should become; PSNR is taken with `peak`, on values clipped at 0.
+    """Projections and the ground truth; PSNR is computed with `peak`, on values clipped at 0.
 
     Attributes:
-        weights: of the rays; None: all alike.
-        unseen: views that judge in place of a truth, their geometry, and whether a ray [view, row, col] counts.
+        weights: weights of the rays; None: all equal.
+        unseen: projections for evaluation if there is no ground truth, their geometry, and whether a ray counts.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Case:
 
 
 def rows_of(case: Case, rows: Sequence[int]) -> Case:
-    """A case of these rows of a parallel beam, as if they were neighbours."""
+    """A case with only these rows of a parallel beam, treated as neighbours."""
     chosen, shape = list(rows), (len(rows), case.geometry.detector_shape[1])
     unseen = case.unseen
 
@@ -71,9 +71,9 @@ def rows_of(case: Case, rows: Sequence[int]) -> Case:
 
 
 def seen_by_simulator(fine: F32, geometry: Geometry, voxel: float | None = None) -> F32:
-    """Line integrals [view, row, col] by the simulator's projector, 2 x 2 rays a pixel: no method uses it.
+    """Line integrals [view, row, col] from the simulator's projector (which no method uses), 2 x 2 rays per pixel.
 
-    `voxel`: the edge of one of `fine`; None: of a cube of edge 2.
+    `voxel`: voxel edge of `fine`; None: that of a cube of edge 2.
     """
     sample = Voxels.of(fine, voxel or 2 / len(fine))
     rows, cols = geometry.detector_shape
@@ -84,7 +84,7 @@ def seen_by_simulator(fine: F32, geometry: Geometry, voxel: float | None = None)
 
 
 def strip_integrals(volume: F32, geometry: Geometry) -> F32:
-    """Exact means [view, row, col] over pixels of the line integrals of cubes of constant density, by a parallel beam.
+    """Exact pixel means [view, row, col] of the line integrals through cubes of constant density, in a parallel beam.
 
     A pixel is as wide as a voxel, and rows show slices. A square casts a trapezoid: the convolution of boxes as wide as
     the cosine and the sine of the angle, whose integral up to the edges of a pixel is a sum of four ramps squared.
@@ -111,12 +111,12 @@ def strip_integrals(volume: F32, geometry: Geometry) -> F32:
 
 
 def seen_by_engine(fine: F32, geometry: Geometry) -> F32:
-    """Line integrals [view, row, col] by the projector of the classical methods."""
+    """Line integrals [view, row, col] from the projector of the classical methods."""
     return Projector(geometry, Grid(fine.shape, 2 / len(fine))).forward(fine)
 
 
 def cone(folder: Path, name: str, views: int, size: int, seen: Callable[[F32, Geometry], F32] = seen_by_engine) -> Case:
-    """An object of the protocol on size³ voxels and (2 size)² pixels, seen as 256³ voxels."""
+    """An object of the protocol on size³ voxels and (2 size)² pixels, projected from 256³ voxels."""
     fine = padded(OBJECTS[name](folder), 256)
     factor = 256 // size
     truth = fine.reshape(size, factor, size, factor, size, factor).mean(axis=(1, 3, 5), dtype=np.float32)
@@ -126,7 +126,7 @@ def cone(folder: Path, name: str, views: int, size: int, seen: Callable[[F32, Ge
 
 
 def walnut(folder: Path, views: int) -> Case:
-    """Every so many-th of 240 measured views of a slab; its reference is an FDK of all 241 cone views."""
+    """Every n-th of 240 measured projections of a slab; the reference is an FDK of all 241 cone projections."""
     with h5py.File(folder / "walnut_parallel_rebinned_240x96x256.h5") as file:
         found: list[h5py.Dataset] = []
         file.visititems(lambda _, node: found.append(node) if getattr(node, "ndim", 0) == 3 else None)
@@ -138,7 +138,7 @@ def walnut(folder: Path, views: int) -> Case:
 
 
 def walnut_halved(folder: Path, views: int) -> Case:
-    """Pixels and voxels of `walnut` twice as large, 32 of its 48 slices."""
+    """`walnut` with pixels and voxels twice as large, 32 of its 48 slices."""
     fine = walnut(folder, views)
     data = fine.projections.reshape(views, 48, 2, 128, 2).mean(axis=(2, 4))[:, 8:40]
     truth = fine.truth.reshape(48, 2, 128, 2, 128, 2).mean(axis=(1, 3, 5))[8:40]
@@ -147,7 +147,7 @@ def walnut_halved(folder: Path, views: int) -> Case:
 
 
 def diamond(folder: Path, views: int) -> Case:
-    """32 rows of Diamond 24737, at most 76 of its 91 views; the other 15 judge."""
+    """32 rows of Diamond 24737, at most 76 of its 91 projections; the other 15 are for evaluation."""
     from beamline.projections.prepare import prepare_projections  # a machine that fits Gaussians has no readers
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
@@ -166,7 +166,8 @@ def diamond(folder: Path, views: int) -> Case:
 
 
 def slab(folder: Path, name: str, views: int, photons: float = 5000) -> Case:
-    """40 x 128² voxels of one of SLABS, by a parallel beam, from views of twice the resolution by no method."""
+    """40 x 128² voxels of one of SLABS in a parallel beam, from projections with twice the resolution (independent
+    code)."""
     fine = SLABS[name](folder)
     angles = np.linspace(0, np.pi, views, endpoint=False)
     rows, side = fine.shape[0] // 2, fine.shape[2] // 2
@@ -182,7 +183,7 @@ def slab(folder: Path, name: str, views: int, photons: float = 5000) -> Case:
 
 
 def dense_battery(views: int, side: int = 256, photons: float = 2e4, particles: int = 300) -> Case:
-    """A can full of particles: piecewise constant, the home ground of total variation. Four rays a pixel."""
+    """A can full of particles: piecewise constant, which suits total variation best. Four rays per pixel."""
     pitch = 1.0 / side
     rng = np.random.default_rng(0)
     phantom = Phantom.of(battery(rng, (1.0, 1.0), particles))
@@ -203,7 +204,7 @@ def first_of(path: Path) -> F32:
 
 
 def _thorax(folder: Path) -> F32:
-    """Hounsfield units of a NIfTI-1 file, -1000 to 1500 to 0 to 1."""
+    """Hounsfield units of a NIfTI-1 file; -1000 to 1500 is mapped to 0 to 1."""
     raw = gzip.decompress((folder / "totalseg_thorax_ct_191x167x233.nii.gz").read_bytes())
     shape = np.frombuffer(raw, np.int16, 4, 40)[1:]
     kind = {4: np.int16, 16: np.float32}[int(np.frombuffer(raw, np.int16, 1, 70)[0])]
@@ -226,7 +227,7 @@ OBJECTS: dict[str, Callable[[Path], F32]] = {
 
 
 def _grains(folder: Path) -> F32:
-    """Random polyhedra of five densities, a sixth of them empty, as in a cement."""
+    """Random polyhedra with five densities, a sixth of them empty, as in cement."""
     rng = np.random.default_rng(3)
     z, y, x = np.indices(_FINE, np.float32)
     seeds = rng.uniform(0, 1, (900, 3)) * _FINE
@@ -236,7 +237,7 @@ def _grains(folder: Path) -> F32:
 
 
 def _foam(folder: Path) -> F32:
-    """Branching struts with a fine texture of a ninth of their density, as in a bone."""
+    """Branching struts with a fine texture of a ninth of their density, as in bone."""
     rng = np.random.default_rng(4)
     struts, texture = (gaussian_filter(rng.normal(size=_FINE), s) for s in (3, 1.2))
     _, y, x = np.indices(_FINE, np.float32)
@@ -264,8 +265,9 @@ def _textured(name: str, own_voxels: bool) -> Callable[[Path], F32]:
     """Slices of a CT volume, 0 outside the field.
 
     Args:
-        own_voxels: 24 slices, interpolated to twice the resolution, so that the voxels of the case are those of the CT,
-            whose edges are one or two wide; else 80 slices as they are, whose structure is finer than those voxels.
+        own_voxels: True: 24 slices, interpolated to twice the resolution, so that the voxels of the case are those of
+            the CT, whose edges are one or two voxels wide. False: 80 original slices, whose structure is finer than the
+            voxels.
     """
 
     def load(folder: Path) -> F32:
@@ -284,7 +286,7 @@ TEXTURED = {
 
 
 def walnut_held_out(folder: Path) -> Case:
-    """60 of 240 measured views, and the 60 between them."""
+    """60 of 240 measured projections, and the 60 between them."""
     case, other = walnut_halved(folder, 120), np.arange(1, 120, 2)
     rays = np.ones(case.projections[other].shape, np.bool_)
     unseen = case.projections[other], case.geometry.select(other), rays

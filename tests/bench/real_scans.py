@@ -1,7 +1,7 @@
-"""The commands and pictures of docs/real_scans.md, from the real scans beside the checkout.
+"""The commands and pictures of docs/real_scans.md, from the real scans next to the checkout.
 
 Run from the root of the checkout with  python -m tests.bench.real_scans FOLDER  (some minutes). Volumes and logs stay
-in FOLDER; where it exists, the pictures alone are drawn anew. They go to docs/.
+in FOLDER. If it exists, only the pictures are drawn again. They are written to docs/.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ WALNUT = "walnut_parallel_rebinned_240x96x256.h5 --quantity line-integrals --vie
 
 @dataclass(frozen=True)
 class Shown:
-    """Two volumes of a scan, before and after, and the parts of one slice that are shown.
+    """Two volumes of a scan, before and after, and the displayed parts of one slice.
 
     Attributes:
-        before, after: commands; their outputs are the names after -o.
-        titles: of the two.
-        slice: its number.
+        before, after: commands; their outputs are named after -o.
+        titles: titles of the two volumes.
+        slice: number of the slice.
         windows: a grey window for each part.
         parts: rows and columns (first, end) of each part.
     """

@@ -1,9 +1,10 @@
-"""Whole commands by width: CPU and wall seconds a slice, the peak of memory beside the plan's, PSNR to the truth.
+"""Whole commands by detector width: CPU and wall seconds per slice, peak and planned memory, PSNR.
 
     python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT OPTION ...]
 
-The scan is one TIFF of line integrals with the noise of 10 000 photons, of grains in a cylinder. One warm-up of 64
-columns compiles. A command that takes longer than LIMIT seconds (600) is ended. OPTIONs go to `recon` as they are.
+The scan is one TIFF of line integrals of grains in a cylinder, with the noise of 10 000 photons. A warm-up with 64
+columns compiles the kernels. A command that takes longer than LIMIT seconds (600) is ended. OPTIONs are passed to
+`recon`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _MEMORY = "16G"
 
 
 def sample_of(cols: int, rows: int) -> Phantom:
-    """Grains in a cylinder, in pixels; a path through the cylinder's middle has a line integral of 1.5."""
+    """Grains in a cylinder, in pixels; a path through the middle of the cylinder has a line integral of 1.5."""
     rng, side = np.random.default_rng(0), float(cols)
     places = zip(0.4 * side * np.sqrt(rng.random(200)), rng.uniform(0, 2 * np.pi, 200), strict=True)
     grains = [
@@ -61,7 +62,7 @@ def command(path: Path, method: str, cols: int, *more: str) -> list[str]:
 
 
 def quality(path: Path, sample: Phantom) -> float:
-    """PSNR of a volume, dB: its peak is the truth's largest value; slice by slice."""
+    """PSNR of a volume in dB, with the largest value of the ground truth as peak; computed slice by slice."""
     volume = read_reconstruction(path).volume
     squares, peak = 0.0, 0.0
     for z in range(volume.grid.shape[0]):

@@ -1,4 +1,4 @@
-"""A small sample of spheres."""
+"""A small simulated sample of spheres."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def spheres(side: int = 96, rows: int = 48, views: int = 60, photons: float = 1e
     """A sample with a known answer: spheres in a cylinder, exact chords, photon noise.
 
     Returns:
-        Line integrals [view, row, col] with the noise of so many photons a pixel (infinite: none), their geometry, and
+        Line integrals [view, row, col] with the noise of `photons` per pixel (infinite: no noise), their geometry, and
         the attenuation [z, y, x] averaged over each voxel.
     """
     rng = np.random.default_rng(3)

@@ -1,12 +1,12 @@
-"""The first minute and the first second: a table of whole commands, several runs of each checkout in turn.
+"""Start-up times: a table of whole commands, several runs of each checkout in turn.
 
     python tests/bench/table_of_times.py FOLDER [CHECKOUT ...] [--runs 5] [--only WORD] [--only WORD]
 
-FOLDER takes scans, environments and results; measured scans come from ../shared/data beside this checkout. Each row is
-run once of every checkout (this one where none is named), then again, so that a busy minute falls on all of them. Times
-are s from the start of the command: the median, and the least and the most in brackets. The first run of a row that is
-not about a first run is left out: it compiles. A row by level is run for each level of x86-64 that the processor has.
-Quiet machine, two cores: nothing else may run.
+FOLDER is for scans, environments and results; measured scans come from ../shared/data next to this checkout. Each row
+is run once with every checkout (this one if none is named), then again, so that a busy minute affects all of them.
+Times are in s from the start of the command: the median, and in brackets the smallest and the largest. The first run of
+a row is left out, because it compiles, unless the row is about a first run. A row "by level" is run for each level of
+x86-64 that the processor supports. Quiet machine, two cores: nothing else may run.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ FIVE = {
 
 @dataclass(frozen=True)
 class Row:
-    """A command and the moments in it that are wanted.
+    """A command and the moments in it that are timed.
 
     Attributes:
-        words: after `beamline`, or of pip where `install` is set.
-        moments: names of events whose first time is wanted; "word" is the first output of any kind.
-        new: the packages as they were installed a moment ago: nothing compiled but what they carry.
-        first_run: with no kernel compiled, and none carried.
-        by_level: once for each level of x86-64.
-        refused: the command ends with an error.
+        words: arguments of `beamline`, or of pip if `install` is set.
+        moments: names of events whose first time is measured; "word" is the first output of any kind.
+        new: True: newly installed packages, with only the compiled code that they contain.
+        first_run: True: no kernel is compiled or included.
+        by_level: True: run once for each level of x86-64.
+        refused: True: the command ends with an error.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""How fast frames are taken, checked and written, beside a plain write of the same bytes, stage by stage.
+"""Speed of taking, checking and writing frames, compared with plain writing, for each stage.
 
 Run with  pytest -m bench -s tests/bench/test_acquisition.py --basetemp FOLDER/acquisition : FOLDER is on the disk for
 scans. Stages are measured in turn, several times over, as disks and machines change their speed meanwhile: ratios are

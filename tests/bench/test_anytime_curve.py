@@ -1,4 +1,4 @@
-"""Measures the growing volume: its quality after every quarter of a scan, beside FBP and a fit to the views so far.
+"""Quality of the live volume after each quarter of a scan, compared with FBP and a fit to the same projections.
 
 Run with  pytest -m bench -s tests/bench/test_anytime_curve.py ; about 5 minutes of CPU time. Rendered views are the
 measure of compute that is the same on any machine: a stream renders so many while a view is taken, and the fit from

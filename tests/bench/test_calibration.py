@@ -1,4 +1,4 @@
-"""Geometry learnt from views against the truth: 32 disturbed scans of analytic bodies, whose rays no method shares.
+"""Calibrated geometry compared with the true one: 32 disturbed scans of analytic bodies.
 
 Run with  pytest -m bench -s tests/bench/test_calibration.py  (some twenty minutes; `-k parallel` for half).
 One line a case: errors of what can be known, in pixels and degrees; PSNR by FISTA-TV of the undisturbed scan, of the

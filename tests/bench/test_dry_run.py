@@ -1,4 +1,4 @@
-"""The seconds that `recon --dry-run` expects beside those that a run takes: methods, sizes and real scans, in CPU s.
+"""The time that `recon --dry-run` predicts, compared with the time a run takes, in CPU s.
 
 Run with  OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 pytest -m bench -s tests/bench/test_dry_run.py  (some ten minutes), or a
 part of it with -k "walnut and r2". A run is single, in processor time, which others on the machine change by a fifth.

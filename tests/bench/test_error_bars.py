@@ -1,4 +1,4 @@
-"""Error bars on simulated scans: how many voxels of the truth lie within one deviation, and what the bars cost.
+"""Error bars on simulated scans: the share of voxels within one standard deviation, and the time they take.
 
 pytest -m bench -s tests/bench/test_error_bars.py    (slabs of real samples need ../shared/data; some minutes)
 """

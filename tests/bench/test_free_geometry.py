@@ -1,4 +1,4 @@
-"""A flat plate with inclusions in a parallel beam, in laminography, and in cones: a circle of sources and free ones.
+"""A flat plate with inclusions: parallel beam, laminography, cones with sources on a circle and anywhere.
 
 Run with  pytest -m bench -s tests/bench/test_free_geometry.py  (three minutes). The views are traced through the bodies
 by vectors alone, four rays a pixel, 10⁵ photons. PSNR in dB over the box of the plate, and inside it, and CPU seconds.

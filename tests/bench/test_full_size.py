@@ -1,4 +1,4 @@
-"""Wide detectors: CPU seconds a slice, and memory beside views and volume; run with  pytest -m bench -s."""
+"""Wide detectors: CPU seconds per slice, and memory in addition to projections and volume; pytest -m bench -s."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast a step on the GPU is; run on a CUDA machine with  pytest -m "gpu and bench" -s tests/bench."""
+"""Speed of a step on the GPU; run on a CUDA machine with  pytest -m "gpu and bench" -s tests/bench."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detail that a volume may hide, on real scans: a crack in a tooth, plastic around a metal wire.
+"""Detail that a volume may hide, in real scans: a crack in a tooth, plastic around a metal wire.
 
 Run with  pytest -m bench -s tests/bench/test_hidden_detail.py  (some minutes). PSNR, SNR and a small residual do not
 see either: the fit alone has the smallest residual on the tooth, and fills its crack.

@@ -1,4 +1,4 @@
-"""Measures accuracy against time of a live volume: by order of views, on a quiet and on a busy machine, and its end.
+"""Accuracy against time of a live volume: by order of projections, on an idle and a busy machine, and at its end.
 
 Run with  pytest -m bench -s tests/bench/test_live_accuracy.py ; about 3 minutes of CPU time. LIVE_FIGURE=PATH writes
 the figure of docs/tradeoff.md. A busy machine is one that leaves the fit a twentieth of the steps. Seconds are those of

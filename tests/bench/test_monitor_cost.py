@@ -1,4 +1,4 @@
-"""What the monitor costs a frame of 2304 x 4096 pixels; run with  pytest -m bench -s tests/bench/test_monitor_cost.py.
+"""CPU time of the monitor per frame of 2304 x 4096 pixels; pytest -m bench -s tests/bench/test_monitor_cost.py.
 
 All in processor time of one core, medians, and as ratios to one pass over the same bytes in the same run: the sum of
 the pixels, which does nothing but read them.

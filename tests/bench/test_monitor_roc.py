@@ -1,4 +1,4 @@
-"""What the monitor sees and what it does not; run with  pytest -m bench -s tests/bench/test_monitor_roc.py.
+"""Detection rates and false alarms of the monitor; pytest -m bench -s tests/bench/test_monitor_roc.py.
 
 Anomalies of a stated strength in scans of samples that no limit was tuned on: recall and latency. Clean scans, each
 hard in its own way: false findings. docs/monitor.md sums up what this prints.

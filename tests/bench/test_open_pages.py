@@ -1,4 +1,4 @@
-"""What twenty open pages cost a scan: its rate, and the processor time of its process a frame."""
+"""Effect of twenty open pages on a scan: its rate, and the processor time per frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The published R²-Gaussian beside ours, and what each setting of ours costs; pytest -m bench -s tests/bench.
+"""The published R²-Gaussian compared with ours, and the effect of each of our settings; pytest -m bench -s.
 
 CURVE_SECONDS=15,60 CURVE_STEPS=3000,30000 pytest -m bench -s tests/bench/test_published.py -k "against_time and shell"
 """

@@ -1,4 +1,4 @@
-"""A sample that changes while it is scanned: one fit beside sub-scans and beside one volume that ignores time.
+"""A changing sample: one joint fit compared with sub-scans and with one volume that ignores time.
 
 pytest -m bench -s tests/bench/test_series.py    (minutes)
 """

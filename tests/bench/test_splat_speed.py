@@ -1,4 +1,4 @@
-"""How fast a step on the CPU is and where its time goes; run with  pytest -m bench -s tests/bench/test_splat_speed.py.
+"""Speed of a step on the CPU, and where the time goes; pytest -m bench -s tests/bench/test_splat_speed.py.
 
 Each time is the best with the median and the quartiles behind it; ratios are of bests in the same run, since other
 work on the machine only ever adds (set GOMP_SPINCOUNT=2000 where there is any). The floor is what the machine's

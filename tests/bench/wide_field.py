@@ -1,4 +1,4 @@
-"""A sample wider than the field: dB, density, axis and CPU seconds by method, on packed balls in a can.
+"""A sample wider than the field of view: dB, density, axis and CPU seconds by method, on packed balls in a can.
 
     python -m tests.bench.wide_field [--seeds 7,8] [--over 1.0,1.5,2.0,3.0] [--methods fbp,fista-tv,auto]
         [--columns 192] [--rows 12] [--views 90] [--offset-views 4]

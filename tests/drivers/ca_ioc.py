@@ -1,4 +1,4 @@
-"""A soft IOC of Channel Access (caproto), a program of its own: a motor record on real time, and some variables.
+"""A soft IOC for Channel Access (caproto) as a separate program: a motor record in real time, and some variables.
 
 Prints the port that it listens at, once it listens.
 """

@@ -1,4 +1,4 @@
-"""Fuzz for drivers and stand-ins: bytes that a bad line makes of good ones, a wire that sends them, what is allowed.
+"""Fuzzing for drivers and simulated controllers: damaged bytes, a wire that sends them, and the allowed reactions.
 
 For a driver: put a `FuzzedWire` before its stand-in, with `plans(samples)` drawn by hypothesis, and run each call
 through `allowed`. For a simulated controller: let `replies` send it `received(samples)`. Number of examples:

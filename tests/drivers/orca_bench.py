@@ -1,4 +1,4 @@
-"""An ORCA-Quest, real or simulated, on the bench of the suite that is shipped."""
+"""An ORCA-Quest, real or simulated, for the conformance suite that is shipped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.testing.camera import CameraBench
 SETTINGS = CameraSettings(exposure=0.01, trigger=TriggerSource.EXTERNAL, roi=(1120, 2008, 48, 64))
 REFUSED = (
     ({"roi": (1120, 2008, 47, 64)}, "steps of 4"),
-    ({"roi": (2300, 2008, 48, 64)}, "does not lie on the sensor"),
+    ({"roi": (2300, 2008, 48, 64)}, "extends beyond the sensor"),
     ({"binning": 3}, "legal: 1, 2, 4"),
     ({"exposure": 1e-9}, "1800 s"),
     ({"exposure": 1e5}, "1800 s"),

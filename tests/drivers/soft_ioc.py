@@ -1,4 +1,4 @@
-"""A soft IOC in the process: simulated records and single variables by PVAccess (p4p)."""
+"""A soft IOC in this process: simulated records and variables over PVAccess (p4p)."""
 
 from __future__ import annotations
 

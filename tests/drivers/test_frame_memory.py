@@ -1,4 +1,4 @@
-"""Memory of frames comes back when the last view of a frame is gone, and not before."""
+"""The memory of a frame is released when its last numpy view is gone, and not before."""
 
 from __future__ import annotations
 

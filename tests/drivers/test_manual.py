@@ -1,4 +1,4 @@
-"""Manual devices ask the operator once for each change, and again after a request that was not confirmed."""
+"""Manual devices ask the operator once for each change, and again if a request was not confirmed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ORCA-Quest figures against the numbers that the vendor prints."""
+"""ORCA-Quest figures compared with the vendor's published numbers."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def test_binning_shrinks_the_frame_and_the_transfer_not_the_readout() -> None:
     ("changes", "problem"),
     [
         ({"readout": "fast"}, "'fast' is unknown; legal: standard, ultra_quiet, photon_number"),
-        ({"binning": 3}, "binning 3 is not offered; legal: 1, 2, 4"),
+        ({"binning": 3}, "binning 3 does not exist; legal: 1, 2, 4"),
         ({"exposure": 1e-6}, "outside 7.2e-06"),
         ({"exposure": 1e-4, "readout": "ultra_quiet"}, "outside 0.0001728"),
         ({"exposure": 2000.0}, "1800 s"),
         ({"roi": (0, 0, 142, 160)}, "steps of 4"),
         ({"roi": (2200, 0, 144, 160)}, "2304 x 4096"),
-        ({"roi": (0, 0, 0, 160)}, "does not lie on the sensor"),
-        ({"roi": (-4, 0, 144, 160)}, "does not lie on the sensor"),
+        ({"roi": (0, 0, 0, 160)}, "extends beyond the sensor"),
+        ({"roi": (-4, 0, 144, 160)}, "extends beyond the sensor"),
     ],
 )
 def test_refusals_name_the_legal_values(changes: dict[str, object], problem: str) -> None:

@@ -1,4 +1,4 @@
-"""A sample mover by a motor goes to its two places, asks where it is, and says what stopped it."""
+"""A motor that moves the sample reaches its two positions, finds out where it is, and reports what stopped it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.drivers.soft_ioc import TickingClock, record_of
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
 
-PLACES = StagePlaces({INSIDE: math.radians(1), OUTSIDE: math.radians(41)}, math.radians(10), "the sample did not come")
+PLACES = StagePlaces({INSIDE: math.radians(1), OUTSIDE: math.radians(41)}, math.radians(10), "the sample did not move")
 
 
 class Rig:
@@ -63,7 +63,7 @@ def test_a_sample_that_a_person_moved_meanwhile_is_moved_back() -> None:
 
 def test_a_switch_on_the_way_is_told_as_the_samples() -> None:
     rig = Rig(switch_at=20_000)
-    said = "^sample mover: the sample did not come out of the beam: stage: it stopped short"
+    said = "^sample mover: the sample did not move out of the beam: stage: it stopped short"
     with pytest.raises(DeviceError, match=said):
         rig.mover.out()
 

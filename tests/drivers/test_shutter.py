@@ -1,4 +1,4 @@
-"""A shutter on an output: what goes out, how long it waits, and what it believes when the output disobeys."""
+"""A shutter on an output: signals, waiting times, and its state if the output does not respond."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_polarity_and_travel(tells: bool, open_high: bool) -> None:
 
 def test_an_output_that_does_not_hold_is_reported() -> None:
     shutter = OutputShutter(Line(stuck=False), VirtualClock(0.0))
-    with pytest.raises(DeviceError, match=r"output 1 is not at the level.*'high'\. Answered 'low'.*is not known"):
+    with pytest.raises(DeviceError, match=r"output 1 does not have the level.*'high'\. Answered 'low'.*is not known"):
         shutter.open()
     assert not shutter.is_open()
 

@@ -1,4 +1,4 @@
-"""The conformance suites of all packages: a class of a site that lacks a fixture is told what to give."""
+"""The conformance suites of all packages: a subclass without a fixture gets a message that says what to define."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ellipsoids seen along the exact rays of any geometry: views and volume with a known answer, without voxels."""
+"""Ellipsoids projected with the exact rays of any geometry: projections and volume with a known answer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 
-_FINE = 0.25 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # rays of a pixel, which is their mean
+_FINE = 0.25 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # rays of a pixel; its value is their mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +20,7 @@ class Bodies:
 
     Attributes:
         centre: [body, 3] mm, x, y, z.
-        inverse: [body, 3, 3], which takes an ellipsoid about its centre to the unit ball.
+        inverse: [body, 3, 3], matrix that maps an ellipsoid (about its centre) to the unit ball.
         density: [body], 1/mm.
     """
 
@@ -29,7 +29,7 @@ class Bodies:
     density: NDArray[np.float64]
 
     def views(self, geometry: Geometry, noise: float = 0.0, seed: int = 0) -> NDArray[np.float32]:
-        """Line integrals [view, row, col], with noise of this standard deviation in shares of the largest one."""
+        """Line integrals [view, row, col], with noise; `noise`: standard deviation as a share of the largest one."""
         rows, cols = geometry.detector_shape
         out, pitch = np.zeros((geometry.n_views, rows * cols)), geometry.pixel_pitch
         at = np.stack([each.ravel() for each in np.meshgrid(np.arange(cols), np.arange(rows))], axis=1)
@@ -69,7 +69,7 @@ class Bodies:
 
 
 def balls(radius: float, height: float, seed: int = 0, count: int = 30) -> Bodies:
-    """Balls in a cylinder of this radius and height, mm, which reach beyond its ends."""
+    """Balls in a cylinder of this radius and height in mm; they extend beyond its ends."""
     rng = np.random.default_rng(seed)
     away, turn = 0.85 * radius * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     centre = np.stack((away * np.cos(turn), away * np.sin(turn), (rng.random(count) - 0.5) * height), axis=1)
@@ -78,7 +78,7 @@ def balls(radius: float, height: float, seed: int = 0, count: int = 30) -> Bodie
 
 
 def sponge(radius: float, height: float, seed: int = 0, count: int = 40) -> Bodies:
-    """A body wider than it is deep with oblong pores and grains in it; longer than the field is high."""
+    """A body with oblong pores and grains, wider than deep, and longer than the height of the field of view."""
     rng = np.random.default_rng(seed)
     away, turn = 0.6 * radius * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     centre = np.stack((away * np.cos(turn), 0.75 * away * np.sin(turn), (rng.random(count) - 0.5) * height), axis=1)

@@ -1,4 +1,4 @@
-"""Small random sets of Gaussians, and few noisy views of a sample."""
+"""Small random sets of Gaussians, and a few noisy projections of a sample."""
 
 from __future__ import annotations
 

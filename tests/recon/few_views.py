@@ -1,4 +1,4 @@
-"""A cylinder with a dense ellipsoid in few noisy views; `conftest.py` has the sample and the views as fixtures."""
+"""A cylinder with a dense ellipsoid in a few noisy projections; `conftest.py` provides them as fixtures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians as leaves of a graph, for gradient comparisons; and many steps of a fit."""
+"""Gaussians as leaves of a torch graph, for gradient comparisons; and many steps of a fit."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run_steps(
     steps: int,
     on_step: Callable[[FitState], bool] | None = None,
 ) -> FitState:
-    """`steps` steps on a full schedule; `on_step` may end it early by returning True."""
+    """Make `steps` steps of a full schedule; `on_step` may end it early by returning True."""
     for k in range(steps):
         step(state, problem, settings, k / max(1, steps))
         if on_step is not None and on_step(state):
@@ -63,7 +63,7 @@ def run_steps(
 
 
 def assert_transpose(projector: Projector, rng: np.random.Generator, rel: float, abs: float = 0.0) -> tuple[F32, F32]:
-    """<A x, p> = <x, Aᵀ p> of a random volume x and views p; returns x and A x."""
+    """Assert <A x, p> = <x, Aᵀ p> for a random volume x and projections p; returns x and A x."""
     volume = rng.random(projector.grid.shape, dtype=np.float32)
     views = rng.random(projector.projection_shape, dtype=np.float32)
     forward = projector.forward(volume)

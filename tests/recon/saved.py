@@ -1,4 +1,4 @@
-"""What `Reconstruction.save` writes, compared with what `load` gives back."""
+"""Compares what `Reconstruction.save` writes with what `load` reads."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import recon
 
 
 def comes_back(result: recon.Reconstruction, path: Path) -> None:
-    """Save, load and compare all that a file holds of a result."""
+    """Save and load a result, and compare everything that the file contains."""
     result.save(path)
     loaded = recon.Reconstruction.load(path)
     np.testing.assert_array_equal(loaded.volume.data, result.volume.data)
     assert loaded.volume.data.dtype == np.float32 and loaded.volume.grid == result.volume.grid
     assert (loaded.method, loaded.seconds) == (result.method, result.seconds)
-    assert repr(loaded.settings) == repr(_as_lists(result.settings))  # which compares NaN, too
+    assert repr(loaded.settings) == repr(_as_lists(result.settings))  # the text form also compares NaN
     assert (loaded.series is None) == (result.series is None)
     if loaded.series is not None and result.series is not None:
         np.testing.assert_array_equal(loaded.series.data, result.series.data)

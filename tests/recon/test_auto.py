@@ -1,4 +1,4 @@
-"""The automatic choice: what predicts unseen views best, on which part of a scan, and what it says of it."""
+"""The automatic choice: the best prediction of held-out projections, the part of the scan it uses, its report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rotation axis by views held out: of cones and nearly parallel beams, from far, through noise; and noise alone."""
+"""The axis from held-out projections: cones and nearly parallel beams, far start values, noise, and noise alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error bars against laws: the analytic noise of FBP, scaling with noise, decisions, and views that are asked for."""
+"""Error bars: the analytic noise of FBP, scaling with noise, decisions, and selected projections."""
 
 from __future__ import annotations
 

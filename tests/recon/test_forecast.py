@@ -1,4 +1,4 @@
-"""Seconds that iterations on a part foretell, on a clock that only these move; and of methods of every kind."""
+"""Forecast of run times from iterations on a part, with a controlled clock, for methods of every kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Volumes of laminography and of a cone with free sources, beside those of plain views of the same ellipsoid."""
+"""Laminography and a cone with free sources, compared with ordinary projections of the same ellipsoid."""
 
 from __future__ import annotations
 

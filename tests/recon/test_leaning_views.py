@@ -1,4 +1,4 @@
-"""Every method takes rolled and tilted views, judged against the same data with these poses unknown."""
+"""Every method can use rolled and tilted projections; compared with a reconstruction that ignores these poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The registry of methods: a name is its object, and one line makes a method known everywhere."""
+"""The registry of methods: each name gives its object, and one line registers a method everywhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weak detail among grains, which a prior may take for noise: hairline cracks, and a disc of 2 % more density.
+"""Weak detail that a prior could remove as noise: hairline cracks between grains, and a disc 2 % denser.
 
 Lines are those of voxels a quarter as wide, so that no projector is matched. Each method has its defaults.
 """

@@ -1,4 +1,4 @@
-"""Public values survive pickle and deepcopy, by which worker processes and caches send and keep them."""
+"""Public values can be pickled and deep-copied, as worker processes and caches do."""
 
 import copy
 import pickle

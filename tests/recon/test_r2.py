@@ -1,4 +1,4 @@
-"""R2 by the public call: starts and ends of fits, views held out, checkpoints, each beam and likelihood."""
+"""R2 through the public call: start and end of fits, held-out projections, checkpoints, all beams and likelihoods."""
 
 from __future__ import annotations
 
@@ -121,7 +121,10 @@ def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
 
 @pytest.mark.parametrize(
     ("held_out", "message"),
-    [((False,) * 20 + (True,) * 4, "held_out must be .* whole number"), ((7,), r"views \[7\] are zero everywhere")],
+    [
+        ((False,) * 20 + (True,) * 4, "held_out must be .* whole number"),
+        ((7,), r"projections \[7\] are zero everywhere"),
+    ],
 )
 def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: tuple[int, ...], message: str) -> None:
     blank = noisy.copy()
@@ -134,7 +137,7 @@ def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: 
 
 def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
     kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100, finish=0)).checkpoint
-    with pytest.raises(ValueError, match=r"least 2\d views"):
+    with pytest.raises(ValueError, match=r"least 2\d projections"):
         recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 
 

@@ -1,4 +1,4 @@
-"""The public call: both methods, better than the baseline, honest about bad input."""
+"""The public call: both methods are better than the baseline, and bad input is an error."""
 
 from __future__ import annotations
 
@@ -74,19 +74,19 @@ def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callab
     ("change", "message"),
     [
         ({"method": "magic"}, "method 'magic' is unknown; legal: r2, .*fbp, "),
-        ({"projections": np.zeros((3, 20, 40))}, "geometry says"),
-        ({"projections": np.full((24, 20, 40), np.nan)}, "no value that is finite"),
-        ({"projections": np.full((24, 20, 40), 1e300)}, "no value that is finite"),
+        ({"projections": np.zeros((3, 20, 40))}, "to match the geometry"),
+        ({"projections": np.full((24, 20, 40), np.nan)}, "no usable value: none that is finite"),
+        ({"projections": np.full((24, 20, 40), 1e300)}, "no usable value: none that is finite"),
         ({"projections": np.ones((24, 20, 40), complex)}, "real numbers"),
-        ({"projections": np.zeros((24, 20, 40))}, "no matter"),
-        ({"method": R2(early_stop=True)}, "there are none"),
-        ({"use": DataUse(held_out=(24,))}, "views 0 to 23"),
+        ({"projections": np.zeros((24, 20, 40))}, "no material"),
+        ({"method": R2(early_stop=True)}, "needs held-out projections"),
+        ({"use": DataUse(held_out=(24,))}, "projection numbers 0 to 23"),
         ({"use": DataUse(held_out=tuple(range(24)))}, "none is left"),
-        ({"control": RunControl(resume={})}, "not a checkpoint"),
-        ({"device": "abacus"}, "'abacus' was asked for"),
+        ({"control": RunControl(resume={})}, "not the checkpoint"),
+        ({"device": "abacus"}, "got 'abacus'"),
         ({"seed": -1}, "seed"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
-        ({"geometry": replace(VIEWS, axis_col=60.0)}, "column 60, lies outside the detector's columns 0 to 39: .*crop"),
+        ({"geometry": replace(VIEWS, axis_col=60.0)}, "column 60, is outside the detector's columns 0 to 39, .*crop"),
         ({"geometry": replace(VIEWS, axis_col=-0.6)}, "columns 0 to 39"),
     ],
 )
@@ -214,10 +214,10 @@ def test_degrees_are_told_as_views_come(noisy: np.ndarray) -> None:
 
 def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:
     degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, pixel_pitch=PITCH, axis_col=18.3)
-    with pytest.warns(UserWarning, match=r"172\.5 rad.*np\.deg2rad"):
+    with pytest.warns(UserWarning, match=r"reach 172\.5 and .*np\.deg2rad"):
         recon.reconstruct(noisy, degrees, "fbp")
     with (
-        pytest.warns(UserWarning, match=r"172\.5 rad.*np\.deg2rad") as told,
+        pytest.warns(UserWarning, match=r"reach 172\.5 and .*np\.deg2rad") as told,
         suppress(ValueError),
     ):
         recon.find_axis(noisy, np.rad2deg(ANGLES))

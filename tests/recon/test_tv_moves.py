@@ -1,4 +1,4 @@
-"""Total variation moves centres as finite differences say; the published gradient is smaller by the voxel squared."""
+"""Total variation moves centres as finite differences predict; the published gradient is too small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wide fields: a full turn with the axis near an edge of the detector, of a sample wider than the detector."""
+"""Half acquisition: a 360° scan with the axis near a detector edge, of a sample wider than the detector."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a point falls on the detector, by trigonometry alone."""
+"""Where a point falls on the detector, computed with trigonometry alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from recon.base.geometry import Geometry
 
 
 def pixel_of(geometry: Geometry, view: int, point: np.ndarray) -> np.ndarray:
-    """Where a point falls, by the trigonometry of `recon.base.geometry` written out without matrices."""
+    """The pixel of a point, with the trigonometry of `recon.base.geometry` written out without matrices."""
     x, y, z = point
     c, s = np.cos(geometry.angles[view]), np.sin(geometry.angles[view])
     u, v, along = x * c + y * s, z, -x * s + y * c

@@ -13,11 +13,11 @@ from simulators.scenes.expose import expose
 from tests.simulators import shots
 
 SEEN = 1e-3
-"""Share of the light that a pixel must gain or lose to count as changed: ten counts of ten thousand."""
+"""A pixel counts as changed if its intensity changes by this share: ten counts in ten thousand."""
 
 
 def change(effect: dict[str, Any], shot: Shot) -> NDArray[np.float64]:
-    """Share of its light that each pixel gains or loses; flats and projections of one scene with the effect."""
+    """Relative change of the intensity in each pixel by the effect, for flats and projections of one scene."""
     plain, changed = (expose(shots.scene(*effects), shot).astype(float) for effects in ([], [effect]))
     return changed / np.maximum(plain, 1) - 1
 
@@ -27,8 +27,11 @@ def labels(effect: dict[str, Any], shot: Shot) -> tuple[Label, ...]:
 
 
 def check_regions(effect: dict[str, Any], shot: Shot, loose: int = 1) -> bool:
-    """Whether the anomaly shows; its regions hold every changed pixel, and each is at most `loose` pixels wider than
-    what changes in it. Where two parts of an anomaly meet, what neither shows by itself may add up: to 2 SEEN."""
+    """Assert that the anomaly is visible and its regions are right.
+
+    The regions contain every changed pixel, and each one is at most `loose` pixels wider than its change. Where two
+    parts of an anomaly meet, their invisible parts may add up to 2 SEEN.
+    """
     changes, found = np.abs(change(effect, shot)), labels(effect, shot)
     seen, beyond = changes > SEEN, changes > 2 * SEEN
     for label in found:

@@ -27,8 +27,10 @@ def never(time: float) -> float:
 
 
 def shot(**changes: Any) -> Shot:
-    """10 ms of 60 x 80 pixels of 10 um in the middle of the sensor, the sample at 0.4 rad; reading the stage's angle
-    at another time fails."""
+    """A shot of 10 ms with 60 x 80 pixels of 10 um in the middle of the sensor, sample at 0.4 rad.
+
+    Reading the angle of the stage at another time fails.
+    """
     values: dict[str, Any] = {
         "detector": Detector.centred((60, 80), 0.01),
         "exposure": 0.01,
@@ -52,20 +54,21 @@ def shot(**changes: Any) -> Shot:
 
 
 def sized(rows: int, cols: int, **changes: Any) -> Shot:
-    """A shot of so many unbinned pixels from the sensor's first row and column."""
+    """A shot of unbinned pixels, from the first row and column of the sensor."""
     return shot(**({"detector": Detector.centred((rows, cols), 0.01), "roi": (0, 0, rows, cols)} | changes))
 
 
 def scene(*effects: Any, flux: float = 4e5, phantom: Any = PHANTOM) -> Scene:
-    """Two solids (or others) and the effects; `flux` in photons/s, so that a shot has 4000."""
+    """A scene with two solids (or others) and the effects; with the default `flux` (photons/s) a shot has 4000
+    photons."""
     return load_scene({"phantom": phantom, "beam": {"photons_per_s": flux}, "effects": list(effects)})
 
 
 def frame(of_scene: Scene, of: Shot | None = None, angle_at: AngleAt = never, **state: Any) -> NDArray[np.uint16]:
-    """Counts of a scene; `state` is beam and sample."""
+    """Counts of a scene; `state`: beam and sample."""
     return expose(of_scene, replace(of or shot(), angle_at=angle_at, **state))
 
 
 def depth(of_scene: Scene, angle: float) -> NDArray[np.float64]:
-    """Line integrals of the scene's sample as `shot()` sees it at `angle` radians."""
+    """Line integrals of the sample of a scene in `shot()` at `angle` radians."""
     return of_scene.sample.line_integrals(angle, shot().detector)

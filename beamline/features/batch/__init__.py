@@ -1,7 +1,7 @@
-"""Batches: many scans reconstructed by one recipe, with a table of what became of each."""
+"""Batches: many scans reconstructed with one recipe, and a table with the result of each."""
 
 COMMANDS = {
-    "batch": ("Reconstruct many scans by one recipe; a table says what became of each.", True),
+    "batch": ("Reconstruct many scans with one recipe; a table lists the result of each.", True),
 }
 
 COUNTED = {"batch": "scans"}

@@ -1,4 +1,4 @@
-"""`beamline batch`: reconstructs many scans by one recipe, and keeps a table of them."""
+"""`beamline batch`: reconstructs many scans with one recipe, and writes a table with the result of each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RowState = Literal["waiting", "done", "poor", "failed"]
 TABLE, RECIPE = "batch.csv", "recipe.yaml"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
 COMMAND = (sys.executable, "-m", "beamline.cli.main")
-_SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
+_SILENCE = 1800.0  # real s without an event, after which a reconstruction counts as hanging
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class BatchRow:
     """A scan of a batch and its result.
 
     Attributes:
-        name: of its folder of results, inside the batch's.
-        state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
-            one; "waiting": not tried yet.
-        residual: of the volume, of views held out where there were any.
-        warnings: how many its reconstruction gave; a volume with some is not to be trusted before they are read.
-        message: why it failed, or is poor; then these warnings.
+        name: name of the folder with its results, inside the folder of the batch.
+        state: "done"; "poor": the residual of the volume is above --max-residual of the recipe; "failed": no volume;
+            "waiting": not tried yet.
+        residual: residual of the volume, in the held-out projections if there are any.
+        warnings: number of warnings of the reconstruction. Read them before you trust the volume.
+        message: why it failed or is poor, then the warnings.
     """
 
     name: str
@@ -62,21 +62,22 @@ class BatchRow:
 
 
 def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Sink, clock: Clock) -> list[BatchRow]:
-    """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
+    """Reconstruct the scans that have no volume in the folder yet; the table is written after each scan.
 
-    A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
-    is tried again by the next call. Ctrl-C ends the scan under way, which leaves nothing; the others stay.
+    The folder with the results of a scan appears only when it is complete. If a scan fails, it gets no folder, the
+    next scan is reconstructed, and the next call tries the failed one again. Ctrl-C discards the scan in progress and
+    keeps the others.
 
     Args:
         recipe: file with the options of `beamline recon`; None: its defaults.
-        folder: of the results, new or of an earlier call with the same recipe.
+        folder: folder for the results, new or of an earlier call with the same recipe.
 
     Returns:
         All rows of the table, also those of earlier calls.
 
     Raises:
-        DataError: the folder is not that of a batch, or of one with another recipe; nothing was touched.
-        KeyboardInterrupt: stopped; the table has the scans that were done.
+        DataError: the folder is not that of a batch, or is that of a batch with another recipe. Nothing was changed.
+        KeyboardInterrupt: stopped; the table lists the scans that are done.
     """
     _begin(folder, b"" if recipe is None else recipe.read_bytes())
     how = [] if recipe is None else ["--config", str(folder / RECIPE)]
@@ -84,8 +85,8 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
         lock = WriterLock(folder / RECIPE, exclusive=True)
     except (BlockingIOError, PermissionError) as error:
         raise DataError(
-            f"Another batch works in {folder}, or its {RECIPE} cannot be written to ({error.strerror}). Wait for its "
-            "end, or name another folder."
+            f"Wait until the other batch in {folder} has ended, or name another folder: its {RECIPE} is locked or "
+            f"cannot be written ({error.strerror})."
         ) from error
     try:
         rows = _rows(scans, _read(folder))
@@ -104,8 +105,8 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
 
 
 def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[str]:
-    """A safe name for each file: its stem, with as many of its folders as tell it from the other files and those of
-    earlier rows, and a number where their names, or the batch's own, are the same."""
+    """A safe and unique name for each file: its stem, preceded by as many of its folders as are needed to distinguish
+    it from the other files and from earlier rows. A number follows if names are still equal."""
     paths = [*(Path(row.scan) for row in earlier), *scans]
     parts = [(*path.absolute().parent.parts[1:], Path(SCAN if path.name == JOINED else path).stem) for path in paths]
     names = [safe_name(own[-1]) for own in parts]
@@ -124,7 +125,7 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
-    """Make the folder. Raises DataError for one that is not that of a batch by this recipe."""
+    """Make the folder if needed. Raises DataError for a folder that does not belong to a batch with this recipe."""
     if not folder.exists():
         with atomic_file(folder) as partial:
             partial.mkdir()
@@ -132,17 +133,17 @@ def _begin(folder: Path, recipe: bytes) -> None:
             _write(partial, [])
     kept = folder / RECIPE
     if not (folder / TABLE).is_file():
-        raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
+        raise DataError(f"{folder} exists, but is not the folder of a batch: it has no {TABLE}. Name another folder.")
     if not kept.is_file() or kept.read_bytes() != recipe:
         raise DataError(
-            f"{folder} holds results of another recipe, {kept}. Give that one as --config, or name another folder. "
-            "Nothing was touched."
+            f"{folder} has results of another recipe, {kept}. Use that recipe (--config {kept}), or name another "
+            "folder. Nothing was changed."
         )
 
 
 def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
-    """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
-    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+    """The earlier rows, and a row for each new scan. Rows without a volume get the new scan file of a resumed run."""
+    from beamline.storage.interrupted import whole_scan  # imported here because help does not need it
 
     by_name = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
     rows = [
@@ -176,7 +177,7 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
     if (place / RECON).is_file():
         return replace(
             row, state="done", seconds=0.0,
-            message="made by a call that ended before it wrote this row; the report has the warnings",
+            message="made by an earlier call that ended before it wrote this row; see the report for warnings",
         )  # fmt: skip
     try:
         with atomic_file(place) as work:
@@ -187,11 +188,11 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
             log.unlink()
             reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
             if ending is ProcessEnd.SILENT:
-                reason = f"no output from its process for {_SILENCE:g} s; it was ended"
+                reason = f"its process was ended, because it gave no output for {_SILENCE:g} s"
             if code not in _WITH_VOLUME or not (work / RECON).is_file():
                 raise DataError(reason or f"no volume: its process ended with code {code}")
         state, why = _WITH_VOLUME[code], [reason] if code else []
-    except DataError as error:  # also of a folder of this name that somebody else made
+    except DataError as error:  # also if another program made a folder of this name
         state, why = "failed", [str(error)]
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
@@ -201,22 +202,22 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
 
 
 def _with_command(message: str, row: BatchRow) -> str:
-    """A message of a reconstruction; where it names options, with the command that takes them."""
+    """A message of a reconstruction; if it mentions options, the command that takes them is added."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
     return message + (
-        f" Give these options to `beamline recon {row.scan}`, or write them into the recipe where they hold for all."
+        f" Give these options to `beamline recon {row.scan}`, or add them to the recipe if they apply to all scans."
         if named
         else ""
     )
 
 
 def _read(folder: Path) -> list[BatchRow]:
-    """The table of an earlier call; a row whose volume is no longer there waits.
+    """The table of an earlier call; a row whose volume no longer exists is waiting again.
 
     Raises:
-        DataError: it cannot be read.
+        DataError: the table cannot be read.
     """
-    from pydantic import TypeAdapter, ValidationError  # here, since help loads this module
+    from pydantic import TypeAdapter, ValidationError  # imported here because help loads this module
 
     path = folder / TABLE
     try:
@@ -234,17 +235,17 @@ def _read(folder: Path) -> list[BatchRow]:
     except ValidationError as error:
         first = error.errors()[0]
         place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"
-        raise DataError(f"{path} is no table of a batch ({place}: {first['msg']}). Nothing was touched.") from error
+        raise DataError(f"{path} is not a table of a batch ({place}: {first['msg']}). Nothing was changed.") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
+        raise DataError(f"{path} is not a table of a batch ({one_line(str(error))}). Nothing was changed.") from error
 
 
 def _refuse_names(rows: Sequence[BatchRow]) -> None:
-    """ValueError for a name that is not safe for a folder, or that another row or file of the batch has."""
+    """Raise ValueError for a name that is not safe as a folder, or that another row or file of the batch has."""
     folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
     for n, row in enumerate(rows, start=2):
         if row.name != safe_name(row.name) or folded[n] in folded[:n]:
-            raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
+            raise ValueError(f"{row.name!r} is not a name that this program gives to the folder of a scan")
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
@@ -252,20 +253,20 @@ def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
-    """Scans that match names and patterns, each once, in the order given."""
-    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+    """Scans that match the names and patterns, each once, in the order given."""
+    from beamline.storage.interrupted import whole_scan  # imported here because help does not need it
 
     scans: dict[Path, None] = {}
     for name in value:
         path, root = Path(name), Path(Path(name).anchor)
         matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
         if not matches:
-            raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
+            raise click.BadParameter(f"{name!r} is not a file, and no file matches it as a pattern")
         for match in matches:
             scans[scan := whole_scan(match)] = None
             if not match.is_dir() and scan != Path(os.path.realpath(match)):
                 click.echo(
-                    f"{match} is a part of a run that was resumed: {scan}, which has all of it, is taken.", err=True
+                    f"{match} is only a part of a resumed run. {scan}, which has all parts, is used instead.", err=True
                 )
     return list(scans)
 
@@ -275,32 +276,38 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
 @click.option(
     "--config",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Recipe of the reconstructions, such as `beamline recon ... --write-config` writes. Default: -m auto.",
+    help="Recipe: a YAML file with the options of `beamline recon`, as --write-config writes it. Default: -m auto.",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     required=True,
-    help="Folder of the results: new, or that of an earlier call with the same recipe, which is continued.",
+    help="Folder for the results: a new one, or that of an earlier call with the same recipe, which is then continued.",
 )
 @json_option
 def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:
-    """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
+    """Reconstruct many scans, one after the other, with one recipe.
 
-    Each scan gets a folder in --output with its volume and report; batch.csv says what became of it, and why it
-    failed. Called again, only scans without a volume are reconstructed. Ctrl-C keeps the scans that are done (exit
-    code 4). Exit code 5: a scan failed.
+    \b
+    beamline recon SCAN.h5 -m fista-tv --bin 2 --write-config recipe.yaml
+    beamline batch "runs/*/scan.h5" --config recipe.yaml -o RESULTS
+
+    SCANS are files, or patterns in quotes. Each scan gets a folder in --output with its volume and report. The table
+    batch.csv lists the result of each scan, and why it failed if it did. If you call the command again, only scans
+    without a volume are reconstructed. Ctrl-C keeps the scans that are done.
+
+    Exit code: 0 all scans have a volume, 4 stopped, 5 a scan failed.
     """
     if config is not None:
-        from beamline.cli.recon import refuse_recipe  # here: help needs none of it
+        from beamline.cli.recon import refuse_recipe  # imported here because help does not need it
 
         refuse_recipe(config)
     with answering(as_json) as answer:
         try:
             rows = run_batch(scans, config, output, answer.sink, answer.clock)
         except KeyboardInterrupt as stop:
-            raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
+            raise ScanStopped(f"The batch was stopped. {output / TABLE} lists the scans that are done.") from stop
         failed = [row for row in rows if not row.has_volume]
         warned = sum(row.has_volume and row.warnings > 0 for row in rows)
         counts = {"done": len(rows) - len(failed), "warned": warned, "failed": len(failed), "output": output / TABLE}

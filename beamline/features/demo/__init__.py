@@ -1,5 +1,5 @@
-"""Demonstration: a simulated scan with live reconstruction, compared with the truth."""
+"""Demonstration: a simulated scan with live reconstruction, compared with the ground truth."""
 
 COMMANDS = {
-    "demo": ("Run a simulated scan with live reconstruction; writes a volume and a report.", True),
+    "demo": ("Scan and reconstruct a simulated battery, in about a minute; nothing has to be set up.", True),
 }

@@ -1,4 +1,4 @@
-"""`beamline demo`: a simulated scan from trigger to volume and report, in about a minute."""
+"""`beamline demo`: a simulated scan, from the trigger to the volume and its report, in about a minute."""
 
 from __future__ import annotations
 
@@ -30,18 +30,25 @@ if TYPE_CHECKING:
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for the folders of runs. Default: storage.folder of configs/demo.yaml.",
+    help="Folder in which the new folder for the results is created. Default: storage.folder of configs/demo.yaml "
+    "(./runs).",
 )
 @click.option(
     "--seconds",
     type=POSITIVE,
-    help="Most time after the scan; less than the fit needs gives a poorer volume.",
+    help="Time limit for the reconstruction after the scan, in seconds. If it is too short for the fit, the volume is "
+    "poorer. Default: as long as the fit needs.",
 )
 @json_option
 def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
-    """Scan a simulated battery, reconstruct it during the scan, and compare the volume with the truth.
+    """Scan and reconstruct a simulated battery, to see what this program does. Takes about a minute.
 
-    The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
+    \b
+    beamline demo
+
+    The battery is reconstructed during the scan. Afterwards the volume and an FBP volume are compared with the ground
+    truth, and a report (HTML) is written. The results are in a new folder, named with UTC time and sample. The
+    configuration is configs/demo.yaml.
     """
     from beamline.config.load import config_folder, load
 
@@ -65,13 +72,13 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
 
     Args:
         config: of simulated devices.
-        runs: the folder in which the run gets its own; the configured one unless given.
-        sinks: besides the run's own.
-        stop: to end it early.
-        command: the command line, for the record.
+        runs: the folder in which the folder of this run is created; None: the configured one.
+        sinks: event sinks in addition to those of the run.
+        stop: request to stop it early.
+        command: the command line, which the report shows.
 
     Raises:
-        ConfigError: for a real instrument, where there is no truth.
+        ConfigError: the configuration is of a real instrument, so that there is no ground truth.
         DataError: the live reconstruction failed; the scan is in its file.
     """
     from beamline.core.files import RECON, RECON_LOG
@@ -86,27 +93,31 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     follow = follow_command(config)
 
     def without_report(scan: Path, output: Path) -> Sequence[str]:
-        return [*follow(scan, output), "--no-report"]  # ours replaces it
+        return [*follow(scan, output), "--no-report"]  # because the demonstration writes its own report
 
     def all_but_done(event: Event) -> None:
-        if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
+        if not isinstance(event, RunDone):  # the scan is done, but the demonstration is not
             outside(event)
 
     with connect(config) as instrument:
         if instrument.truth is None:
-            raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
+            raise ConfigError(
+                "The demonstration needs simulated devices, because only a simulator knows the ground truth."
+            )
         truth = instrument.truth
         result = run_scan(config, runs, [all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
-        raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
+        raise DataError(
+            f"The live reconstruction made no volume; the reason is in {folder / RECON_LOG}. The scan is not affected."
+        )
     shown = _Shown(command, config.recon.seed, config.recon.method, started)
     _compare(result.path, folder / RECON, truth, shown, outside, clock)
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """What the page of the demonstration states beside the scan and its volume."""
+    """Further facts for the report of the demonstration."""
 
     command: str
     seed: int
@@ -117,7 +128,7 @@ class _Shown:
 def _compare(
     scan: Path, volume: Path, truth: Callable[[Grid], Volume], shown: _Shown, sink: Sink, clock: Clock
 ) -> None:
-    """Compare the live volume and FBP of the same views with the truth, on a page that replaces the volume's."""
+    """Compare the live volume, and FBP of the same projections, with the ground truth, in a new report."""
     from beamline.gaussians import read_model
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection

@@ -1,5 +1,5 @@
-"""EPICS: the running scan as process variables."""
+"""EPICS: the state of the running scan as process variables."""
 
 COMMANDS = {
-    "ioc": ("Serve the running scan as EPICS process variables.", False),
+    "ioc": ("Publish the state of the running scan as EPICS process variables.", False),
 }

@@ -1,4 +1,4 @@
-"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control it takes verbs and answers."""
+"""Process variables of the newest run in a folder, over PVAccess (p4p). With --control clients can control the scan."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class RunServer:
             conf = {**others, "EPICS_PVAS_INTF_ADDR_LIST": address}
             self._server = Server(providers=[provider], conf=conf, useenv=False)
         except RuntimeError as error:
-            raise DataError(f"{address} cannot be listened at: {error}. Nothing was started.") from error
+            raise DataError(f"{address} cannot be used: {error}. Nothing was started.") from error
 
     @property
     def configuration(self) -> dict[str, str]:

@@ -36,23 +36,23 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import ReconRecord
 
 _PLY, _CSV = ".ply", ".csv"
-_SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
+_SLICES, _VALUES = 9, 2**20  # slices of a volume, and values of a slice, that are read at most to suggest a window
 
 
 def window_of(text: str) -> tuple[float, float]:
-    """LOW:HIGH, two finite numbers. ValueError for anything else."""
+    """Parse LOW:HIGH, two finite numbers. Raises ValueError for any other text."""
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"{text!r} is not a window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+        raise ValueError(f"{text!r} is not a window; expected LOW:HIGH with LOW below HIGH, such as 0:0.5")
     return low, high
 
 
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
-    """What `beamline export` is asked for."""
+    """The arguments of `beamline export`."""
 
     volume: Path = set_by(click.argument("volume", metavar="VOLUME|RUN", type=click.Path(path_type=Path)))
     output: Path = set_by(
@@ -61,32 +61,40 @@ class ExportRequest:
         metavar="PATH",
         callback=parsed(lambda text: Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)),
         required=True,
-        help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
+        help=f"File to write; its suffix sets the format: {suffixes_text()}. With --gaussians: .ply. With --poses: "
+        ".csv.",
     )
     bits: str = set_by(
-        "--bits", type=NameChoice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values."
+        "--bits",
+        type=NameChoice(["8", "16", "32"]),
+        default="32",
+        help="Bits per voxel. 32: the values themselves (float32). 8, 16: grey values, which need --window.",
     )
     window: tuple[float, float] | None = set_by(
         "--window",
         metavar="LOW:HIGH",
         callback=parsed(window_of),
-        help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
+        help="With --bits 8 or 16: LOW becomes grey value 0, and HIGH the largest grey value. Values outside are "
+        "clipped.",
     )
-    gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
+    gaussians: bool = set_by(
+        "--gaussians", is_flag=True, help="Write the Gaussians of an r2 volume as a .ply file, instead of voxels."
+    )
     poses: bool = set_by(
         "--poses",
         is_flag=True,
-        help="Write displacement, roll and tilt of the volume's views as a .csv that --poses reads.",
+        help="Write shift, roll and tilt of each projection of this volume as a .csv, instead of voxels. `beamline "
+        "recon --poses` reads this file.",
     )
     material: int | None = set_by(
         "--material",
         type=WholeRange(min=1),
         metavar="K",
-        help="Of a volume pulled to few materials: in place of its density each voxel's probability of being material "
-        "K. 1 is the least dense one.",
+        help="For a volume with discrete levels: write the probability that a voxel is material K instead of its "
+        "density. 1: the least dense material.",
     )
     at: int | None = set_by(
-        "--at", type=WholeRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
+        "--at", type=WholeRange(min=0), metavar="K", help="Write volume K of a time series, counted from 0."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)
@@ -97,8 +105,12 @@ class ExportRequest:
 def export(request: ExportRequest) -> None:
     """Copy VOLUME to another format.
 
-    Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
-    Nothing is overwritten, and a failure leaves nothing.
+    \b
+    beamline export VOLUME.h5 -o VOLUME.tif
+    beamline export VOLUME.h5 -o GREY.tif --bits 16 --window 0:0.5
+
+    The values stay as they are (float32), unless you give --bits and --window. Slices are copied one at a time, so
+    volumes may be larger than the memory. No file is overwritten, and a failure leaves no file.
     """
     from beamline.storage.interrupted import volume_file
 
@@ -113,14 +125,17 @@ def export(request: ExportRequest) -> None:
 
 
 def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None] | None:
-    """The exporter of what --gaussians or --poses ask for; None: they ask for nothing, so that voxels are exported."""
+    """The function that exports what --gaussians or --poses ask for; None if voxels are exported."""
     parts = {
         "--gaussians": (request.gaussians, _PLY, _export_gaussians),
         "--poses": (request.poses, _CSV, _export_poses),
     }
     for name, (wanted, suffix, _) in parts.items():
         if (request.output.suffix.lower() == suffix) != wanted:
-            raise click.UsageError(f"-o {request.output}: {name} needs the suffix {suffix}; voxels need another one.")
+            raise click.UsageError(
+                f"-o {request.output}: {name} writes {suffix} files, and only {name} writes them. Change the suffix or "
+                f"add {name}."
+            )
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
             if request.bits != "32" or any(
@@ -142,16 +157,13 @@ def _export_voxels(request: ExportRequest) -> None:
         raise click.UsageError("--window needs --bits 8 or --bits 16.")
     if pixels.bits < 32 and not format_of(request.output).greys:
         raise click.UsageError(
-            f"{format_of(request.output).name} stores values, not grey values: leave out --bits and --window."
+            f"{format_of(request.output).name} files have no grey values: leave out --bits and --window."
         )
     with answering(request.as_json) as answer:
         refuse_existing(request.output)
         with opened_volume(request.volume, request.dataset, request.at) as record:
             if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
-                raise DataError(
-                    f"{request.volume} holds grey values of a window, not the volume itself. Export the volume it was "
-                    "made of."
-                )
+                raise DataError(f"Export the original volume: {request.volume} is a copy of it with grey values.")
             if request.material is not None:
                 record = _of_material(record, request.material)
             if pixels.bits < 32 and request.window is None:
@@ -160,7 +172,7 @@ def _export_voxels(request: ExportRequest) -> None:
             shape = record.volume.grid.shape
         share, window = clipped / math.prod(shape), request.window
         facts = {"output": request.output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
-        outside = f"{share:.3%} of the voxels lie outside and are clipped"
+        outside = f"{share:.3%} of the voxels are outside it and were clipped"
         answer.done(
             {**facts, "seconds": answer.seconds},
             f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})",
@@ -170,10 +182,10 @@ def _export_voxels(request: ExportRequest) -> None:
 
 
 def _of_material(record: ReconRecord, number: int) -> ReconRecord:
-    """The volume of each voxel's probability to be of a material; in memory, one volume for each material and two.
+    """The probability of each voxel that it is a certain material. Needs memory for two volumes more than materials.
 
     Raises:
-        DataError: it has no such material.
+        DataError: the volume has no such material.
     """
     from recon.base.registry import loaded
     from recon.base.volume import Volume
@@ -184,11 +196,14 @@ def _of_material(record: ReconRecord, number: int) -> ReconRecord:
     shares = pulled.probabilities(record.volume, record.settings) if known else None
     if shares is None:
         raise DataError(
-            "--material: this volume was not pulled to few materials. Discrete and the finish of r2 do so where views "
-            "held out prefer it; the record then has levels_of_materials. Nothing was written."
+            "--material: this volume has no discrete levels. `discrete` and r2 (--finish) use discrete levels only if "
+            "these predict held-out projections better; the volume then has the parameter levels_of_materials. Nothing "
+            "was written."
         )
     if number > len(shares):
-        raise DataError(f"--material {number}: this volume has materials 1 to {len(shares)}. Nothing was written.")
+        raise DataError(
+            f"--material {number}: the materials of this volume are 1 to {len(shares)}. Nothing was written."
+        )
     return replace(record, volume=Volume(shares[number - 1], record.grid), kind=VoxelKind.SHARE)
 
 
@@ -207,7 +222,7 @@ def _write_ply(path: Path, model: Model) -> None:
     """The Gaussians as a binary PLY: x y z, scale_0..2 (standard deviations), rot_0..3 (w x y z), density.
 
     Raises:
-        DataError: `path` exists, or the disk refuses; nothing is left.
+        DataError: `path` exists, or the disk cannot take it. No file is left.
     """
     import numpy as np
 
@@ -234,12 +249,16 @@ def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
     with answering(as_json) as answer:
         refuse_existing(output)
         views, axis_col = write_poses(output, volume)
-        lines = f"output  {output} (CSV)", f"views   {views}", f"axis    give --axis {axis_col:.2f} with these --poses"
+        lines = (
+            f"output  {output} (CSV)",
+            f"views   {views}",
+            f"axis    use --axis {axis_col:.2f} together with these --poses",
+        )
         answer.done({"output": output, "views": views, "axis_col": axis_col}, *lines)
 
 
 def _suggestion(record: ReconRecord) -> str:
-    """A window for the volume, by some of its slices."""
+    """A suggested window for the volume, from some of its slices."""
     import numpy as np
 
     from recon.base.arrays import some_values
@@ -250,10 +269,12 @@ def _suggestion(record: ReconRecord) -> str:
     values = np.concatenate([some_values(values, _VALUES) for values in some])
     values = values[np.isfinite(values)]
     if not values.size:
-        return "No value of the slices looked at is finite. Nothing was written."
+        return "The slices that were read have no finite value. Nothing was written."
     low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
-    if low == high:  # matter in a few voxels, or values that differ in their last digits
+    if low == high:  # only a few voxels have material, or values differ only in the last digits
         low, high = float(values.min()), float(values.max())
     if low == high:
-        return f"Every value of the slices looked at is {low:g}: there is no window to take. Nothing was written."
-    return f"The values of {count(chosen.size, 'slice')} lie in {low:.8g}:{high:.8g}. Nothing was written."
+        return (
+            f"Every voxel in the slices that were read is {low:g}, so no window can be suggested. Nothing was written."
+        )
+    return f"Suggested: --window {low:.8g}:{high:.8g} (from {count(chosen.size, 'slice')}). Nothing was written."

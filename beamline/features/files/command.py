@@ -1,4 +1,4 @@
-"""`beamline info`, `validate`, `ingest`: describe, check and copy scans."""
+"""`beamline info`, `validate`, `ingest`: describe, check and convert scans and volumes."""
 
 from __future__ import annotations
 
@@ -35,15 +35,24 @@ _PATH = click.Path(path_type=Path)
 @scan_options
 @heading(OUTPUT)
 @click.option(
-    "--statistics", is_flag=True, help="For a scan: range, percentiles, mean and saturated pixels of the stored values."
+    "--statistics",
+    is_flag=True,
+    help="For a scan: range, percentiles, mean and saturated pixels of the stored values, before any correction.",
 )
-@click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: write the histograms as a picture.")
+@click.option(
+    "-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: write the histograms to this PNG file."
+)
 @light_options
 @click.option(
-    "--truth", metavar="FILE", help="For a volume: PSNR and SSIM against this reference (FILE or FILE:first:end)."
+    "--truth",
+    metavar="FILE",
+    help="For a volume: PSNR and SSIM against this ground truth (FILE, or FILE:FIRST:END for some slices).",
 )
 @click.option(
-    "--masks", metavar="FILE", type=_PATH, help="For a volume: SNR and CNR in labelled regions, 1 dense and 2 empty."
+    "--masks",
+    metavar="FILE",
+    type=_PATH,
+    help="For a volume: SNR and CNR in the regions of this label image, in which 1 is dense and 2 is empty.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(
@@ -57,20 +66,25 @@ def info(
     dose_in: str | None,
     **scan_facts: Any,
 ) -> None:
-    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format.
+    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of the file.
 
-    --statistics looks at up to 64 darks, flats and views each, spread over the scan, before any correction. --masks
-    takes regions that somebody has drawn, such as a TIFF of labels. "SSIM whole slices" has means and variances of
-    whole slices, without windows; "SSIM 3D" is that of reports.
+    \b
+    beamline info SCAN.h5
+    beamline info SCAN.h5 --statistics -o histograms.png
+    beamline info VOLUME.h5 --truth TRUTH.h5
+
+    --statistics reads up to 64 darks, 64 flats and 64 projections, spread over the scan. --masks takes regions that
+    you have drawn, for example as a TIFF of labels. "SSIM 3D" is the value that reports show. "SSIM whole slices" is
+    computed from means and variances of whole slices, without windows.
     """
     from beamline.features.files.validate import describe
     from beamline.storage.readers.open import SourceOptions
 
     light = light_asked(photons_per_count, dose_in)
     if (output is not None or light is not None) and not statistics:
-        raise click.UsageError("-o and --photons-per-count go with --statistics.")
+        raise click.UsageError("-o and --photons-per-count work only with --statistics.")
     if statistics and (truth or masks):
-        raise click.UsageError("--statistics needs a scan, --truth and --masks need a volume: give one of them.")
+        raise click.UsageError("--statistics is for scans, --truth and --masks are for volumes: leave out one of them.")
     if statistics:
         _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
     elif truth or masks:
@@ -115,7 +129,7 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
         facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
         lines = [aligned(rows, ">"), *(f"light   {line}" for line in dose)]
         beyond = (
-            f"! Pixels without data, not finite or beyond what a detector counts ({LARGEST:g}), are left out above."
+            f"! Not included above: pixels without data (not finite, or above {LARGEST:g}, which no detector counts)."
         )
         lines += [beyond] * any(each.not_finite for each in statistics)
         lines += [] if output is None else [f"output  {output}"]
@@ -149,12 +163,25 @@ def _text(value: Any) -> str:
 @click.command()
 @scan_argument
 @scan_options
-@click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
+@click.option(
+    "--deep", is_flag=True, help="Also read every frame and compare it with its stored checksum. Takes longer."
+)
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print JSON to stdout instead of text: one event per finding, then the counts.",
+)
 def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
-    """Check whether the scan in FILE can be reconstructed, or whether the volume in it is sound.
+    """Check whether the scan in FILE can be reconstructed, or whether a volume file is intact.
 
-    Exit code: 0 no error (warnings may be), 5 errors.
+    \b
+    beamline validate SCAN.h5
+    beamline validate SCAN.h5 --deep    also read and check every frame
+
+    Prints one line per finding: an error (it cannot be reconstructed as it is), a warning, or information.
+
+    Exit code: 0 no error (but there may be warnings), 5 errors.
     """
     from beamline.features.files.validate import validate as findings_of
     from beamline.storage.readers.open import SourceOptions
@@ -175,7 +202,7 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
             f"{one_line(str(file), SENTENCE)}: {errors}, {count(counts['warning'], 'warning')}",
         )
     if counts["error"]:
-        raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
+        raise DataError(f"{file} has {errors}; stdout lists them.")
 
 
 @click.command(
@@ -190,10 +217,20 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
 @heading(DATA)
 @scan_options
 @heading(OUTPUT)
-@click.option("--pixel-size-um", type=POSITIVE, help="Pixel size at the sample.")
-@click.option("--energy-kev", type=POSITIVE, help="Photon energy.")
-@click.option("--sample", help="Name of the sample, for the record.")
-@click.option("--no-data", type=float, help="Pixel value that marks pixels without a measurement.")
+@click.option(
+    "--pixel-size-um",
+    type=POSITIVE,
+    help="Pixel size at the sample in µm, if IN does not state it or states a wrong one.",
+)
+@click.option(
+    "--energy-kev", type=POSITIVE, help="Photon energy in keV, if IN does not state it or states a wrong one."
+)
+@click.option(
+    "--sample", help="Name of the sample, which the file will state. Default: the name in IN, or its file name."
+)
+@click.option(
+    "--no-data", type=float, help='Pixel value that means "no data". These pixels are not counted in the statistics.'
+)
 @json_option
 def ingest(
     source: Path,
@@ -205,10 +242,13 @@ def ingest(
     as_json: bool,
     **scan_facts: Any,
 ) -> None:
-    """Copy the scan IN into the new HDF5 scan OUT.h5.
+    """Convert the scan IN of any format into one new HDF5 file, OUT.h5.
 
-    IN: a multi-page TIFF, folder or .zip of images, .npy, Zarr, .txrm, or HDF5 (--data-path where its layout is not
-    known). Frames are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
+    \b
+    beamline ingest IMAGES SCAN.h5 --angles angles.txt --flats FLATS
+
+    IN is a multi-page TIFF, a folder or .zip of images, .npy, Zarr, .txrm or HDF5 (with --data-path, if its layout is
+    not known). Frames are copied one at a time, each with statistics and a preview. No file is overwritten.
     """
     from beamline.features.files.ingest import ingest as ingest_scan
     from beamline.storage.readers.open import SourceOptions
@@ -228,7 +268,7 @@ def ingest(
         answer.done(
             {**vars(done), "output": done.path, "seconds": seconds},
             f"output   {done.path} ({done.definition})",
-            f"frames   {done.frames}, {done.invalid_frames} without a valid pixel",
+            f"frames   {done.frames} ({done.invalid_frames} of them without a valid pixel)",
             *(f"! {doubt}" for doubt in done.doubts),
             f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s",
         )

@@ -1,4 +1,4 @@
-"""ingest: any scan, frame by frame, into one of our files with statistics of each frame; whole or not at all.
+"""ingest: copies any scan, frame by frame, into one of our files, with statistics of each frame.
 
 Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
 rounding would lose what was measured. They keep their type, at the same paths, under the definition
@@ -100,20 +100,20 @@ def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
     n = source.table.views.size
     if unknown := n - source.table.views_with_angles.size:
         raise DataError(
-            f"{source.path} does not say the angles of {unknown} of its {n} projections: give "
-            "--angles FILE (degrees, one a line). Nothing was written."
+            f"{source.path} does not state the angles of {unknown} of its {n} projections. Add --angles FILE (degrees, "
+            "one a line). Nothing was written."
         )
     if source.table.shifts is not None:
         raise DataError(
-            f"{source.path} states by how much its views are displaced, which the copy would not. Reconstruct it "
-            "as it is. Nothing was written."
+            f"{source.path} states a shift for each projection, which the copy could not state. Reconstruct the "
+            "original file instead. Nothing was written."
         )
     if source.table.altered.any():
         raise DataError(f"{altered_sentence(source)} Nothing was written.")
     if source.row_pitch_mm is not None:
         raise DataError(
-            f"{source.path} has pixels of {source.pixel_size_mm} x {source.row_pitch_mm:g} mm, and the copy states "
-            "one size. Reconstruct it as it is. Nothing was written."
+            f"{source.path} has pixels of {source.pixel_size_mm} x {source.row_pitch_mm:g} mm, but the copy can state "
+            "only one pixel size. Reconstruct the original file instead. Nothing was written."
         )
 
 
@@ -146,8 +146,8 @@ def _copy(
             raise DataError(f"{error} Nothing is left of {out}.") from error
         if i in source.damaged:
             raise DataError(
-                f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
-                f"good copy; `beamline validate --deep` looks at all frames. Nothing is left of {out}."
+                f"Frame {i} of {source.path} is damaged: its pixels differ from the stored checksum. Use an intact "
+                f"copy of the file; `beamline validate --deep` checks all frames. {out} was not written."
             )
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
@@ -168,7 +168,7 @@ def _ending_of(source: ScanSource) -> ScanEnding:
         return source.ending
     if held(source.path) or time.time() - source.path.stat().st_mtime < QUIET:
         raise DataError(
-            f"{source.path} is being written, or its program died less than {QUIET:.0f} s ago. Let the scan end. "
-            "Nothing was written."
+            f"{source.path} is still being written, or its program died less than {QUIET:.0f} s ago. Wait until the "
+            "scan has ended. Nothing was written."
         )
     return replace(source.ending, status="failed", reason=DIED)

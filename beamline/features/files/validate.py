@@ -1,4 +1,4 @@
-"""validate and describe: everything that the rules find in a file of a scan or a volume, and its facts as plain values.
+"""validate and describe: all findings about the file of a scan or a volume, and its facts as plain values.
 
 The rules of storage.rules look at a scan of any format; those at the end at what the camera's count and the clock say
 of its frames: which are lost, repeated or out of order.
@@ -53,16 +53,19 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
     raw, there = record.raw_file, record.parameters.get("partial")
     partial = f"Partial: {there} are there, the others are empty. recon --resume makes them."
-    early = "The reconstruction was stopped early; this is what it had reached."
+    early = "The reconstruction was stopped early; this is the volume that it had reached."
     rules = (
         (bad > 0, Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")),
         (low == high, Finding("error", "voxels", f"Every voxel is {low:g}.")),
         (bool(there), Finding("error", "partial", partial)),
         (record.ending.early, Finding("warning", "ended-early", early)),
-        (record.length_unit != "mm", Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")),
+        (
+            record.length_unit != "mm",
+            Finding("info", "voxel-size", "The voxel size in mm is not known: lengths are in voxels."),
+        ),
         (
             bool(record.parameters) and not Path(raw).exists(),
-            Finding("info", "raw-file", f"The scan that it was made from, {raw}, is not there."),
+            Finding("info", "raw-file", f"The scan from which it was reconstructed, {raw}, does not exist."),
         ),
     )
     yield from (finding for broken, finding in rules if broken)
@@ -120,8 +123,8 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {of} ({frames_text(unlit)}) without light: the shutter was closed, the beam was gone, "
-            f"or the file was never written there. `beamline recon` leaves such views out.{more}",
+            f"{len(unlit)} of {of} ({frames_text(unlit)}) without beam: the shutter was closed, the beam was lost, or "
+            f"these frames were never written. `beamline recon` does not use such projections.{more}",
         )
 
 
@@ -143,22 +146,27 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         if progress is not None:
             progress(row + 1, n)
     if unreadable:
-        sentence = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
+        sentence = (
+            f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Use an intact copy "
+            "of the file."
+        )
         yield Finding("error", "unreadable", sentence)
     elif progress is None and source.unreadable:
         which = f"{count(len(source.unreadable), 'frame')} cannot be read: {spans(sorted(source.unreadable))}."
-        sentence = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` leaves such frames out."
+        sentence = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` does not use such frames."
         yield Finding("warning", "unreadable", f"{sentence} `validate --deep` reads all frames.")
     if source.damaged:
         yield Finding(
             "error",
             "checksums",
-            f"{len(source.damaged)} of {n} frames differ from the checksums that were written with them: "
+            f"{len(source.damaged)} of {n} frames are damaged, because they differ from their stored checksums: "
             f"{spans(sorted(source.damaged))}. Look for a good copy; `beamline recon` leaves them out."
             + ("" if progress else " `validate --deep` compares all frames."),
         )
     elif progress and not source.checksummed:
-        yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
+        yield Finding(
+            "info", "checksums", "The frames can be read, but not checked, because the file has no checksums."
+        )
 
 
 LOOK = 15.0
@@ -330,16 +338,16 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "framestamps",
-            f"{repeated.size} frames repeat or go back in the camera's count (first: frame {first + 1}, "
-            f"framestamp {stamps[first + 1]} after {stamps[first]}).",
+            f"{repeated.size} frames have a framestamp that repeats or goes back (first: frame {first + 1}, framestamp "
+            f"{stamps[first + 1]} after {stamps[first]}).",
         )
     skipped = [i for i in np.flatnonzero(same_block & (steps > 1)).tolist() if not _taken_again(source, i, steps[i])]
     if skipped:
         yield Finding(
             "warning",
             "framestamps",
-            f"The camera counted {sum(steps[skipped] - 1)} frames that are not in the file "
-            f"(first gap before frame {skipped[0] + 1}).",
+            f"The camera recorded {sum(steps[skipped] - 1)} frames that are not in the file (first gap before frame "
+            f"{skipped[0] + 1}).",
         )
 
 

@@ -1,4 +1,4 @@
-"""The page's server: files of the page, the feed of events, tiles, and verbs for who may act.
+"""Web application of the page: its files, the stream of events, image tiles, and commands for authorised users.
 
 A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
 host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the
@@ -102,7 +102,7 @@ class Guard:
             answer.set_cookie(self._cookie, self._access.look, httponly=True, samesite="strict")
             await answer(scope, receive, send_with_headers)
         else:
-            text = "This page needs the token in the address that was printed at its start.\n"
+            text = "Use the complete address that was printed when the page started: the token in it is missing here.\n"
             await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
 
 
@@ -268,10 +268,10 @@ class _Server:
         name = _NO_VERB if verb is None else str(verb)  # never what was sent
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
-            self._log(f"refused: {name} from {client}, without the token for acting")
-            return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
+            self._log(f"not done: {name} from {client}, because the token for controlling the scan is missing")
+            return JSONResponse({"message": "This is possible only with the address for controlling the scan."}, 403)
         if folder is None or verb is None:
-            return JSONResponse({"message": f"Nothing here can {name}: no scan runs in this folder."}, 404)
+            return JSONResponse({"message": f"{name} is not possible: no scan is running in this folder."}, 404)
         self._log(f"{name}, asked for from {client}")
         asked = ask(folder, verb)
         while (state := await run_in_threadpool(asked.state)) is None:

@@ -1,4 +1,4 @@
-"""`beamline watch`, `runs` and `view`: a run, the runs in a folder, a scan or volumes, as pages in the browser."""
+"""`beamline watch`, `runs` and `view`: show a run, the runs in a folder, a scan or volumes in the browser."""
 
 from __future__ import annotations
 
@@ -29,30 +29,42 @@ if TYPE_CHECKING:
 LOOPBACK, PORT = "127.0.0.1", 8642
 
 port_option = click.option(
-    "--port", default=PORT, show_default=True, type=WholeRange(0, 65535), help="Port, or else the next free one."
+    "--port",
+    default=PORT,
+    show_default=True,
+    type=WholeRange(0, 65535),
+    help="Port of the page. If it is in use, the next free one.",
 )
 bind_option = click.option(
-    "--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all."
+    "--bind",
+    default=LOOPBACK,
+    show_default=True,
+    metavar="ADDRESS",
+    help="Network address of the page. 0.0.0.0: every computer in the network can open it (not encrypted).",
 )
 
 
 @click.command()
 @click.argument("path", metavar="[RUN|FILE|RUNS]", required=False, type=click.Path(path_type=Path))
-@click.option("--control", is_flag=True, help="Print a second address, which can pause and end the scan.")
+@click.option("--control", is_flag=True, help="Also print an address from which the scan can be paused and ended.")
 @port_option
 @bind_option
 @click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
-@click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
+@click.option("--open", "browse", is_flag=True, help="Open the page in the browser of this computer.")
 def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """Show the run in the folder RUN, or a scan FILE, as a page in the browser: views, flags, volume, states, log.
+    """Show a run in the browser: projections, flags, volume, states and log, during the scan and afterwards.
 
-    Of a folder of RUNS (./runs, unless given): the running scan, else the newest run. The page only reads; it cannot
-    slow the scan down or harm it. It is served to this machine alone: from elsewhere use an ssh tunnel, or --bind (not
-    encrypted).
+    \b
+    beamline watch        the running scan in ./runs, otherwise the newest run
+    beamline watch RUN    the run in the folder RUN
 
-    Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
+    You can also give a scan FILE, or another folder of RUNS. The page only reads files, so it cannot slow the scan
+    down or harm it. Only this computer can open the page. To open it from another one, use an ssh tunnel or --bind
+    (not encrypted).
+
+    Exit code: 0 ended by Ctrl-C, 2 no run or no free port, 5 not a scan of this program.
     """
-    from beamline.features.page.app import page  # these load HDF5 and the server, which `scan -h` does not need
+    from beamline.features.page.app import page  # these load HDF5 and the server, which help does not need
     from beamline.features.page.serve import open_port, start
     from beamline.page.run_files import Reader, watched
     from beamline.scan.runs import newest, runs_in
@@ -64,15 +76,15 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     if path is not None and not path.exists():
         there = ", ".join(run.name for run in runs_in(Path(RUNS))[:5])
         held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
-        raise ConfigError(f"there is no file or folder {path}; {held_runs}.")
+        raise ConfigError(f"{path} does not exist; {held_runs}.")
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
     if not (held(what.scan) if what.folder is None else alive(what.folder)) and (advice := next_step(what.scan)):
         click.echo(advice, err=True)
     reader = Reader(what)
     try:
-        reader.state()  # refuses a scan of another program before a page shows nothing
+        reader.state()  # stops with an error for a scan of another program, which the page cannot show
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
-        click.echo("Ctrl-C ends the page, not the scan.", err=True)
+        click.echo("Press Ctrl-C to close the page. The scan continues.", err=True)
         if tethered:
             at_end_of(sys.stdin.fileno(), lambda: _end(server))
         serve_shown(server, browse)
@@ -102,24 +114,29 @@ def _end(server: PageServer) -> None:
 @click.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
-@click.option("--page", "as_page", is_flag=True, help="Show the runs in the browser; a link opens the page of each.")
+@click.option("--page", "as_page", is_flag=True, help="Show the list in the browser; each run has a link to its page.")
 @port_option
 @bind_option
 @click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
-@click.option("--open", "browse", is_flag=True, help="With --page: open it in this machine's browser.")
+@click.option("--open", "browse", is_flag=True, help="With --page: open it in the browser of this computer.")
 def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """List the runs in FOLDER (./runs), newest first: sample, frames, state, size on the disk, flags.
+    """List the runs in FOLDER (default ./runs), newest first: sample, frames, state, size on the disk, flags.
 
-    A run that was resumed is one line. A run that is not complete shows the frames in its files and the frames planned.
-    `died`: its process ended without a word; a line says what can be done with it.
+    \b
+    beamline runs
+    beamline runs --page    the same in the browser
 
-    Exit code: 0 also where there is no run, 2 no folder, or no port.
+    A resumed run is one line. For an incomplete run, the number of frames in its files and the planned number are
+    shown. The state `died` means that the process ended before it could write its last state; a line then says what
+    you can do.
+
+    Exit code: 0 done (also if there is no run), 2 no such folder or no free port.
     """
     from beamline.scan.runs import HEAD, cells, describe, runs_in
 
     folder = folder or Path(RUNS)
     if not folder.is_dir():
-        raise ConfigError(f"there is no folder {folder} here: name the one that has the runs.")
+        raise ConfigError(f"the folder {folder} does not exist: name the folder that has the runs.")
     if as_page:
         if as_json:
             raise click.UsageError("--page does not go with --json.")
@@ -131,14 +148,15 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     if as_json:
         return
     if not runs:
-        click.echo(f"There is no run in {folder}.", err=True)
+        click.echo(f"There are no runs in {folder}.", err=True)
     for run in runs:
         if sentence := run.next_step or run.ended:
             click.echo(f"{run.folder.name}: {sentence}", err=True)
 
 
 def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """tethered: to the program whose runs these are: it tells their folders, a line each, and its page may act."""
+    """Serve the list of runs. tethered: the program that runs the scans writes their folders to stdin, one a line, and
+    its page may control them."""
     from beamline.features.page.serve import (
         RunBrowser,  # these load HDF5 and the server
         open_port,
@@ -168,10 +186,17 @@ def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> 
 @heading(OUTPUT)
 @port_option
 @bind_option
-@click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
-@click.option("--napari", "in_napari", is_flag=True, help="Show the volume in napari, if installed.")
+@click.option("--open", "browse", is_flag=True, help="Open the page in the browser of this computer.")
 @click.option(
-    "--labels", type=click.Path(path_type=Path), help="With --napari: labels from `structure`, or a TIFF of labels."
+    "--napari",
+    "in_napari",
+    is_flag=True,
+    help="Show the volume in napari instead of the browser, if napari is installed.",
+)
+@click.option(
+    "--labels",
+    type=click.Path(path_type=Path),
+    help="With --napari: file with labels, from `beamline structure` or as a TIFF.",
 )
 def view(
     volume: str,
@@ -183,29 +208,34 @@ def view(
     labels: Path | None,
     **scan_facts: Any,
 ) -> None:
-    """Show SCAN, VOLUME or the volume of RUN as a page in the browser: slices, zoom, grey window, histogram, profile.
+    """Show a scan, or one or two volumes, in the browser: slices, zoom, grey window, histogram, profile.
 
-    Of SCAN, of any format that `recon` reads, the slices are its views over the flats and sinograms. Means, angles, a
-    pair of opposite views over each other and a slice by FBP are shown with them, for any axis and tilt, which are
-    copied as options. TIFFs are a volume unless names, a file of angles or an option say that they are a scan.
+    \b
+    beamline view VOLUME.h5             or RUN: the volume of a run
+    beamline view VOLUME.h5 OTHER.h5    two volumes and their difference
+    beamline view SCAN.h5               corrected projections and sinograms
 
-    OTHER is shown below it at the same places, and the difference where both have the same shape. Of a volume above
-    512 MB slices across y and x are binned; those of an OME-Zarr are not (`beamline export`). The page is served to
-    this machine alone: from elsewhere use an ssh tunnel, or --bind (not encrypted). NAME is an array in a file with
-    several, as in FILE.h5::/entry/data.
+    For a SCAN, in any format that `recon` reads, the page also shows mean images, the angles, two opposite projections
+    over each other and an FBP slice. You can change axis and tilt there, and copy them as options for `recon`. TIFFs
+    count as a volume, unless their names, a file of angles or an option show that they are a scan.
 
-    --napari shows VOLUME and OTHER in napari instead, in their units, with labels and the centres of the Gaussians.
+    OTHER is shown below VOLUME at the same positions; the difference is shown if both have the same shape. For volumes
+    above 512 MB, slices across y and x are binned, except those of an OME-Zarr (`beamline export` makes one). NAME is
+    an array in a file with several arrays, for example FILE.h5::/entry/data. Only this computer can open the page. To
+    open it from another one, use an ssh tunnel or --bind (not encrypted).
 
-    Exit code: 0 ended by Ctrl-C, 2 no port or no napari, 5 no scan and no volume.
+    --napari shows VOLUME and OTHER in napari, in their units, with labels and the centres of the Gaussians.
+
+    Exit code: 0 ended by Ctrl-C, 2 no free port or no napari, 5 neither a scan nor a volume.
     """
     if labels is not None and not in_napari:
-        raise click.UsageError("--labels goes with --napari.")
+        raise click.UsageError("--labels works only with --napari.")
     named = [_named(each) for each in (volume, other) if each is not None]
     if in_napari:
         from beamline.features.page.in_napari import show
 
         if any(name is not None for _, name in named):
-            raise click.UsageError("--napari takes no ::NAME; copy the array to a separate file.")
+            raise click.UsageError("--napari cannot open ::NAME; copy the array to a file of its own.")
         show([path for path, _ in named], labels)
         return
     from beamline.features.page.app import viewer  # these load HDF5 and the server
@@ -219,7 +249,7 @@ def view(
 
             if other is not None:
                 source.close()
-                raise click.UsageError(f"{volume} is a scan, which is shown alone: leave out {other}.")
+                raise click.UsageError(f"{volume} is a scan, and a scan can only be shown alone: leave out {other}.")
             scan = opened.enter_context(closing(ShownScan(source)))
             server = start(lambda access: viewer([scan.stack], access, scan), open_port(bind, port))
             serve_shown(server, browse)
@@ -230,7 +260,7 @@ def view(
 
 
 def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
-    """The scan in a file, opened; None where it is a volume. DataError: a scan that cannot be read."""
+    """The scan in a file, opened; None if the file is a volume. Raises DataError for a scan that cannot be read."""
     from beamline.storage import hdf5
     from beamline.storage.readers.open import SourceOptions, open_scan, scan_format
     from beamline.storage.volume_file import SUFFIXES
@@ -248,7 +278,7 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
         if path.is_file() and not path.name.lower().endswith(SUFFIXES):
             raise
         return None
-    is_zip = path.suffix.lower() == ".zip"  # which no volume is
+    is_zip = path.suffix.lower() == ".zip"  # a .zip is never a volume
     if is_zip or source.table.views.size < len(source.table) or source.table.views_with_angles.size:
         return source
     source.close()

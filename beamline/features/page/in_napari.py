@@ -1,4 +1,4 @@
-"""Volumes, labels and Gaussians in napari, each in its place and unit."""
+"""Shows volumes, labels and Gaussians in napari, each at its position and in its unit."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:
         place["scale"] = None
     if place["scale"] is None or not np.array_equal(values, values.astype(np.int32)):
         raise DataError(
-            f"{path} holds {values.dtype} of shape {values.shape}; expected whole numbers of "
-            f"{volume.volume.grid.shape}, as the volume, or an HDF5 file of `beamline structure` of this volume."
+            f"{path} has {values.dtype} values of shape {values.shape}; expected whole numbers of the shape of the "
+            f"volume, {volume.volume.grid.shape}, or an HDF5 file that `beamline structure` made from this volume."
         )
     return values.astype(np.int32), place

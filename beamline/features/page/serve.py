@@ -1,4 +1,4 @@
-"""Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
+"""Web server for a run or a folder of runs. By default only this computer can reach it; each start makes new tokens.
 
 The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`.
 """
@@ -226,14 +226,14 @@ def open_port(bind: str, port: int) -> socket.socket:
     try:
         family = socket.AF_INET6 if ipaddress.ip_address(bind).version == 6 else socket.AF_INET
     except ValueError as error:
-        raise ConfigError(f"--bind is {bind!r}; expected an IP address of this machine, such as 127.0.0.1.") from error
+        raise ConfigError(f"--bind is {bind!r}; expected an IP address of this computer, such as 127.0.0.1.") from error
     reason = ""
     for candidate in range(port, min(port + 10, 65536)):
         try:
             return socket.create_server((bind, candidate), family=family)
         except OSError as error:
             reason = error.strerror or str(error)
-    raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
+    raise ConfigError(f"No free port was found at {bind}, from {port} on ({reason}). Choose another with --port.")
 
 
 class _Connection(H11Protocol):

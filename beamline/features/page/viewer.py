@@ -1,4 +1,4 @@
-"""Answers of the viewer: one or two volumes, or a scan, slice by slice."""
+"""Answers to requests of the viewer: slices of one or two volumes or of a scan."""
 
 from __future__ import annotations
 

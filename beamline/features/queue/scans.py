@@ -1,4 +1,4 @@
-"""`beamline scan` of several configurations, or of a table of them."""
+"""`beamline scan` with several configurations, or with a table of them."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
     head = numbered[0][1] if numbered else []
     if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
         raise ConfigError(
-            f"{table} is no table of scans: expected a line of names, such as config,sample.name,scan.exposure_s, each "
-            "once, and a line for each scan. Nothing was started."
+            f"{table} is not a table of scans. Expected a first line with names, such as "
+            "config,sample.name,scan.exposure_s, each only once, then one line per scan. Nothing was started."
         )
     for number, row in numbered[1:]:
         if not any(row):
@@ -169,7 +169,7 @@ class QueueNeeds:
         return [
             aligned([("scan", "frames", "size", "time"), *rows]),
             "",
-            f"{count(len(self.scans), 'scan')}: {total}, without what is done between them",
+            f"{count(len(self.scans), 'scan')}: {total}, plus the time between them",
         ]
 
     def data(self) -> Mapping[str, Any]:
@@ -183,11 +183,13 @@ class QueueNeeds:
         faults = [f"{name}: {text}" for name, worked in self.scans for text in worked.timeline.violations]
         if not faults and self.total_bytes * ROOM > self.free_bytes:
             faults.append(
-                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} and a tenth more, the disk has "
-                f"{size(self.free_bytes)} free; free some, or choose another storage.folder"
+                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} plus a tenth, but the disk has "
+                f"{size(self.free_bytes)} free. Free some space, or choose another storage.folder"
             )
         if faults:
-            raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
+            raise ConfigError(
+                "".join(["Nothing was started, because some of the scans cannot run:", *_indented(faults)])
+            )
 
 
 def queue_needs(queue: Sequence[Config], place: Path | None) -> QueueNeeds:
@@ -240,7 +242,7 @@ def run_queue(
             outcomes.append(ScanOutcome(name, status, path, " ".join(faults), AlarmError.exit_code if faults else 0))
             ended = "somebody stopped the queue" if stop.by_person else ""
         if run.unsafe:
-            ended = f"stage, camera or shutter did not obey at the end of {name}"
+            ended = f"stage, camera or shutter did not respond at the end of {name}"
     return tuple(outcomes)
 
 
@@ -259,7 +261,9 @@ def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
         others = ", ".join(f"{outcome.name} {outcome.status}" for outcome in bad)
         raise QueueError(f"{whole} of {len(outcomes)} scans are complete: {others}.", code)
     if alarmed:
-        raise AlarmError(f"All scans are complete, but {alarmed[0].name}: {alarmed[0].why} Look at {alarmed[0].path}.")
+        raise AlarmError(
+            f"All scans are complete, but {alarmed[0].name}: {alarmed[0].why} Details are in {alarmed[0].path}."
+        )
 
 
 def _indented(lines: Sequence[str]) -> list[str]:
@@ -283,7 +287,7 @@ def take_all(request: ScanRequest) -> None:
             return
         needs.refuse_impossible()
         if request.wait and not sys.stdin.isatty():
-            raise click.UsageError("--wait asks before each sample: it needs a terminal. Nothing was started.")
+            raise click.UsageError("--wait needs a terminal, because it asks before each scan. Nothing was started.")
         outcomes = run_queue(
             queue, partial(_take_next, request, len(queue), json_sink), stop_on_failure=request.stop_on_failure
         )
@@ -298,7 +302,7 @@ def _take_next(
 ) -> Taken:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
-        ask_operator(f"Scan {n + 1} of {of}: bring {config.sample.name} to its place.")
+        ask_operator(f"Scan {n + 1} of {of}: put the sample {config.sample.name} in place.")
     click.echo(f"Scan {n + 1} of {of}: {config.sample.name}", err=True)
     sinks: list[Sink] = [json_sink, run]
     if config.scan.energies is not None:

@@ -1,5 +1,5 @@
-"""Simulated scans of a scene without an instrument: frames, labels, the truth behind them, and the steps of a frame."""
+"""Simulated scans of a scene without an instrument: frames, labels, ground truth, and the steps that make a frame."""
 
 COMMANDS = {
-    "simulate": ("Simulate a scan of a scene, with labels and truth.", True),
+    "simulate": ("Simulate a scan of a sample with known ground truth, and write it as a scan file.", True),
 }

@@ -1,4 +1,4 @@
-"""`beamline simulate`: frames of a scene without an instrument, their steps and labels, and the truth behind them."""
+"""`beamline simulate`: simulates the scan of a scene, and writes its frames, labels and ground truth."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from simulators.effects.catalogue import CATALOGUE, load_effect
 
 
 def effects_text() -> str:
-    """Each effect that a scene may name, in the order of physics: its parameters with their defaults, what it acts on,
-    what happens, and what the parameters mean. This imports all of them."""
+    """Each effect that a scene can use, in the order of physics: parameters with defaults, what it acts on, what
+    happens, and what the parameters mean. This imports all effects."""
     lines = []
     for name, row in sorted(CATALOGUE.items(), key=lambda item: item[1].domain):
         effect = load_effect(name)
@@ -48,7 +48,7 @@ def effects_text() -> str:
     return "\n".join(lines)
 
 
-_OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
+_OVERRIDE_HELP = "Replace a value of the scene, for example detector.shape=[2048,2048]. Can be given several times."
 _VIEWS = WholeRange(1)
 _SEED = WholeRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -72,32 +72,39 @@ class SimulateRequest:
             is_eager=True,
             expose_value=False,
             callback=_print_effects,
-            help="Print all effects that a scene may name, with their parameters, and end.",
+            help="Print all effects that a scene can use, with their parameters, and stop.",
         ),
         "--explain",
         is_flag=True,
-        help="Print the steps of computing a frame, in order.",
+        help="Print the steps in which a frame is computed, in order.",
     )
     views: int | None = set_by(
         "--frames",
         type=_VIEWS,
         metavar="N",
-        help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
+        help="Number of projections over the range of angles of the scene, at the same speed of the stage. Default: "
+        "the number in the scene.",
     )
     out: Path | None = set_by(
-        "-o", "--output", "--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
+        "-o",
+        "--output",
+        "--out",
+        type=_FILE,
+        help="Write the scan to this HDF5 file, and its labels to a file next to it.",
     )
     truth: Path | None = set_by(
-        "--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file."
+        "--truth",
+        type=_FILE,
+        help="Write the ground truth to this HDF5 file: attenuation and label of each voxel of the sample.",
     )
     truth_bin: int | None = set_by(
         "--truth-bin",
         type=WholeRange(min=1),
-        help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 "
-        "voxels.",
+        help="Voxel size of the ground truth in pixels. Use the value of --bin of the reconstruction that you want to "
+        "compare. Default: such that the ground truth has about 256 voxels a side.",
     )
     picture: Path | None = set_by(
-        "--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out."
+        "--picture", type=_FILE, help="Write a picture of some frames to this PNG file. Default: next to the scan file."
     )
     seed: int = set_by(
         "--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers."
@@ -107,7 +114,7 @@ class SimulateRequest:
 
 
 class Output:
-    """Prints results as lines for people and sends them as events to programs."""
+    """Prints results as lines for people, and sends them as events for programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
         self._sink, self._clock, self._plain = sink, clock, plain
@@ -126,11 +133,16 @@ class Output:
 @click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
 @with_request(SimulateRequest)
 def simulate(request: SimulateRequest) -> None:
-    """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
+    """Simulate the scan of a sample with known ground truth, and write it as a scan file.
 
-    Only the effects that the scene names are computed. The file has the format of the instrument, which
-    `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
-    second stops at once.
+    \b
+    beamline simulate battery_noisy -o SCAN.h5 --truth TRUTH.h5
+    beamline recon SCAN.h5 --truth TRUTH.h5
+    beamline simulate battery_noisy --explain
+
+    SCENE is a YAML file, or the name of a scene that comes with the package (listed below). Only the effects that the
+    scene uses are computed. `beamline recon` reads the file as it reads a scan of the instrument. The first Ctrl-C
+    stops after the current frame, and leaves a readable file with its labels; the second one stops at once.
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
@@ -140,7 +152,7 @@ def simulate(request: SimulateRequest) -> None:
     clock = SystemClock()
     with terminated_like_interrupted(), json_events(request.as_json) as sink, exposure_errors(request.scene):
         if not (request.explains or request.out or request.truth or request.picture):
-            raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
+            raise ConfigError("Nothing to do: add --explain, --output FILE, --truth FILE or --picture FILE.")
         if request.truth_bin and not request.truth:
             raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
         picture = request.out.with_suffix(".png") if request.out and not request.picture else request.picture
@@ -170,13 +182,14 @@ def simulate(request: SimulateRequest) -> None:
             raise
         if written and written.stopped:
             raise ScanStopped(
-                f"Stopped after {written.n_frames} of {len(scan)} frames; {request.out} holds them and is readable."
+                f"Stopped after {written.n_frames} of {len(scan)} frames. {request.out} has these frames and is "
+                "readable."
             )
         output.event(Done(outputs))
 
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
-    """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
+    """Raise DataError for an output file that exists, and ConfigError if two outputs are the same file."""
     from beamline.simulate import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
@@ -186,7 +199,9 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
             continue
         other = seen.setdefault(os.path.realpath(path), what)
         if other is not what:
-            raise ConfigError(f"{path} would be both {other} and {what}; name another. Nothing was simulated.")
+            raise ConfigError(
+                f"{path} is given for {other} and for {what}: use two different files. Nothing was simulated."
+            )
         refuse_existing(path)
 
 
@@ -200,7 +215,7 @@ def _explain(scan: Scan, output: Output) -> None:
         "\n".join(
             [f"{'step':<22}{'acts on':<15}what happens"]
             + [f"{name:<22}{domain:<15}{summary}" for name, domain, summary in steps]
-            + ["\nNot named by the scene, hence neither imported nor computed:"]
+            + ["\nEffects that the scene does not use, and that are therefore neither imported nor computed:"]
             + [f"  {name:<20}{summary}" for name, summary in unused]
         )
     )
@@ -216,8 +231,8 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[
         raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
     if needed > free:
         raise ConfigError(
-            f"--truth-bin {n}: the truth takes {size(needed)} of memory, {size(free)} are free. Give a larger "
-            "--truth-bin. Nothing was simulated."
+            f"Use a larger --truth-bin: with {n}, the ground truth needs {size(needed)} of memory, and {size(free)} is "
+            "free. Nothing was simulated."
         )
     truth = truth_of(scan.scene.sample, scan.detector, n)
     write_truth(path, truth)
@@ -229,7 +244,7 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[
 def _scan(scene: SceneFile, scan: Scan, out: Path, output: Output, sink: Sink) -> SimulatedScan:
     from beamline.features.simulate.write import write_scan
 
-    ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")
+    ending = StopOnSignal("Stopping after this frame. Press Ctrl-C again to stop at once.")
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
     output("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")

@@ -1,4 +1,4 @@
-"""Writes the scan of a scene into a file like an instrument's, frame by frame; the steps of a frame; an overview."""
+"""Writes the simulated scan of a scene into a file like that of the instrument; lists the steps of a frame."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def check_output(scan: Scan, out: Path) -> None:
     free = shutil.disk_usage(out.parent).free
     if needed > free:
         raise DataError(
-            f"{out} would take {size(needed)} with {len(scan)} frames, its disk has {size(free)} free. Simulate fewer "
-            "or smaller frames, or use another disk. Nothing was written."
+            f"{out} needs {size(needed)} for {len(scan)} frames, but its disk has {size(free)} free. Simulate fewer or "
+            "smaller frames, or use another disk. Nothing was written."
         )
 
 

@@ -1,7 +1,7 @@
-"""Trials: methods, settings and options compared on a scan, and what fewer views would cost."""
+"""Trials: compare methods, settings and options on a scan, and measure the loss with fewer projections."""
 
 COMMANDS = {
     "tradeoff": ("Compare methods and settings on a scan: quality against time and memory.", True),
-    "sweep": ("Reconstruct one slice with each value of an option, as a sheet with scores.", True),
-    "study": ("Say what fewer views, narrower sectors, random angles or averaged views cost on a scan.", True),
+    "sweep": ("Reconstruct one slice with each value of an option, and draw the slices with their scores.", True),
+    "study": ("Measure how much quality a scan loses with fewer, limited-angle, random or averaged projections.", True),
 }

@@ -1,4 +1,4 @@
-"""`beamline tradeoff` and `study`: methods and settings, or views, of a scan compared by quality, time and memory."""
+"""`beamline tradeoff` and `study`: compare methods and settings, or selections of projections, on one scan."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class TradeoffRequest:
         heading(DATA),
         "--truth",
         metavar="FILE[:A:B]",
-        help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
-        "held out.",
+        help="Ground truth, to compare the volumes with: .npz, .npy or HDF5. A:B: use only these slices. Default: "
+        "compare with held-out projections.",
     )
     values: Mapping[str, Any] = others(selection_options)
     methods: tuple[str, ...] | None = set_by(
@@ -67,11 +67,14 @@ class TradeoffRequest:
         "--methods",
         callback=parsed(listed),
         metavar="A,B,...",
-        help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
-        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}.",
+        help=f"Methods to compare: some of {', '.join(names_of_one_volume())}. "
+        f"Default: all except {', '.join(name for name in names_of_one_volume() if name not in names_compared())}.",
     )
     quick: bool = set_by(
-        "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."
+        "--quick/--full",
+        default=True,
+        show_default=True,
+        help="Effort: few and short trials (--quick), or many and long ones (--full).",
     )
     seconds: float | None = set_by(equal_time)
     seed: int = set_by(heading(METHOD), seed_option)
@@ -98,11 +101,15 @@ class TradeoffRequest:
 def tradeoff(request: TradeoffRequest) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
-    With --seconds: each method once, all in the same time.
+    \b
+    beamline tradeoff SCAN.h5 --rows 500:510
+    beamline tradeoff SCAN.h5 --rows 500:510 --seconds 60
 
-    Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses.
-    Writes a folder with tradeoff.csv, pictures and an HTML page.
-    Ctrl-C keeps the trials that are done (exit code 4); before the first one it writes nothing (130).
+    With --seconds, each method runs once, and all methods get the same time.
+
+    Quality is PSNR and SSIM against --truth. Without --truth it is the residual in projections that no trial uses.
+    The command writes a folder with tradeoff.csv, pictures and an HTML page. Ctrl-C keeps the trials that are done
+    (exit code 4); before the first one is done, it writes nothing (exit code 130).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_tradeoff
@@ -114,7 +121,7 @@ def tradeoff(request: TradeoffRequest) -> None:
 
 
 def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...]) -> ComparedScan:
-    """The scan of a command, after its options were checked."""
+    """The scan of a command, after checking its options."""
     from beamline.features.trials.runner import ComparedScan
 
     context, values = click.get_current_context(), request.values
@@ -129,7 +136,7 @@ def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...])
 
 @dataclass(frozen=True, eq=False)
 class StudyRequest:
-    """What `beamline study` is asked for."""
+    """The arguments of `beamline study`."""
 
     which: str = set_by(
         heading(METHOD), click.argument("which", metavar="|".join(STUDIES), type=NameChoice(list(STUDIES)))
@@ -142,13 +149,14 @@ class StudyRequest:
         multiple=True,
         default=(DEFAULT, BASELINE),
         show_default=True,
-        help="Method of each row; may be repeated.",
+        metavar="NAME",
+        help=f"Method for every row: {', '.join(names_of_one_volume())}. Can be given several times.",
     )
     truth: str | None = set_by(
         heading(DATA),
         "--truth",
         metavar="FILE[:A:B]",
-        help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use.",
+        help="Also compare with this ground truth: .npz, .npy or HDF5. A:B: use only these slices.",
     )
     seconds: float | None = set_by(heading(METHOD), equal_time)
     values: Mapping[str, Any] = others(row_options, selection_options)
@@ -158,14 +166,14 @@ class StudyRequest:
         type=NameChoice(get_args(Filter)),
         default="hann",
         show_default=True,
-        help="Filter of each FBP, of the rows and of all views.",
+        help="Filter of every FBP, both of the rows and of the volume from all projections.",
     )
     draws: int = set_by(
         "--draws",
         type=WholeRange(min=1, max=100),
         default=3,
         show_default=True,
-        help="How often the study random draws its views.",
+        help="For the study random: number of random selections for each number of projections.",
     )
     seed: int = set_by(seed_option)
     output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem and the study's name"))
@@ -178,15 +186,25 @@ class StudyRequest:
 )
 @with_request(StudyRequest)
 def study(request: StudyRequest) -> None:
-    """Reconstruct the scan in FILE from chosen views, and compare each volume with that of all its views.
+    """Measure how much quality a scan loses with fewer, limited-angle, random or averaged projections.
 
-    fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
-    equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring
-    views, side by side and overlapping. `study structure`: numbers of the microstructure (splatline-structure).
+    \b
+    beamline study fixed-views SCAN.h5 --rows 500:510
+    beamline study sector SCAN.h5 -m fista-tv -m fbp
 
-    Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
-    the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
-    the rows done so far (exit code 4; 130 and no folder if there are none).
+    \b
+    fixed-views      360, 180, 90 and 45 evenly spread projections
+    sector           only 30-150, 45-135 and 60-120 degrees: fewer projections,
+                     and as many as before
+    random           random projections, compared with evenly spread ones
+    window-average   means of neighbouring projections, separate and overlapping
+    structure        numbers of the microstructure; needs splatline-structure
+                     (see `beamline study structure --help`)
+
+    Each volume is compared with the volume from all projections by the same method, in PSNR, SSIM, SNR and CNR; with
+    --truth, PSNR and SSIM against the ground truth are added. Rows that need more projections than the scan has are
+    left out. The command writes a folder with study.csv, pictures and report.html. Ctrl-C keeps the rows that are done
+    (exit code 4; 130 and no folder if there are none).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_study

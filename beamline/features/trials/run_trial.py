@@ -1,4 +1,4 @@
-"""The data that all trials of a scan share, and one trial: its reconstruction, and what it measures."""
+"""Runs one trial: reconstructs and measures. Also the data that all trials of a scan share."""
 
 from __future__ import annotations
 
@@ -64,15 +64,15 @@ class TrialScan(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TrialData(TrialScan):
-    """What every trial of a scan shares.
+    """The data that all trials of a scan share.
 
     Attributes:
-        prepared: the views that may be used, and those that no trial uses as its views held out, without what the
-            monitor says of views: trials are compared by all rays with the same weight.
-        truth: the volume [z, y, x] on Grid.matching(geometry).
-        references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
-        regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None: there are none.
-        seed: of all trials.
+        prepared: the projections that may be used, and the held-out projections that no trial uses. Weights from the
+            monitor are removed, because trials are compared with equal weight for all rays.
+        truth: the ground truth [z, y, x] on Grid.matching(geometry).
+        references: further volumes on the same grid that trials are compared with, by method.
+        regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None if there are none.
+        seed: random seed of all trials.
     """
 
     prepared: PreparedProjections
@@ -83,11 +83,11 @@ class TrialData(TrialScan):
 
     @property
     def geometry(self) -> Geometry:
-        """Geometry of the views that may be used."""
+        """Geometry of the projections that may be used."""
         return self.prepared.geometry
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
-        """The method of a trial, and its views."""
+        """The method of a trial, and its projections."""
         if trial.choice is None:
             angles, period = self.geometry.angles, self.geometry.period
             views = self.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
@@ -96,7 +96,7 @@ class TrialData(TrialScan):
         return TrialRun(trial.build(), views, Grid.matching(self.geometry), self.seed)
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[dict[str, float], list[float]]:
-        """Figures of a volume, and the squared residual of each view held out."""
+        """Figures of merit of a volume, and the squared residual of each held-out projection."""
         truth = None if self.truth is None else Volume(self.truth, made.grid)
         judged = judge(made, self.prepared.views, truth, held_out=self.prepared.views_held_out)
         figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
@@ -109,10 +109,10 @@ class TrialData(TrialScan):
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
-    """The views of a row of a study, each the mean of a window of views.
+    """The projections of a row of a study, each the mean of a window of projections.
 
-    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. A ray
-    weighs as the least of its window.
+    The transmissions are averaged, -log(mean(exp(-p))), not the logarithms, as in a longer exposure. The weight of a
+    ray is the smallest weight in its window.
     """
     groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
@@ -134,7 +134,7 @@ def run_trial(
     control: RunControl = _UNWATCHED,
     cpu: Callable[[], float] = time.process_time,
 ) -> tuple[Outcome, F32 | None]:
-    """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x]; None where it failed."""
+    """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x] (None if it failed)."""
     try:
         method, prepared, grid, seed, device = data.asked_by(trial)
         trial = replace(trial, views=prepared.geometry.n_views)

@@ -1,4 +1,4 @@
-"""Runner: reads the scan once, runs each trial, writes the table."""
+"""Runner: reads the scan once, runs each trial, and writes the table."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid, Volume
 from recon.judgement import regions_of
 
-_HELD_OUT_VIEWS = 16  # at most
+_HELD_OUT_VIEWS = 16  # largest number of held-out projections
 
 
 @dataclass(frozen=True)
 class ComparedScan:
-    """The scan of a trade-off or a study, and what holds for all of its reconstructions.
+    """The scan of a trade-off or a study, and settings that apply to all of its reconstructions.
 
     Attributes:
-        methods: names in `recon.methods`; none: those that suit the comparison.
-        truth: FILE or FILE:first:end to compare with.
-        seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
-        command: that repeats this, for the record.
+        methods: names in `recon.methods`; empty: the methods that suit the comparison.
+        truth: ground truth for the comparison, as FILE or FILE:first:end.
+        seconds: time limit of each reconstruction, the same for all methods; None: no limit.
+        command: the command line of this call, which the page states.
     """
 
     source: SourceOptions
@@ -56,7 +56,7 @@ class ComparedScan:
 
 
 Run = Callable[[TrialScan, MethodTrial], tuple[Outcome, F32 | None]]
-"""Runs a trial of a scan: its outcome and the volume [z, y, x]; None where it failed."""
+"""Runs a trial of a scan; returns its outcome and the volume [z, y, x], which is None if the trial failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,9 @@ class Planned:
     """What a comparison will do.
 
     Attributes:
-        data: gives the scan, once it has run what trials are compared with.
-        table: before any trial is done.
-        slices: those that are shown, before any is.
+        data: gives the data of the scan, after running the reconstructions that trials are compared with.
+        table: the table before any trial is done.
+        slices: the sheet of slices before any trial is done.
     """
 
     data: Callable[[Run], TrialScan]
@@ -75,7 +75,7 @@ class Planned:
 
 
 Plan = Callable[[Sink, Clock], Planned]
-"""Reads and corrects the views of a scan, and says which trials to run. ConfigError, DataError: nothing was written."""
+"""Reads and corrects the projections of a scan, and plans the trials. ConfigError, DataError: nothing was written."""
 
 
 def opened_scan(
@@ -84,8 +84,8 @@ def opened_scan(
     """Read and correct the views, after all inputs were checked; the table has no trials yet.
 
     Args:
-        name, title: of the table.
-        held_out: views held out judge all trials where there is no truth.
+        name, title: name and title of the table.
+        held_out: True if all trials are scored with held-out projections when there is no ground truth.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -169,7 +169,7 @@ def compare(plan: Plan, file: Path | str, folder: Path, *, as_json: bool) -> Tri
         answer.lines = text(table), f"\n{'report':<10}{folder / table.page}"
     if table.stopped:
         counts = f"{len(table.compared)} of {len(table.todo)} trials"
-        raise ScanStopped(f"The {table.name} was stopped after {counts}; their results are in {folder}.")
+        raise ScanStopped(f"The {table.name} was stopped after {counts}. The results are in {folder}.")
     return table
 
 
@@ -223,7 +223,9 @@ def with_references(data: TrialData, references: Sequence[MethodTrial], run: Run
     for reference in references:
         outcome, volume = run(data, reference)
         if volume is None:
-            raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
+            raise DataError(
+                f"The reference for the comparison ({reference.label}) failed: {outcome.message}. Nothing was written."
+            )
         volumes[reference.method] = volume
     contrast = next(iter(volumes.values())) if data.truth is None else data.truth
     regions = regions_of(Volume(contrast, Grid.matching(data.geometry)), data.seed)

@@ -1,4 +1,4 @@
-"""Sweep: the same slice with each value of one or two options, and how well each volume predicts views held out."""
+"""Sweep: the same slice with each value of one or two options, scored with held-out projections."""
 
 from __future__ import annotations
 
@@ -39,10 +39,13 @@ from recon.voxels.resolution import ViewResolution
 
 _LEAST_CHANGE = 0.05  # share of the residual of a direct method: 0.03 named an axis that was 0.7 columns off
 _NUMBER = re.compile(rf"[-+]?{NUMBER}")
-_NO_SCORE = "No score: the values change pixels or views, so the slices cannot be compared with the same views."
+_NO_SCORE = (
+    "No scores: these values change the pixels or the selection of projections, so the slices cannot be "
+    "compared with the same projections."
+)
 _OTHER_VIEWS = (
-    "These values change the views that judge the slices: each is compared with the views of every value, which "
-    "favours the middle of a range. Look at the pictures first."
+    "Look at the pictures first. This option also changes the projections that are used for scoring, so each slice is "
+    "compared with the projections as every value corrects them. That favours values in the middle of the range."
 )
 
 
@@ -69,13 +72,13 @@ class SweptTrial(MethodTrial):
 
 
 class UnseenViews(NamedTuple):
-    """The views held out from a trial, and what its volume shows in them.
+    """The held-out projections of a trial, and the forward projection of its volume.
 
     Attributes:
-        ids: rows of the file.
-        data: [view, col, row], as the trial corrects them; pixels that were not measured are NaN.
-        model: [view, col, row] what the volume shows at this resolution.
-        views: those that the trial used; trials with the same ones have the same data.
+        ids: their rows in the file.
+        data: [view, col, row], as the trial corrects them; pixels without data are NaN.
+        model: [view, col, row], forward projection of the volume at this resolution.
+        views: the projections that the trial used; trials with the same projections have the same data.
     """
 
     ids: I64
@@ -85,7 +88,7 @@ class UnseenViews(NamedTuple):
     views: object
 
     def of(self, ids: I64) -> UnseenViews:
-        """Those with these rows of the file."""
+        """The projections with these rows of the file."""
         at = np.searchsorted(self.ids, ids)
         return UnseenViews(ids, self.data[at], self.model[at], self.resolution.select(at), self.views)
 
@@ -93,11 +96,11 @@ class UnseenViews(NamedTuple):
 def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     """The same reconstruction options for a few rows around the middle.
 
-    A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
-    are given, all of them are made.
+    A direct method needs only the row of the slice; total variation and fits need some rows around it. For a cone beam,
+    and if the user gave rows, all of them are reconstructed.
 
     Raises:
-        ConfigError, DataError: a scan or a selection that is refused.
+        ConfigError, DataError: the scan or the selection cannot be used.
     """
     halo = max(min(trial.method.halo, (TRIAL_ROWS - 1) // 2) for trial in trials)
     return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
@@ -116,13 +119,13 @@ def _middle(trial: ReconOptions, halo: int) -> Selection:
 
 
 class SweptScan(TrialScan):
-    """The scan of a sweep. Views are corrected once for all values that do not affect the correction.
+    """The scan of a sweep. Projections are corrected only once for all values that do not affect the correction.
 
-    The rotation axis is found once, so that slices differ by the options alone; where it is swept, views are corrected
-    about the axis in the middle.
+    The rotation axis is found only once, so that slices differ only by the options. If the axis is swept, projections
+    are corrected with the middle axis.
 
     Attributes:
-        unseen: of the trials that were made, by label.
+        unseen: held-out projections of the finished trials, by label.
     """
 
     def __init__(self, trials: Sequence[SweptTrial], sink: Sink, clock: Clock) -> None:
@@ -179,7 +182,7 @@ class SweptScan(TrialScan):
             DataError: no slice was made, or the views held out show nothing.
         """
         if not table.compared:
-            raise DataError(f"No slice was made, the first because {table.outcomes[0].message}.")
+            raise DataError(f"No slice was made. Reason for the first one: {table.outcomes[0].message}.")
         direct = not self._trials[0].options.method.fitted
         if (scores := scores_of(self.unseen, direct=direct)) is None:
             outcomes = [replace(outcome, metrics={}) for outcome in table.outcomes]
@@ -193,16 +196,19 @@ class SweptScan(TrialScan):
                 share, verdict = judged[label]
                 metrics = {HELD_OUT: share}
                 table = table.with_outcome(at, replace(table.outcomes[at], verdict=verdict, metrics=metrics))
-        notes = [f"{BASELINE} leaves mostly the blur of its filter; -m fista-tv tells values apart better."] * direct
+        notes = [
+            f"{BASELINE} leaves mostly the blur of its filter in the residual. -m fista-tv distinguishes the values "
+            "better."
+        ] * direct
         notes += [] if same_views else [_OTHER_VIEWS]
         if (best := table.best) is None:
             low, high = min(shares_of(choice)), max(shares_of(choice))
-            best, nearly = {}, f"All scores are nearly the same ({low:.4g} to {high:.4g}): they name no value."
+            best, nearly = {}, f"All scores are nearly the same ({low:.4g} to {high:.4g}), so no value is the best."
             notes.append(nearly)
         for name in best if same_views else ():
             tried = list(dict.fromkeys(trial.settings[name] for trial in self._trials))
             if len(tried) > 2 and best[name] in (tried[0], tried[-1]) and all(_NUMBER.fullmatch(str(v)) for v in tried):
-                notes.append(f"The best {name} is at the end of the range, {best[name]}: try further.")
+                notes.append(f"The best {name} is at the end of the range, {best[name]}: try values beyond it.")
         return replace(table, notes=notes)
 
 
@@ -252,7 +258,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
     sums = [[squares_left(each.model, judge.data, None, judge.resolution) for judge in judges] for each in unseen]
     scale = sum(math.sqrt(of.own.mean()) for of in sums[0])
     if scale == 0:
-        raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
+        raise DataError("The slices cannot be scored, because the held-out projections show no sample.")
     residuals = [np.sum([np.sqrt(of.left) for of in row], axis=0) / scale for row in sums]
     predictions = (Prediction(name, left.tolist()) for name, left in zip(slices, residuals, strict=True))
     return TrialChoice(f"{len(common)} views", _LEAST_CHANGE if direct else 0.0, tuple(predictions)), same

@@ -1,4 +1,4 @@
-"""`beamline sweep`: one slice with each value of an option of `beamline recon`, as a sheet with scores."""
+"""`beamline sweep`: reconstructs one slice with each value of an option of `recon`, and draws them with scores."""
 
 from __future__ import annotations
 
@@ -30,21 +30,28 @@ _OF_A_VOLUME = frozenset(
      "roi", "follow", "previous-part", "memory", "cluster", "checkpoint", "resume", "budget",
      "volumes", "moves", "beside-scan")
 )  # fmt: skip
-"""Options of `beamline recon` that a slice has no use for."""
+"""Options of `beamline recon` that have no effect on a single slice."""
 
 MOST = 64
-"""Slices of a sheet: 16 rows of four, 3200 pixels high as `sheets` draws them."""
-_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
+"""Most slices in one picture: 16 rows of four, 3200 pixels high as `sheets` draws them."""
+_AXIS = (
+    "center",
+    "centre",
+    "center-of-rotation",
+    "centre-of-rotation",
+    "cor",
+    "rotation-axis",
+)  # names of the option axis in other programs
 _SIGNED = rf"[-+]?{NUMBER}"
 _RANGE = re.compile(rf"({_SIGNED}):({_SIGNED}):({_SIGNED})")
 
 
 @dataclass(frozen=True)
 class SweptOption:
-    """An option and the values to try, as they are typed.
+    """An option and the values to try, as the user typed them.
 
     Attributes:
-        name: long name, without dashes.
+        name: long name of the option, without dashes.
     """
 
     name: str
@@ -55,26 +62,26 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
     """The option and values of NAME=A:B:STEP or NAME=a,b,c.
 
     Args:
-        legal: long names of options that can be swept; "_" in a name stands for "-".
+        legal: long names of the options that can be swept; "_" in a name counts as "-".
 
     Raises:
-        ValueError: another name, with the nearest one, or no values.
+        ValueError: another name (the message suggests the nearest one), or too few values.
     """
     name, equals, values = text.partition("=")
     name = name.strip().lstrip("-").replace("_", "-")
     if not equals:
-        raise ValueError(f"{text!r} is no option with values; expected NAME=A:B:STEP or NAME=a,b,c")
+        raise ValueError(f"{text!r} is not an option with values; expected NAME=A:B:STEP or NAME=a,b,c")
     if name not in legal:
         near = " (did you mean axis?)" if name in _AXIS else did_you_mean(name, legal)
         raise ValueError(
-            f"{name!r} cannot be swept{near}; options of `beamline recon --help-all` under Data, Corrections and "
-            "Method can be swept, such as tv-weight, rings or axis"
+            f"{name!r} cannot be swept{near}. You can sweep the options that `beamline recon --help-all` lists under "
+            "Data, Corrections and Method, such as tv-weight, rings or axis"
         )
     tried = _values(name, values)
     if len(tried) < 2:
-        one = f"; a single one is `beamline recon --{name} {tried[0]}`" if tried else ""
+        one = f". For a single value use `beamline recon --{name} {tried[0]}`" if tried else ""
         raise ValueError(
-            f"a sweep takes at least two values, as NAME=A:B:STEP or NAME=a,b,c, and {text!r} has {len(tried)}{one}"
+            f"a sweep needs at least two values, as NAME=A:B:STEP or NAME=a,b,c, but {text!r} has {len(tried)}{one}"
         )
     return SweptOption(name, tried)
 
@@ -85,10 +92,10 @@ def _values(name: str, text: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(value for value in (word.strip() for word in text.split(",")) if value))
     first, last, step = map(Decimal, match.groups())
     if step == 0 or (last - first) / step <= 0:
-        raise ValueError(f"{name}={text}: a STEP of {step} does not lead from {first} to {last}")
+        raise ValueError(f"{name}={text}: steps of {step} do not lead from {first} to {last}")
     steps = int((last - first) / step)
     if steps >= MOST:
-        raise ValueError(f"{name}={text} has {steps + 1} values, more than {MOST}: give a larger STEP")
+        raise ValueError(f"{name}={text} has {steps + 1} values, but at most {MOST} are possible: use a larger STEP")
     return tuple(f"{first + n * step:f}" for n in range(steps + 1))
 
 
@@ -100,12 +107,14 @@ def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
     """
     names = [option.name for option in options]
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
-        raise ValueError(f"{len(names)} options are given ({', '.join(names) or 'none'}); expected one, or two others")
+        raise ValueError(
+            f"{len(names)} options are given ({', '.join(names) or 'none'}); expected one or two different ones"
+        )
     combined: list[Mapping[str, str]] = [
         dict(zip(names, values, strict=True)) for values in itertools.product(*(option.values for option in options))
     ]
     if len(combined) > MOST:
-        raise ValueError(f"{len(combined)} combinations are more than {MOST}: give fewer values")
+        raise ValueError(f"there are {len(combined)} combinations, but at most {MOST} are possible: give fewer values")
     return combined
 
 
@@ -113,7 +122,7 @@ Trials = list[tuple[Mapping[str, str], "ReconOptions"]]
 
 
 def sweepable() -> dict[str, click.Option]:
-    """The options of `beamline recon` that may have several values, by long name."""
+    """The options of `beamline recon` that can be swept, by long name."""
     own = {name_of(param): param for param in recon.params if isinstance(param, click.Option)}
     of_one_call = {name for name, param in own.items() if isinstance(param, Declared) and param.of_one_call}
     return {name: own[name] for name in sorted(own.keys() - _OF_A_VOLUME - of_one_call)}
@@ -124,16 +133,20 @@ def sweepable() -> dict[str, click.Option]:
 @new_folder_option("FILE's stem + _sweep")
 @json_option
 def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
-    """Reconstruct one slice of the scan in FILE with each value of an option of `beamline recon`, and draw them.
+    """Reconstruct one slice with each value of an option of `beamline recon`, and draw the slices with their scores.
 
-    NAME is the long name of the option; VALUES are A:B:STEP or a,b,c: tv-weight=0.5:4:0.5, rings=none,sort,vo,
-    axis=84:88:0.5. Two options make a grid. All other options of `beamline recon` hold for every slice; the method is
-    fbp without -m.
+    \b
+    beamline sweep SCAN.h5 axis=84:88:0.5
+    beamline sweep SCAN.h5 rings=none,sort,vo
+    beamline sweep SCAN.h5 tv-weight=0.001,0.002,0.004 -m fista-tv
 
-    One of eight views is held out, and each volume is judged by what it leaves of these. The best is marked, and those
-    that chance does not tell from it. The middle row is shown, of the rows that the method needs around it, or of
-    --rows. Writes a folder with sweep.csv, pictures and report.html. Ctrl-C keeps the slices that are done (exit code
-    4; 130 and no folder before the first).
+    NAME is the long name of the option. VALUES are A:B:STEP or a,b,c. Two options give a grid of slices. All other
+    options of `beamline recon` apply to every slice; without -m the method is fbp.
+
+    One of eight projections is held out, and the score of each value is the residual in the held-out projections. The
+    best value is marked, and so are values that do not differ significantly from it. The slice is the middle row of
+    the detector, or of --rows. The command writes a folder with sweep.csv, pictures and report.html. Ctrl-C keeps the
+    slices that are done (exit code 4; before the first one is done: exit code 130, no folder).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.sweep import planned_sweep
@@ -146,15 +159,18 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     table = compare(plan, file, folder, as_json=as_json)
     if not as_json and table.best is not None:
         again = [word for name, value in table.best.items() for word in _as_words(name, str(value))]
-        click.echo(f"If the pictures agree: {shlex.join(['beamline', 'recon', *common, *again])}", err=True)
+        click.echo(
+            f"If the pictures confirm the best value, use: {shlex.join(['beamline', 'recon', *common, *again])}",
+            err=True,
+        )
 
 
 def _parsed(words: Sequence[str]) -> tuple[list[SweptOption], list[str]]:
-    """The options with their values, and the words of `beamline recon` that are the same for all, its scan first."""
+    """The options with their values, and the words of `beamline recon` common to all slices, with the scan first."""
     with click.Context(recon, info_name="sweep") as context:
         taken, further, _ = recon.make_parser(context).parse_args(list(words))
     if (file := taken.get("file")) is None or not further:
-        raise click.UsageError("give a scan, and an option with its values, such as tv-weight=0.5:4:0.5.")
+        raise click.UsageError("expected a scan and an option with its values, such as tv-weight=0.5:4:0.5.")
     rest = list(words)
     for word in (str(file), *further):
         rest.remove(word)
@@ -167,19 +183,19 @@ def _parsed(words: Sequence[str]) -> tuple[list[SweptOption], list[str]]:
 
 
 def _as_words(name: str, value: str) -> list[str]:
-    """An option with a value, as `beamline recon` takes it. UsageError: a flag that is neither on nor off."""
+    """An option with a value, as words for `beamline recon`. Raises UsageError for a flag that is not true or false."""
     switch = sweepable()[name]
     if not switch.is_flag:
         return [f"--{name}={value}"]
     if value not in ("true", "false"):
-        raise click.UsageError(f"{name}={value}: it is on or off; expected {name}=false,true.")
+        raise click.UsageError(f"{name}={value}: this option can only be on or off; expected {name}=false,true.")
     names = switch.opts if value == "true" else switch.secondary_opts
     return [max(names, key=len)] if names else []
 
 
 def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
-    """Each combination of values with the options of its reconstruction. UsageError: values that are not taken, or that
-    change nothing."""
+    """Each combination of values with the options of its reconstruction. Raises UsageError for values that are not
+    allowed, or that change nothing."""
     trials: Trials = []
     for values in combinations(options):
         own = [word for item in values.items() for word in _as_words(*item)]
@@ -189,21 +205,24 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
             with recon.make_context("sweep", list(common)) as alone:
                 twice = names_given(alone) & values.keys()
             if twice:
-                raise click.UsageError(f"--{min(twice)} is swept: give its values once.")
+                raise click.UsageError(
+                    f"--{min(twice)} is given twice: once as an option and once with values to sweep. Leave out the "
+                    "option."
+                )
     told = [
         (repr((each.source, each.selection, each.method)), each.quality, each.seed, each.device) for _, each in trials
     ]
     if all(each == told[0] for each in told[1:]):
         names = " and ".join(option.name for option in options)
-        raise click.UsageError(f"{names} changes nothing of a slice by {trials[0][1].method.name}.")
+        raise click.UsageError(f"{names} changes nothing in a slice made with {trials[0][1].method.name}.")
     return trials
 
 
 def _options(context: click.Context) -> ReconOptions:
-    """The options of one reconstruction, of which no volume is written."""
+    """The options of one reconstruction whose volume is not written."""
     from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
-        raise click.UsageError(f"--{foreign[0]} belongs to a volume, and a sweep makes slices.")
+        raise click.UsageError(f"--{foreign[0]} works only with whole volumes, but a sweep makes slices: leave it out.")
     target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
     return replace(options_of(context, BASELINE), target=target)

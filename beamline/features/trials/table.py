@@ -1,4 +1,4 @@
-"""A table of trials as text, pictures and a page, and what follows from it in sentences."""
+"""The results of trials: as text, pictures and a page, with sentences that say what follows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from recon.methods import by_name
 
 _QUALITY = {
     "psnr": "PSNR (dB)",
-    "psnr_all": "PSNR all views (dB)",
+    "psnr_all": "PSNR against all projections (dB)",
     HELD_OUT: "−20 log₁₀ of the held-out residual (dB)",
 }
 """Label of the quality by each metric."""
@@ -34,9 +34,9 @@ _SHOWN_DB = 12.0  # below the best; worse trials are drawn at the lower edge
 _COLOURS = {"best": "tab:red", "alike": "tab:orange"}  # of frames, by verdict
 _MARKS = {"front": "*", "best": "*", "alike": "~"}
 _LEGENDS = {
-    "front": "*: on the front of time and quality.",
-    "best": "*: the least residual.",
-    "alike": "~: no more than that, but for chance.",
+    "front": "*: on the Pareto front: no faster trial is as good.",
+    "best": "*: the smallest residual.",
+    "alike": "~: not significantly larger than the smallest residual.",
 }
 _ALIKE_DB = 1.0  # dB below the best figure: a tenth more error
 _WIDTH = 120  # characters
@@ -162,7 +162,7 @@ def _conclusions(table: TrialTable) -> list[str]:
     highest = max((o for o in table.compared if math.isfinite(o.quality(by))), key=lambda o: o.quality(by))
     if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
         chance = f"+{gain:.2f} dB by {highest.trial.label}, is within chance (± {table.chance(highest, best):.2f} dB)."
-        out.append(f"There it ends: the best figure, {chance}")
+        out.append(f"No further improvement is significant: the best value, {chance}")
     return out
 
 
@@ -185,24 +185,27 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
     """Quality against each cost, and the slices of baselines or of all rows, by file name."""
     if any(math.isfinite(outcome.quality(table.by)) for outcome in table.compared):
         caption = (
-            "Each point is a trial, a colour a method. The line is the best quality at each time. A triangle at the "
-            f"lower edge is more than {_SHOWN_DB:g} dB below the best. Trials without a finite quality are not drawn."
+            "Each point is a trial, and each colour is a method. The line shows the best quality at each time. A "
+            f"triangle at the lower edge is a trial more than {_SHOWN_DB:g} dB below the best. Trials without a finite "
+            "quality are not drawn."
         )
         yield "quality.png", Picture("Quality against its costs", caption, quality_plot(table))
     if labels := slices.labels():
-        caption = (
-            "The same slice by each method with its usual settings, all in the grey window of matter of the first."
-        )
+        caption = "The same slice by each method with its usual settings, all with the grey window of the first one."
         marks = dict[str, tuple[str, str]]()
         if table.asks_best:
             caption = (
-                "The middle slice of each trial in one grey window, with its residual; of large ones the part that "
-                "changes most. The best has a red frame, those that are no worse but for chance an orange one."
+                "The middle slice of each trial, with its residual, all with the same grey window. Of large slices "
+                "only the part that changes most is shown. The best slice has a red frame; slices that are not "
+                "significantly worse have an orange frame."
             )
             marks = {each.trial.shown: _mark(table, each) for each in table.compared}
         yield "slices.png", Picture("Slices", caption, slices.png(labels, marks))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
-        caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
+        caption = (
+            f"One slice of every volume by {method}, all with the same grey window. Of repeated random "
+            "selections, the first is shown."
+        )
         title = f"{by_name(method).label}, slice by slice"
         yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))
 

@@ -1,4 +1,4 @@
-"""Trade-off and studies: which trials they compare.
+"""Trade-off and studies: the lists of trials that they compare.
 
 The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
 """
@@ -65,8 +65,8 @@ def planned_study(
     )
     if not table.todo:
         raise DataError(
-            f"{scan.source.path}: {n_views} views are too few for any row of {study.name}: "
-            f"left out: {choices[-1].reason}. Take a scan with more views."
+            f"{scan.source.path}: {n_views} projections are too few for any row of {study.name} (reason for the last "
+            f"one: {choices[-1].reason}). Use a scan with more projections."
         )
     warn = Warnings(sink, clock)
     for choice in choices:
@@ -80,15 +80,18 @@ def planned_study(
 
 def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings: "
-        "they say what fewer views lose, not which method is better. That volume has noise, too, which rows share as "
-        "far as they share its views. A smoother volume has more SNR and CNR."
+        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings. "
+        "They show how much is lost with fewer projections, not which method is better. The reference volume has "
+        "noise, too, and a row shares part of it, because it uses some of the same projections. A smoother volume has "
+        "higher SNR and CNR."
     )
 
 
 def _notes_on_methods(settings: Mapping[str, Mapping[str, Plain]], seconds: float | None) -> list[str]:
     words = {method: ", ".join(f"{name} {value}" for name, value in own.items()) for method, own in settings.items()}
-    in_time = [] if seconds is None else [f"Each row had {seconds:g} s; direct methods take what they take."]
+    in_time = (
+        [] if seconds is None else [f"Each row had {seconds:g} s; methods without iterations took the time they need."]
+    )
     return [*(f"{method}: {own}." for method, own in words.items() if own), *in_time]
 
 

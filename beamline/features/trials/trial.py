@@ -1,4 +1,4 @@
-"""Trial of a method: what is to be reconstructed, and what became of it; the table of all, and their Pareto front."""
+"""Trial (what to reconstruct), its outcome, the table of all trials, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -94,15 +94,15 @@ class Outcome:
     """Result of a trial.
 
     Attributes:
-        status: only "done" comes with figures.
-        seconds: wall time of the reconstruction, without compilation and measuring.
-        peak_bytes: of its process; None where the system does not say.
-        metrics: psnr, ssim3d (with a truth), residual_held_out, and with a reference psnr_all, ssim_all, snr, cnr;
-            by name.
-        gaussians: in the model at the end; None for voxel methods.
-        cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
-        squared_residuals: of each view held out.
-        verdict: "best"; "alike", not told from it by chance; empty: not compared so, or worse.
+        status: only outcomes with the status "done" have figures of merit.
+        seconds: wall time of the reconstruction, without compilation and checks.
+        peak_bytes: peak memory of its process; None if the system does not report it.
+        metrics: figures of merit by name: psnr, ssim3d (with a ground truth), residual_held_out, and with a reference
+            psnr_all, ssim_all, snr, cnr.
+        gaussians: number of Gaussians at the end; None for voxel methods.
+        cpu_seconds: CPU time of all threads of the reconstruction; compare this if other programs use the computer.
+        squared_residuals: squared residual of each held-out projection.
+        verdict: "best"; "alike": not significantly worse than the best; empty: not compared in this way, or worse.
     """
 
     trial: MethodTrial
@@ -117,7 +117,7 @@ class Outcome:
     verdict: str = ""
 
     def quality(self, by: str) -> float:
-        """dB, more is better, by the metric of this name; NaN where it is not known."""
+        """Quality in dB by the metric of this name (higher is better); NaN if it is not known."""
         value = self.metrics.get(by, math.nan)
         if by != HELD_OUT:
             return value
@@ -126,19 +126,20 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TrialTable:
-    """All trials of a scan, with the scan and the machine that they ran on.
+    """All trials of a scan, with facts about the scan and the computer.
 
     Attributes:
-        name: of the command, and of its CSV file.
-        title: of the page.
-        outcomes: in the order of the plan, also of trials that are left out.
+        name: name of the command and of its CSV file.
+        title: title of the page.
+        outcomes: all outcomes in the order of the plan, including trials that are left out.
         by: the metric of quality: psnr, psnr_all or residual_held_out.
-        scan: facts for people, by name.
-        question: that the table answers; empty: none.
-        stopped: it was interrupted before all trials were done.
-        notes: sentences on what the figures mean.
-        asks_costs: which trial is worth its time: the front of time and quality is named.
-        asks_best: which trial leaves least of the views held out: figures have more digits, and are in the pictures.
+        scan: facts about the scan for people, by name.
+        question: the question that the table answers; may be empty.
+        stopped: True if it was interrupted before all trials were done.
+        notes: sentences about the meaning of the figures.
+        asks_costs: True if the question is which trial is worth its time; the Pareto front is then marked.
+        asks_best: True if the question is which trial has the smallest residual in held-out projections; figures then
+            have more digits and are shown in the pictures.
         page: file name of the page.
     """
 
@@ -157,7 +158,7 @@ class TrialTable:
     page: str = REPORT
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
-        """The table with this outcome in place of the one of this number."""
+        """The table with the outcome of this number replaced."""
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
 
     @property
@@ -167,7 +168,7 @@ class TrialTable:
 
     @property
     def best(self) -> dict[str, Plain] | None:
-        """The settings of the best trial; None: none is named."""
+        """The settings of the best trial; None if no trial is called the best."""
         return next((dict(each.trial.settings) for each in self.compared if each.verdict == "best"), None)
 
     @property
@@ -182,11 +183,10 @@ class TrialTable:
 
     @property
     def front(self) -> list[Outcome]:
-        """The trials that no other one beats, by rising time, and so by rising quality; of equal ones the first.
+        """The Pareto front: trials for which no faster trial is as good, in ascending order of time and of quality.
 
-        A trial is beaten by one of at most its time and at least its quality. Times are compared to 1 %: smaller
-        differences between two trials are chance. A trial that takes longer is on the front where its gain is above
-        `chance`.
+        Times within 1 % count as equal. A slower trial is on the front only if it is better by more than `chance`. Of
+        equal trials, the first one is taken.
         """
         front: list[Outcome] = []
         known = [o for o in self.compared if math.isfinite(o.seconds) and math.isfinite(o.quality(self.by))]
@@ -196,10 +196,10 @@ class TrialTable:
         return front
 
     def chance(self, one: Outcome, other: Outcome) -> float:
-        """dB between two trials that chance may reach.
+        """Largest difference between two trials in dB that is not significant.
 
-        Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
-        noise of a view is in both of its residuals, and so not in their difference.
+        Without a ground truth: two standard errors of the mean difference of squared residuals over the held-out
+        projections. The noise of a projection is in both of its residuals, so it cancels in the difference.
         """
         first, second = (np.asarray(each.squared_residuals) for each in (one, other))
         if self.by != HELD_OUT or min(first.size, second.size) < 2 or first.size != second.size:
@@ -209,12 +209,12 @@ class TrialTable:
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
     def verdict(self, outcome: Outcome) -> str:
-        """That of the outcome, or "front" where it is on the front of a table that asks for it."""
+        """The verdict of the outcome; "front" if it is on the Pareto front and the table asks for it."""
         return "front" if self.asks_costs and outcome in self.front else outcome.verdict
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The rows of the CSV: all that is known of each trial, by name; None where it is known of another row only."""
+        """The rows of the CSV file: all values of each trial, by name; None if only other rows have a value."""
         settings = [name for outcome in self.outcomes for name in outcome.trial.settings]
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:

@@ -1,4 +1,4 @@
-"""The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
+"""The studies, and which projections of a scan each of their rows uses; pure values."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ OVERLAPPING = 180  # Number of overlapping windows of each width
 
 @dataclass(frozen=True, eq=False)
 class ViewChoice:
-    """A choice of views, each the mean of some views of the scan.
+    """A selection of projections; each one is the mean of some projections of the scan.
 
     Attributes:
-        label: in tables.
-        groups: [view, window]: each view is the mean of these views of the scan; None: left out.
-        family: choices of the same family are draws of the same kind; empty: it stands alone.
+        label: its name in tables.
+        groups: [projection, window]: the projections of the scan that are averaged; None: the choice is left out.
+        family: choices of the same family are random selections of the same kind; empty: no family.
         reason: why it is left out.
     """
 
@@ -37,23 +37,23 @@ class ViewChoice:
 
     @property
     def window(self) -> int:
-        """How many views of the scan are averaged into one."""
+        """Number of projections of the scan that are averaged into one."""
         return len(self.groups[0]) if self.groups else 0
 
     @property
     def frames(self) -> int:
-        """Frames of the scan that it takes, each counted once: its dose."""
+        """Number of frames of the scan that it uses, each counted once: its dose."""
         return len({view for group in self.groups or () for view in group})
 
     @property
     def n_views(self) -> int:
-        """Views that it makes; 0 where it is left out."""
+        """Number of projections; 0 if it is left out."""
         return len(self.groups) if self.groups else 0
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """The views that a study chooses from.
+    """The projections that a study selects from.
 
     Attributes:
         angles: [view], radians.
@@ -103,7 +103,9 @@ def random(views: ViewSet) -> list[ViewChoice]:
 def _draws(views: ViewSet, n: int) -> list[ViewChoice]:
     family = f"random, {n} views"
     if n == views.angles.size:
-        return [ViewChoice(family, None, family, "these are all views of the scan: nothing to draw")]
+        return [
+            ViewChoice(family, None, family, "these are all projections of the scan, so there is nothing to select")
+        ]
     draws = range(views.draws if n < views.angles.size else 1)
     return [_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family) for k in draws]
 
@@ -119,9 +121,19 @@ STUDIES = {
     study.name: study
     for study in (
         Study("fixed-views", "Fewer views", "What do fewer views, evenly spread, cost?", fixed_views),
-        Study("sector", "A narrower sector", "What does a narrower range of angles cost, beside fewer views?", sector),
-        Study("random", "Views at random", "Are views at random angles worse than evenly spread ones?", random),
-        Study("window-average", "Averaged views", "What do means of neighbouring views gain and cost?", window_average),
+        Study(
+            "sector",
+            "A narrower sector",
+            "How much is lost with a narrower range of angles, apart from fewer projections?",
+            sector,
+        ),
+        Study("random", "Views at random", "Are projections at random angles worse than evenly spread ones?", random),
+        Study(
+            "window-average",
+            "Averaged views",
+            "What is gained and lost by averaging neighbouring projections?",
+            window_average,
+        ),
     )
 }
 
@@ -155,7 +167,9 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     kind = "side by side" if count is None else f"overlapping, {count} views"
     label = f"mean of {w} ({width:g}°), {kind}"
     if w < 2:
-        return ViewChoice(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
+        return ViewChoice(
+            label, None, reason=(f"the projections are {np.degrees(step):.3g}° apart, so there is nothing to average")
+        )
     room = order.size - w + 1
     n = order.size // w if count is None else count
     if n < 2 or n > room:
@@ -166,6 +180,6 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     groups = order[starts[:, None] + np.arange(w)]
     together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
     if together.sum() < 2:
-        return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
+        return ViewChoice(label, None, reason="the projections are spread too unevenly to average neighbours")
     groups = groups[together]
     return ViewChoice(label, groups.tolist())

@@ -1,6 +1,6 @@
-"""Before a scan: which exposure to take, and how the axis lies, by a few frames."""
+"""Before a scan: find the exposure time, and the position of the rotation axis, from a few frames."""
 
 COMMANDS = {
-    "tune": ("Take a few frames and say which exposure to take.", True),
-    "align": ("Take a pair of views and say axis, tilt and sharpness, with the corrections.", True),
+    "tune": ("Take a few frames, and report noise, saturation and the exposure time to use.", True),
+    "align": ("Take two opposite projections; report rotation axis, tilt and focus, and how to correct them.", True),
 }

@@ -1,4 +1,4 @@
-"""Align: a pair of views half a turn apart before a scan: where the axis is, how it leans, and how sharp views are."""
+"""Align: finds rotation axis, tilt and focus from two opposite projections, before a scan."""
 
 from __future__ import annotations
 
@@ -118,15 +118,19 @@ class Alignment:
             tilt = "not known: too few bands of rows show the sample"
         else:
             turn, sure = math.degrees(self.tilt), math.degrees(self.uncertainty)
-            tilt = f"{turn:.3f}° ± {sure:.3f}°, {abs(self.lean):.2f} px from first to last row; "
+            tilt = f"{turn:.3f}° ± {sure:.3f}°, {abs(self.lean):.2f} px between the first and the last row; "
             way = "clockwise" if turn > 0 else "anticlockwise"  # the axis' foot is right of its head
-            turned = f"turn the axis {abs(turn):.3f}° {way} as the frame shows it, or the camera the other way"
+            turned = (
+                f"rotate the axis by {abs(turn):.3f}° {way} as seen in the frame, or the camera by the same angle "
+                "in the other direction"
+            )
             tilt += turned if abs(self.lean) > STRAIGHT else "no correction"
         detail = (
             "not known: the view is only noise"
             if math.isnan(self.detail)
             else (
-                f"{self.detail:.3g} px over which the view at {degrees(self.angle)} changes; focus until it is smallest"
+                f"{self.detail:.3g} px is the width of the finest detail in the projection at {degrees(self.angle)}; "
+                "focus until this is smallest"
             )
         )
         return [f"{name:<8}{text}" for name, text in (("axis", axis), ("tilt", tilt), ("detail", detail))]
@@ -152,8 +156,8 @@ def align(
     pair = [first, first + math.pi if first + math.pi <= limits.high else first - math.pi]
     if not all(limits.low - _ROUNDING <= each <= limits.high + _ROUNDING for each in pair):
         raise ConfigError(
-            f"The views would be at {' and '.join(map(degrees, pair))}; the stage goes from {degrees(limits.low)} to "
-            f"{degrees(limits.high)}. Give --angle another value. Nothing was started."
+            f"The projections would be at {' and '.join(map(degrees, pair))}, but the stage can only go from "
+            f"{degrees(limits.low)} to {degrees(limits.high)}. Choose another --angle. Nothing was started."
         )
     frames, _ = take(_blocks(plan.exposure, pair), config, instrument, stop, sink)
     return evaluate(frames, config.optics.pixel_size_um * 1e-3 * config.devices.camera.binning)
@@ -182,8 +186,8 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
         raise QualityError(f"The two views show no axis: {error}") from error
     if not axis.confident:
         raise QualityError(
-            f"The two views do not match: the axis may be near column {axis.value:.1f}, or not. Take a sample with "
-            "more contrast that stays in the field of view, and look at the flats."
+            f"The two projections do not match: the axis may be near column {axis.value:.1f}, or not. Use a sample "
+            "with more contrast that stays in the field of view, and check the flats."
         )
     offset = axis.value - (dark.shape[1] - 1) / 2
     return Alignment(

@@ -1,4 +1,4 @@
-"""`beamline tune`, `align`: a few frames before a scan say which exposure to take, and where the axis is."""
+"""`beamline tune`, `align`: find the exposure time and the rotation axis from a few frames before a scan."""
 
 from __future__ import annotations
 
@@ -29,15 +29,19 @@ Found = TypeVar("Found", bound="Tuning | Alignment")
 
 @click.command()
 @config_argument
-@click.option("--angle", type=float, help="Angle of the view, degrees. Default: the first one of the scan.")
+@click.option("--angle", type=float, help="Angle of the projection in degrees. Default: the first angle of the scan.")
 @set_option
 @json_option
 def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Take darks, flats and a view, and report counts, saturation, transmission, noise and the exposure to take.
+    """Take a few frames, and report counts, saturation, transmission, noise and the exposure time to use.
 
-    The shutter opens, the sample goes out and back, the stage turns to the view's angle and back. Two darks and two
-    flats tell noise from structure. Flats and view are also taken at an eighth and a 64th of the exposure, in case
-    they saturate. Nothing is written.
+    \b
+    beamline tune my.yaml
+
+    Two darks, two flats and one projection are taken: the shutter opens, the sample moves out and back, and the stage
+    turns to the angle of the projection and back. The difference of two equal frames shows the noise. Flats and
+    projection are also taken with an eighth and a 64th of the exposure time, in case they saturate. No file is
+    written.
 
     Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.
     """
@@ -46,15 +50,20 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     result = evaluated(file, overrides, as_json, tune_exposure, angle)
     if result.faults:
         if math.isnan(result.advised):
-            raise QualityError("These references would stop a scan, and no exposure mends that: look at the FAULT.")
-        raise QualityError(f"These references would stop a scan; {result.advised:.4g} s is the exposure to take.")
+            raise QualityError(
+                "A scan would stop with these darks and flats, and no exposure time changes that: see FAULT above."
+            )
+        raise QualityError(
+            f"Set the exposure to {result.advised:.4g} s: with the present one, a scan would stop at its darks or "
+            "flats."
+        )
 
 
 def evaluated(
     file: Path, overrides: Sequence[str], as_json: bool,
     evaluate: Callable[[Config, ConnectedDevices, StopRequest, Sink, float | None], Found], angle: float | None,
 ) -> Found:  # fmt: skip
-    """What `evaluate` finds in views from `angle`, degrees, printed as lines or JSON."""
+    """The result of `evaluate` for projections from `angle` (degrees) on, printed as lines or JSON."""
     from beamline.config.load import load
     from beamline.instrument.connect import ask_operator, connect
 
@@ -77,16 +86,21 @@ def evaluated(
 
 @click.command()
 @config_argument
-@click.option("--angle", type=float, help="Angle of the first view, degrees. Default: the first one of the scan.")
+@click.option(
+    "--angle", type=float, help="Angle of the first projection in degrees. Default: the first angle of the scan."
+)
 @set_option
 @json_option
 def align(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Take a pair of views half a turn apart, and report axis, tilt and sharpness, with the correction of each.
+    """Take two opposite projections (180° apart); report rotation axis, tilt and focus, and how to correct them.
 
-    The shutter opens, the sample goes out and back, the stage turns to both angles and back. Mend what is said, and
-    call it again. Nothing is written.
+    \b
+    beamline align my.yaml
 
-    Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the views show no axis.
+    The shutter opens, the sample moves out and back, and the stage turns to both angles and back. Correct what the
+    command reports, and call it again. No file is written.
+
+    Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the projections show no axis.
     """
     from beamline.features.tuning.align import align as align_views
 

@@ -1,4 +1,4 @@
-"""Tune: takes a few darks, flats and views at some exposures, and derives counts, noise and the best exposure.
+"""Tune: takes a few darks, flats and projections at several exposures, and finds counts, noise and the best exposure.
 
 Pairs of frames separate noise from structure. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
 ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
@@ -78,31 +78,36 @@ class Tuning:
         low, middle = self.transmission
         at_low, at_middle = self.noise
         words = [
-            ("dark", f"{self.dark:.5g} counts, a pixel's noise {self.dark_noise:.3g}"),
+            ("dark", f"{self.dark:.5g} counts; noise of a pixel: {self.dark_noise:.3g} counts"),
             (
                 "flat",
-                f"{self.flat:.5g} counts, the brightest thousandth {self.brightest:.5g} of {self.saturation:.5g}, at "
-                f"{self.exposure:.4g} s",
+                f"{self.flat:.5g} counts; the brightest thousandth of the pixels has {self.brightest:.5g} of "
+                f"{self.saturation:.5g}, at {self.exposure:.4g} s",
             ),
-            ("saturated", f"{self.saturated:.2%} of the flat's pixels at the configured {self.configured:.4g} s"),
-            ("photons", f"{self.photons:.4g} in a pixel of that flat, {self.gain:.3g} counts each"),
+            ("saturated", f"{self.saturated:.2%} of the pixels of the flat, at the configured {self.configured:.4g} s"),
+            (
+                "photons",
+                f"{self.photons:.4g} photons in a pixel of that flat; camera gain: {self.gain:.3g} counts per photon",
+            ),
             (
                 "view",
-                f"lets {middle:.3g} of the light through, its darkest hundredth {low:.3g}, at {degrees(self.angle)}",
+                f"transmission {middle:.3g} (median), {low:.3g} in its darkest hundredth, at {degrees(self.angle)}",
             ),
             (
                 "noise",
-                f"{at_middle:.3g} of a line integral in one view at the exposure advised, {at_low:.3g} in its darkest "
-                "hundredth",
+                f"of a line integral in one projection at the advised exposure: {at_middle:.3g}, {at_low:.3g} in the "
+                "darkest hundredth",
             ),
             (
                 "exposure",
-                f"{self.advised:.4g} s: scan.exposure_s={self.advised:.4g} (configured {self.configured:.4g}; period "
-                f"and camera allow up to {self.longest:.4g})",
+                f"{self.advised:.4g} s: scan.exposure_s={self.advised:.4g} (now configured: {self.configured:.4g} s; "
+                f"period and camera allow up to {self.longest:.4g} s)",
             ),
         ]
         if not math.isnan(self.x_rays):
-            words[4:4] = [("X-rays", f"{self.x_rays:.3g} photons a count by optics.light_path: --photons-per-count")]
+            words[4:4] = [
+                ("X-rays", f"{self.x_rays:.3g} photons per count, from optics.light_path (for --photons-per-count)")
+            ]
         if math.isnan(self.advised):
             words[3:] = [("exposure", "not known until the fault is mended")]
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]

@@ -1,4 +1,4 @@
-"""Bands: rows or columns that suddenly lose or gain light while others do not: a lost packet, a slit that moved.
+"""Check `bands`: rows or columns that suddenly get darker or brighter than the others, for example after a lost packet.
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
 column is compared with the value expected from the views before. A change of
@@ -37,15 +37,15 @@ Blocks = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Lines of one kind of frame, along one axis.
+    """Rows or columns of the preview (lines), for one kind of frame.
 
     Attributes:
-        last: logarithms of the light of the last frames without a band, oldest first.
-        change: each line's usual change that its velocity does not explain.
+        last: logarithms of the intensity of each line in the last frames without a band, oldest first.
+        change: usual change of each line that its velocity does not explain.
         blocks: [line, block] counts of the last frame without a band.
-        first, after: lines of the present band; equal without one.
-        jump: change of their difference from the lines beside them.
-        flagged: frames in a row with this band.
+        first, after: first line of the present band, and the line after its last; equal without a band.
+        jump: change of the difference between the band and the lines next to it.
+        flagged: number of frames in a row with this band.
     """
 
     last: tuple[Lines, ...] = ()
@@ -72,19 +72,19 @@ class BandsState:
 
 @dataclass(frozen=True)
 class BandsCheck(Logged):
-    """Score: fraction of its light that a preview row or column has lost (negative: gained).
+    """Score: fraction of intensity that a preview row or column has lost (negative: gained).
 
-    The default limit comes from two black rows across two preview blocks of 8: they take an eighth of the light of
-    each.
+    The default limit comes from two black rows that lie in two preview blocks of 8 rows: each block loses an eighth of
+    its intensity.
     """
 
     name: ClassVar[str] = "bands"
     bit: ClassVar[int] = 3
-    unit: ClassVar[str] = "fraction of the line's light"
-    meaning: ClassVar[str] = "rows or columns lost or gained light against their own past while the others did not"
+    unit: ClassVar[str] = "fraction of the intensity in the row or column"
+    meaning: ClassVar[str] = "rows or columns suddenly became darker or brighter, while the others did not"
 
     alarm: float = setting(
-        0.1, "fraction of light that a preview row or column may lose against the others", ge=0, lt=1
+        0.1, "fraction of the intensity that a preview row or column may lose against the others", ge=0, lt=1
     )
 
     start = BandsState
@@ -133,9 +133,9 @@ class BandsCheck(Logged):
     def _flag(self, view: int, score: float, limit: float, region: PixelBox, word: str) -> Flag:
         first, after = region[:2] if word == "rows" else region[2:]
         advice = (
-            f"Within {word} {first} ... {after - 1} the light {'fell' if score > 0 else 'rose'} by up to "
-            f"{abs(score):.0%} at once, and not elsewhere: a band. Check the camera's link and readout, and "
-            f"slits. {AGAIN}"
+            f"Check the link and the readout of the camera, and the slits: {word} {first} ... {after - 1} suddenly "
+            f"became up to {abs(score):.0%} {'darker' if score > 0 else 'brighter'}, the rest of the frame did not. "
+            f"{AGAIN}"
         )
         return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
 
@@ -187,10 +187,10 @@ def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
 
 
 def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
-    """Difference of the darkest (or brightest) of some lines from those on both sides, in logarithms.
+    """Difference in log intensity between the darkest (or brightest) of some lines and the lines on both sides.
 
-    An edge of the sample lies between the two sides; at the frame's edge there is only one side. The outer lines of a
-    band may be only partly in it.
+    The value at an edge of the sample is between those of the two sides; at the edge of the frame there is only one
+    side. The outer lines of a band may be only partly in it.
     """
     left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
     beside = [float(side.mean()) for side in (left, right) if side.size]
@@ -201,5 +201,5 @@ def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
 
 
 def _typical(now: Blocks, before: Blocks) -> float:
-    """Median change of the logarithm of the light along a line, so that zingers do not count."""
+    """Median change of the log intensity along a line. The median ignores zingers."""
     return float(np.median(np.log(np.maximum(now, LEAST_LIGHT)) - np.log(np.maximum(before, LEAST_LIGHT))))

@@ -1,4 +1,4 @@
-"""Blur: loss of the finest detail, by defocus or by motion during the exposure.
+"""Check `blur`: loss of fine detail because of defocus or motion during the exposure.
 
 The figure is the contrast of second differences over two pixels against that of first differences over four, along the
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
@@ -56,20 +56,20 @@ class BlurState:
 
 @dataclass(frozen=True)
 class BlurCheck(Logged):
-    """Score: fraction of its fine contrast that a view has lost relative to the views before.
+    """Score: fraction of fine contrast that a projection has lost relative to the projections before.
 
-    The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
-    is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well. Fringes
-    are a fact, too: their score is how far line integrals beside an outer edge fall below the air, as a share of the
-    step at the edge.
+    The default: a blur of 0.7 pixels (sigma) takes 0.3 of the fine contrast of round particles, and 0.4 of flat faces.
+    A slow loss is reported as info if both directions have it, because a sample with flat faces also turns its sharp
+    edges away. Phase fringes are reported as info, too: their score is how far line integrals next to an outer edge
+    fall below the air, as a fraction of the step at the edge.
     """
 
     name: ClassVar[str] = "blur"
     bit: ClassVar[int] = 14
-    unit: ClassVar[str] = "share of the fine contrast"
-    meaning: ClassVar[str] = "the view is less sharp than the views before"
+    unit: ClassVar[str] = "fraction of the fine contrast"
+    meaning: ClassVar[str] = "the projection is less sharp than the projections before"
 
-    warn: float = setting(0.3, "share of the fine contrast that a view may lose", ge=0, lt=1)
+    warn: float = setting(0.3, "fraction of the fine contrast that a projection may lose", ge=0, lt=1)
 
     start = BlurState
 
@@ -89,7 +89,7 @@ class BlurCheck(Logged):
         return CheckResult(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
 
     def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> CheckResult[BlurState]:
-        """What the frame has lost beside the views before."""
+        """The loss of sharpness of the frame relative to the projections before."""
         if frame.kind is not FrameKind.PROJECTION:
             return CheckResult(_with_reference(state, frame))
         if context.view is None:
@@ -112,8 +112,9 @@ class BlurCheck(Logged):
         worst = int(np.argmax(np.where(over, losses, -np.inf)))
         where = "" if all(over) else (" along the rows", " along the columns")[worst]
         advice = (
-            f"The finest detail has {losses[worst]:.0%} less contrast{where} than in the views before: the focus "
-            "moved, or the sample moved while the frame was exposed. Check focus and vibration. " + again_by(self.name)
+            f"Check focus and vibration: fine details have {losses[worst]:.0%} less contrast{where} than in the "
+            "projections "
+            "before. The focus moved, or the sample moved during the exposure. " + again_by(self.name)
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 
@@ -128,8 +129,8 @@ class BlurCheck(Logged):
         if state.reported or limit >= LEAST or min(losses) <= limit:
             return CheckResult(state)
         advice = (
-            f"The finest detail has {min(losses):.0%} less contrast than in the first views: the focus drifts, or the "
-            "sample shows its sharp edges no more from here. Compare with the view half a turn away."
+            f"Compare with the opposite projection (180° away): fine details have {min(losses):.0%} less contrast than "
+            "in the first projections. Either the focus drifts, or the sample has no sharp edges in this direction."
         )
         return CheckResult(replace(state, reported=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 
@@ -138,7 +139,8 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
     """Ratio of fine to coarse contrast, along rows and along columns; NaN without contrast.
 
     Args:
-        lines: counts [line, col] of strips of `STRIP` neighbouring rows; `dark` and `flat` likewise.
+        lines: counts [line, col] of strips of `STRIP` neighbouring rows.
+        dark, flat: the same lines of the mean dark and the mean flat.
     """
     low = np.zeros_like(lines, np.float32) if dark is None else dark
     if flat is None:

@@ -1,4 +1,4 @@
-"""Steps of the light, or of the camera's gain, between two views; and bright spots that only one view has."""
+"""Checks `gain` and `zingers`: sudden changes of beam intensity or camera gain, and bright spots in single frames."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from beamline.core.text import count
 from beamline.monitor.change import FrameScatter, SampleChange
 from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -16,26 +17,26 @@ from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
 
 SIGMAS = 8.0
-PARTS = 5  # of the field, from left to right
-ALIKE = 0.5  # allowed difference between parts, as a share of the gain: a ghost is only in some of them
+PARTS = 5  # number of parts of the field of view, from left to right
+ALIKE = 0.5  # allowed difference between the parts, as a fraction of the change; a ghost is only in some parts
 
 
 @dataclass(frozen=True)
 class GainCheck(Logged):
-    """Score: relative change of the light, equal in all places, since the view before (beamline.monitor.change).
+    """Score: uniform relative change of the intensity since the previous projection (beamline.monitor.change).
 
-    The default: flats divide a step out only if they are taken anew. 1 % of light is 0.01 of line integral in every
-    ray, a fifth of what 50 um of electrolyte do. A ring that is topped up every few minutes steps by less. The figure's
-    own noise is 1e-4 on 128 x 512 pixels of 5000 photons.
+    The default: a change is corrected only if flats are taken again. 1 % of intensity is 0.01 of line integral in every
+    ray, a fifth of what 50 um of electrolyte absorb. A top-up of the ring every few minutes changes the intensity by
+    less. The noise of the score is 1e-4 for 128 x 512 pixels with 5000 photons.
     """
 
     name: ClassVar[str] = "gain"
     bit: ClassVar[int] = 8
-    unit: ClassVar[str] = "relative change of the light"
-    meaning: ClassVar[str] = "the light, or the camera's gain, stepped between this view and the one before"
+    unit: ClassVar[str] = "relative change of the intensity"
+    meaning: ClassVar[str] = "the beam intensity, or the gain of the camera, changed suddenly before this projection"
 
-    warn: float = setting(0.01, "relative change of the light from one view to the next", ge=0)
-    alarm: float = setting(0.1, "relative change that is an alarm", ge=0)
+    warn: float = setting(0.01, "relative change of the intensity from one projection to the next", ge=0)
+    alarm: float = setting(0.1, "relative change above which there is an alarm", ge=0)
 
     start = FrameScatter
 
@@ -51,8 +52,8 @@ class GainCheck(Logged):
             return CheckResult(after)
         level, limit = (Level.ALARM, self.alarm) if abs(score) > self.alarm else (Level.WARN, limit)
         advice = (
-            f"{score:+.1%} of light from one view to the next, equally everywhere: a top-up, a filter or slit that "
-            "moved, or the camera's gain. Take new flats."
+            f"Take new flats: the intensity changed by {score:+.1%} between two projections, uniformly over the frame. "
+            "Likely causes are a top-up, a filter or slit that moved, or a change of the camera gain."
         )
         return CheckResult(after, Flag(self.name, level, frame.index, score, limit, advice))
 
@@ -68,8 +69,8 @@ def _everywhere(change: SampleChange, view: CellView | None) -> float:
     return change.gain if alike else 0.0
 
 
-VIEWS = 20  # views after which their number is reported
-FEW = 10  # zingers a view that are never too many
+VIEWS = 20  # projections after which the number of zingers is reported
+FEW = 10  # zingers in a projection that are never too many
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,10 @@ class ZingersCheck(Logged):
 
     name: ClassVar[str] = "zingers"
     bit: ClassVar[int] = 32
-    unit: ClassVar[str] = "zingers over pixels"
-    meaning: ClassVar[str] = "many bright spots that are in this frame only"
+    unit: ClassVar[str] = "zingers per pixel"
+    meaning: ClassVar[str] = "many zingers: bright spots that are only in this frame"
 
-    warn: float = setting(1e-4, "zingers over pixels that a view may have", ge=0, le=1)
+    warn: float = setting(1e-4, "zingers per pixel that a projection may have", ge=0, le=1)
 
     start = ZingersState
 
@@ -106,15 +107,16 @@ class ZingersCheck(Logged):
         score = n / context.pixels
         if score > self.warn and n > FEW:
             advice = (
-                f"{n} bright spots that are in no other frame. `beamline recon` fills those of up to 3 x 3 pixels, "
-                "but so many hide what is behind them: shield the detector against scattered and direct X-rays."
+                f"Shield the detector against scattered and direct X-rays: this projection has {count(n, 'zinger')} "
+                "(bright spots that are in no other frame). `beamline recon` replaces zingers of up to 3 x 3 pixels "
+                "with their neighbours, but so many of them hide the sample behind."
             )
             return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
         if state.views != VIEWS or not state.zingers:
             return CheckResult(state)
         advice = (
-            f"The first {VIEWS} views have {state.zingers} bright spots that are in one frame only. `beamline recon` "
-            "fills those of up to 3 x 3 pixels from their neighbours."
+            f"Nothing to do: {count(state.zingers, 'zinger')} in the first {VIEWS} projections. `beamline recon` "
+            "replaces zingers of up to 3 x 3 pixels with their neighbours."
         )
         score = state.zingers / VIEWS / context.pixels
         return CheckResult(state, Flag(self.name, Level.INFO, frame.index, score, self.warn, advice))

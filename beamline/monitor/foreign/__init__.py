@@ -1,4 +1,4 @@
-"""Checks for objects beside the sample: fog, and crumbs far from the axis."""
+"""Checks for objects other than the sample: shadows and reflections, and loose particles."""
 
 CHECKS = {
     "FloaterCheck": "beamline.monitor.foreign.floater",

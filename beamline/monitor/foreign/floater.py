@@ -1,8 +1,8 @@
-"""Floater: a crumb that crosses the field in some views, on a path that no point of the turning sample takes.
+"""Check `floater`: a loose particle that crosses the field of view on a path that no point of the sample takes.
 
-Its track is found by the sum over all views that show it (`track`), and held against the sample: a point of it moves on
-a sinusoid about the axis, no farther from it than the sample reaches. A crumb absorbs the same in every view; edges and
-textures of the sample, which may lie on a line by chance, do not.
+Its track is found by the sum over all projections that show it (`track`), and compared with the sample: a point of the
+sample moves on a sine curve about the axis, within the radius of the sample. A particle absorbs the same in every
+projection. Edges and textures of the sample, which may lie on a line by chance, do not.
 """
 
 from __future__ import annotations
@@ -41,12 +41,13 @@ HIGHEST = 8  # cells above and below the track in which its rows are sought
 
 @dataclass(frozen=True, eq=False)
 class SeenCrumb:
-    """A crumb that was detected, with its track.
+    """A particle that was detected, with its track.
 
     Attributes:
-        first, last: rows in the file of the views that show it, so far.
-        time, col, speed: where it was last, in views and cells, and its speed in cells a view.
-        top, below: cells, first row and row after the last.
+        first, last: rows in the file of the projections that show it so far.
+        time, col, speed: time (in projections) and column (in cells) at which it was seen last, and its speed in
+            cells per projection.
+        top, below: its first row and the row after its last, in cells.
     """
 
     first: int
@@ -73,14 +74,16 @@ class FloaterState:
 
 @dataclass(frozen=True)
 class FloaterCheck(Logged):
-    """Score: the sum along the track in standard deviations."""
+    """Score: sum of the absorption along the track, in standard deviations."""
 
     name: ClassVar[str] = "floater"
     bit: ClassVar[int] = 10
     unit: ClassVar[str] = "standard deviations"
-    meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
+    meaning: ClassVar[str] = (
+        "a loose particle crosses the field of view, on a path that no point of the rotating sample takes"
+    )
 
-    warn: float = setting(7.0, "standard deviations of the sum of a crumb's views", ge=0)
+    warn: float = setting(7.0, "standard deviations of the sum along the path of a particle", ge=0)
 
     start = FloaterState
 
@@ -125,18 +128,19 @@ class FloaterCheck(Logged):
         where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
         cell = grid.cell
         advice = (
-            f"A crumb crosses the field: rows {top * cell} ... {below * cell - 1}, frames {after.crumbs[-1].first} ... "
-            f"{crumb.last} so far, {abs(track.speed) * cell:.1f} px a view to the "
-            f"{'right' if track.speed > 0 else 'left'}. No point of the turning sample moves so: it falls, floats, or "
-            "sits on the holder. Find it and blow it off; scan again if its streaks disturb, recon gives its rays "
-            "less weight."
+            f"Find the particle and blow it off: it crosses the field of view in rows {top * cell} ... "
+            f"{below * cell - 1}, frames {after.crumbs[-1].first} ... {crumb.last} so far, and moves "
+            f"{abs(track.speed) * cell:.1f} px per projection to the {'right' if track.speed > 0 else 'left'}. No "
+            "point of the rotating sample moves like this, so it is falling, floating or sitting on the holder. "
+            "`beamline recon` gives its rays less weight; repeat the scan if streaks remain."
         )
         flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
         return CheckResult(after, flag)
 
 
 def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:
-    """The state at the next view; tracks begin anew where it is no neighbour of the last one, or at uneven steps."""
+    """The state for the next projection. Tracks start again if it is not a neighbour of the last one, or at uneven
+    steps."""
     steps = 1.0
     if state.time > 0 and state.step != 0:
         steps = (angle - state.angle) / math.copysign(state.step, state.angle - state.start)
@@ -165,7 +169,7 @@ def _is_crumb(track: Track) -> bool:
 
 
 def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
-    """Whether it goes on where the known one was going."""
+    """Whether a track continues the known one."""
     apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
     rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
     return rows and apart <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))

@@ -1,8 +1,8 @@
-"""Ghost: a broad hump of too much or too little light that crosses the field from side to side.
+"""Check `ghost`: a broad shadow or reflection that crosses the field of view from side to side.
 
-As for a floater the filters suppress everything that turns with the stage (`fan`). But they use the
-mean of all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are below the
-noise. In the mean of thousands of pixels they are a hundred times its noise.
+As in the check `floater`, filters suppress everything that rotates with the stage (`fan`). Here they use the mean of
+all rows in broad columns, because a ghost is as broad as a part of the field of view. In a single cell, 2 % of
+intensity are below the noise; in the mean of thousands of pixels they are a hundred times the noise.
 """
 
 from __future__ import annotations
@@ -132,19 +132,18 @@ class GhostState:
 
 @dataclass(frozen=True)
 class GhostCheck(Logged):
-    """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
-    ghost that leaves a place looks like a shadow that comes.
-    """
+    """Score: absolute relative change of the intensity in the middle of the ghost. It has no sign, because in the few
+    projections of a window a ghost that leaves a place looks like a shadow that arrives."""
 
     name: ClassVar[str] = "ghost"
     bit: ClassVar[int] = 11
-    unit: ClassVar[str] = "relative change of the light"
+    unit: ClassVar[str] = "relative change of the intensity"
     meaning: ClassVar[str] = (
-        "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
+        "a broad shadow or reflection crosses the field of view and does not rotate with the sample"
     )
 
-    warn: float = setting(0.01, "relative change of the light in the middle of the ghost", ge=0)
-    alarm: float = setting(0.8, "relative change that is an alarm", ge=0)
+    warn: float = setting(0.01, "relative change of the intensity in the middle of the ghost", ge=0)
+    alarm: float = setting(0.8, "relative change above which there is an alarm", ge=0)
 
     start = GhostState
 
@@ -202,16 +201,17 @@ class GhostCheck(Logged):
         broad = cols / COLUMNS
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
         advice = (
-            f"A ghost crosses the field, a broad hump: it changes the light by {light:.1%}, "
-            f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
-            "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
-            + again_by(self.name)
+            "Look for something between source and detector that reflects or shadows the beam and moves with the "
+            f"stage: a broad shadow or reflection crosses the field of view. It changes the intensity by {light:.1%} "
+            f"and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster than any part of "
+            "the "
+            "sample. " + again_by(self.name)
         )
         return CheckResult(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
 
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
-    """Mean line integral of the cells that are lit [part of the rows, broad column]."""
+    """Mean line integral [part of the rows, broad column] of the cells with beam."""
     lit = (weight > 0).astype(np.float32)
     sums, lit = (sums_of_places(each, min(PARTS, depth.shape[0]), COLUMNS) for each in (depth, lit))
     return np.asarray(sums / np.maximum(lit, 1), np.float32)
@@ -225,7 +225,7 @@ def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
 
 
 def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
-    """The filters for a sample whose rim moves `rim` broad columns a view."""
+    """The filters for a sample whose rim moves `rim` broad columns per projection."""
     views, cols = window(LAGS)
     signals, speeds = [], []
     for width in WIDTHS:

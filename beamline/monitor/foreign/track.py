@@ -1,4 +1,4 @@
-"""Track: the path of a small absorber through the field, found by the sum over all views that show it.
+"""Track: the path of a small absorber through the field of view, found by the sum over all projections that show it.
 
 Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
 along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number

@@ -1,1 +1,1 @@
-"""Steps: corrections of views, one a file; `registry` has a line for each."""
+"""Corrections of projections, one per file; `registry` has a line for each."""

@@ -1,4 +1,6 @@
-"""Air: a view's air is scaled by its edge columns; its background is fitted on all rays that miss the sample."""
+"""Air: the intensity of each projection is scaled with its edge columns, and a background is fitted to all rays that
+miss the sample.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,13 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
     from recon.prep.background import AirSums, Background
 
-_VOXELS, _VIEWS = 2**20, 180  # at most, of the volume that tells where the sample is
-_RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
+_VOXELS, _VIEWS = 2**20, 180  # upper limits for the volume that shows where the sample is
+# voxels around the sample that are left out, for each round. An uneven beam piles up there until the second round,
+# before which most of the background was subtracted
+_RIMS = 6.0, 1.5
 _COPIES = 6  # float32 copies of the volume
-_TERMS, _SUMS = 40, 800  # float64 numbers a binned pixel, and a view
-_AT_ONCE, _NOISE_VIEWS = 64, 16  # views
+_TERMS, _SUMS = 40, 800  # float64 numbers per binned pixel, and per projection
+_AT_ONCE, _NOISE_VIEWS = 64, 16  # projections
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 Columns = Literal["none", "auto"] | tuple[int, int]
@@ -42,15 +46,15 @@ _MODELS: dict[str, tuple[Columns, Surface]] = {
 
 
 def _parts(text: str) -> tuple[Columns, Surface]:
-    """Which columns at the detector's edges show air, and the surface that is taken off."""
+    """Which columns at the detector's edges show air, and the background surface that is subtracted."""
     if match := re.fullmatch(r"(\d+),(\d+)", text):
         return (int(match[1]), int(match[2])), "none"
     if match := re.fullmatch(r"surface:([0-3])", text):
         return "auto", int(match[1])
     if text not in _MODELS:
         raise ValueError(
-            f"{text!r} is not known; expected auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12) or "
-            "surface:ORDER (0 to 3)"
+            f"{text!r} is unknown; expected auto, none, columns, LEFT,RIGHT (numbers of columns, "
+            "e.g. 12,12) or surface:ORDER (0 to 3)"
         )
     return _MODELS[text]
 
@@ -62,10 +66,10 @@ def _model(text: str) -> str:
 
 @dataclass(frozen=True)
 class Air:
-    """Subtracts a background from each view, so that the line integral of air is zero.
+    """Subtracts a background from each projection, so that the line integral of air is zero.
 
     Attributes:
-        model: as the option says it.
+        model: the value of the option.
     """
 
     name: ClassVar[str] = "background"
@@ -74,9 +78,10 @@ class Air:
     model: str = option(
         "--air",
         "auto",
-        "Set the air of each view to zero. columns: subtract the line through the air at both edges. LEFT,RIGHT: the "
-        "same, with this many columns of air at each edge. surface:0 to surface:3: also subtract a polynomial of this "
-        "order, fitted to all rays that miss the sample. auto: the surface, if the views confirm it.",
+        "Set the air of each projection to zero. columns: subtract the line through the air at both "
+        "edges. LEFT,RIGHT: the same, with this many columns of air at each edge. surface:0 to "
+        "surface:3: also subtract a polynomial of this order, fitted to all rays that miss the sample. "
+        "none: subtract nothing. auto: columns, and the surface if the projections confirm it.",
         parse=_model,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )
@@ -88,7 +93,9 @@ class Air:
 
     @property
     def sample_from(self) -> float:
-        """Line integral above which the edges count as sample, as for the monitor; requested columns count as air."""
+        """Line integral above which the edges count as sample, as in the monitor. Columns that the user states
+        always count as air.
+        """
         from recon.voxels.field_edges import LEAST
 
         return LEAST if self.model == "auto" else math.inf
@@ -113,13 +120,13 @@ class Air:
             levelled,
         )  # fmt: skip
         line = any(views.projections.air_columns)
-        nothing = "no surface taken off, a line through the air at the edges" if line else "none taken off"
+        nothing = "no surface subtracted, only a line through the air at the edges" if line else "nothing subtracted"
         parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or nothing}
         return StepDone(sentence, parameters if terms is None else {**parameters, "background_terms": terms})
 
 
 def background_memory(geometry: Geometry) -> int:
-    """Approximate peak memory of `without_background` in bytes, without the views themselves."""
+    """Approximate peak memory of `without_background` in bytes, without the projections themselves."""
     from recon.voxels.fbp import fbp_memory
 
     small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
@@ -131,7 +138,7 @@ def background_memory(geometry: Geometry) -> int:
 
 
 class _Views:
-    """Line integrals [view, row, col] with their geometry, which are taken binned and finite, so many at a time."""
+    """Line integrals [view, row, col] with their geometry, binned and finite, read N at a time."""
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
@@ -146,7 +153,7 @@ class _Views:
         return np.concatenate([bin_views(masked(self.data[k : k + 1])[0], self.factor) for k in numbers])
 
     def sums(self, sample: Mask, grid: Grid, numbers: NDArray[np.int64]) -> AirSums:
-        """Sums over the rays of some views that miss the sample, which is a mask on a grid."""
+        """Sums over the rays of some projections that miss the sample; the sample is a mask on a grid."""
         from recon.prep.background import AirSums
         from recon.voxels.projector import Projector
 
@@ -166,15 +173,15 @@ def without_background(
     unknown: Mask | None = None,
     levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
-    """Subtract the background of the beam from views [view, row, col], in place.
+    """Subtract the background of the beam from projections [view, row, col], in place.
 
-    Returns what was done, in words (empty: nothing), and the terms of the mean surface that was taken off.
+    Returns what was done, in words (empty: nothing), and the coefficients of the mean surface that was subtracted.
 
     Args:
-        surface: "auto": where the views confirm it; a number: polynomials of this order.
-        others: further views, which lose their background, too.
+        surface: "auto": subtract it if the projections confirm it; a number: polynomials of this order.
+        others: further projections, from which the same background is subtracted.
         unknown: bool [row, col], pixels that were not measured.
-        levelled: line integral of the air at the edges that was taken off already, the mean of the views.
+        levelled: line integral of the air at the edges that was already subtracted, the mean of the projections.
 
     Raises:
         DataError: polynomials were asked for, and too few rays miss the sample.
@@ -193,16 +200,18 @@ def without_background(
         if order is None:
             return "", None
         raise DataError(
-            "--air surface: too few rays miss the sample, so that no surface can be fitted. Give --air columns or none."
+            "--air surface: no surface can be fitted, because too few rays miss the sample. Give --air columns or none."
         )
     if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
         return "", None
     seen = _described(fitted, levelled)
-    # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
+    # With the line subtracted, the projections are brighter than their flats inside the sample's outline: then it is
+    # the beam that changed.
     if order is None and fitted.level > 0 and fitted.level + levelled > 0:
         return (
-            f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: the "
-            f"surface is not taken off. If that is air, give --air surface:{fitted.order}."
+            "The background of the beam was not subtracted, because it is positive and may be weakly "
+            f"absorbing material all around the sample: {seen}. If it is air, give --air "
+            f"surface:{fitted.order}."
         ), None
     if others is not None:
         more = _Views(others.data, others.geometry, unknown)
@@ -211,33 +220,36 @@ def without_background(
             unseen.remove(more.data)
     fitted.remove(data)
     sentence = (
-        f"Background of the beam: {seen}; taken off. Air was {fitted.before:.2g} off nothing and is {fitted.after:.2g}."
+        f"Background of the beam subtracted: {seen}. The line integral of air was up to "
+        f"{fitted.before:.2g} away from zero and is now {fitted.after:.2g}."
     )
     return sentence, fitted.coefficients.mean(axis=0)
 
 
 def _described(fitted: Background, levelled: float) -> str:
-    """The surface in words, and the line that was taken off before it."""
+    """The surface in words, and the line that was subtracted before it."""
     from recon.prep.background import LEAST_SIZE
 
     before = ""
     if abs(levelled) >= LEAST_SIZE:
-        before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
+        before = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
     return (
-        f"{before}the air of the views is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} of line "
-        f"integral, by the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
+        f"{before}the air is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line "
+        f"integral, fitted to the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
     )
 
 
 def _see_all_sides(geometry: Geometry) -> bool:
-    """Views enough, and no wide gap between them: else a first volume does not show where the sample is."""
+    """True if there are enough projections without a wide gap in angle; otherwise a first volume does not show where
+    the sample is.
+    """
     angles = np.sort(np.mod(geometry.angles, geometry.period))
     gaps = np.diff(angles, append=angles[0] + geometry.period)
     return geometry.n_views >= _LEAST_VIEWS and bool(gaps.max() < _WIDEST_GAP)
 
 
 def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
-    """The background of all views, by where a first volume of some of them has matter; and that."""
+    """The background of all projections, and the first volume of some of them that shows where the sample is."""
     from recon.prep.background import matter
     from recon.splatting.initialise import first_volume
 
@@ -253,7 +265,7 @@ def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[
         if fitted is not None:
             fitted.remove(levelled, factor=views.factor)
         inside = away <= geometry.reach - rim * grid.voxel_size
-        if not inside.any():  # a detector of a few columns
+        if not inside.any():  # a detector of a few columns has no voxel inside
             return None, (np.zeros(grid.shape, np.bool_), grid)
         sample = matter(first_volume(levelled, some, grid).data, inside)
         fitted = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)

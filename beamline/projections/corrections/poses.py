@@ -1,4 +1,6 @@
-"""Poses of views from a file: displacement, roll and tilt, or vectors, become geometry. No view is resampled."""
+"""Poses of projections from a file: displacement, roll and tilt, or vectors, become geometry. Projections are not
+resampled.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 _SAME_SIZE = 0.01  # of a pixel
-_OFF = 0.25  # of the step between two views: an angle that differs by more belongs to another view
+_OFF = 0.25  # of the step between two projections: an angle that differs by more belongs to another projection
 
 
 def _table(text: str) -> PoseTable:
@@ -37,10 +39,10 @@ def _table(text: str) -> PoseTable:
 
 @dataclass(frozen=True)
 class PosesOfFile:
-    """Displacement, roll and tilt of the views, as stated by a file.
+    """Displacement, roll and tilt of the projections, as stated by a file.
 
     Attributes:
-        table: the file's; None: views are displaced as the scan file says (.txrm), or not at all.
+        table: the file's; None: projections are displaced as the scan file states (.txrm), or not at all.
     """
 
     name: ClassVar[str] = "poses"
@@ -48,10 +50,11 @@ class PosesOfFile:
     table: PoseTable | None = option(
         "--poses",
         None,
-        "Displacement, roll and tilt of each view; no view is resampled. FILE is a CSV with the columns view or "
-        "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an NXtomo file "
-        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. Or vectors of each view in mm, as "
-        "ASTRA has them: a CSV with ray_x (of a cone: src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. "
+        "Displacement, roll and tilt of each projection; no projection is resampled. FILE is one of "
+        "these. (1) A CSV with the columns view or angle_deg, and shift_col_px, shift_row_px, roll_deg, "
+        "tilt_deg. (2) A volume that has poses. (3) An NXtomo file as FILE:x,-y: columns grow with "
+        "x_translation, rows against y_translation. (4) Vectors of each projection in mm, as ASTRA has "
+        "them: a CSV with ray_x (of a cone: src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. "
         "ignore: do not use the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
@@ -59,7 +62,7 @@ class PosesOfFile:
 
     @property
     def needs_finished(self) -> str:
-        return "" if self.table is None else "--poses is for a finished scan: it needs all views."
+        return "" if self.table is None else "--poses needs a finished scan, because it uses all projections."
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
@@ -95,14 +98,16 @@ class ScanPoses:
 
     Attributes:
         table: the poses as the file states them.
-        shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN where the file states none.
+        shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN if the file states none.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
         sentence: in a line, what was read.
-        pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
+        pivot: row of the detector about which projections are rolled and tilted, binned and counted from the first
+            one used.
         binning: of the detector's pixels.
-        vectors: the geometry that the file states of its views, in the rows and with the binning used; None: no such.
-        view_of: int64 [frame], which of these views a frame is; -1: none.
+        vectors: the geometry that the file states for its projections, in the rows and with the binning used; None:
+            the file has no vectors.
+        view_of: int64 [frame], index of the frame in `vectors`; -1: none.
     """
 
     table: PoseTable
@@ -128,7 +133,7 @@ class ScanPoses:
         return StepDone(self.sentence)
 
     def stated(self, view_ids: I64) -> NDArray[np.bool_]:
-        """[view] whether the file states the pose of the view."""
+        """[view] True if the file states the pose of the projection."""
         return np.isfinite(self.roll[view_ids])
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
@@ -148,8 +153,8 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
     """The poses of `frames` from the selection's file, or else from the scan file; None if neither states any.
 
     Raises:
-        ConfigError: options that do not go together.
-        DataError: the file does not fit the scan: the message says how.
+        ConfigError: options that exclude each other.
+        DataError: the file does not fit the scan; the message says why.
     """
     table = stated_poses(source, selection)
     if table is None:
@@ -157,20 +162,23 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
     tilt = selection.step(TiltAndLens)
     if tilt.sought or tilt.tilt_deg:
         raise ConfigError(
-            f"--tilt and --poses both set the roll of the views. Add the tilt to the column roll_deg of {table.path}."
+            "--tilt and --poses both set the roll of the projections. Omit --tilt, and add it to the "
+            f"column roll_deg of {table.path}."
         )
     for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"{learns} learns what {table.path} states: give one of {learns} and --poses, or --poses ignore."
+            f"{learns} calibrates what {table.path} states. Give either {learns} or --poses, or add --poses ignore."
         )
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
     height, width = source.shape
-    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():  # offset views are a few fields aside
+    # offset projections are displaced by a few fields of view
+    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
         row = int(np.flatnonzero(far)[0])
         raise DataError(
             f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "
-            f"{shifts[row, 1]:g} rows on a detector of {width} x {height}; expected pixels of the unbinned detector."
+            f"{shifts[row, 1]:g} rows, but the detector has {width} x {height} pixels. Expected "
+            "displacements in pixels of the unbinned detector."
         )
     n = len(source.table)
     every = np.full((n, 4), np.nan)
@@ -183,12 +191,12 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
 
 
 def _of_vectors(table: PoseTable, source: ScanSource, selection: ScanSelection) -> Geometry:
-    """The views of a table of vectors, in the rows and with the binning of the selection."""
+    """The projections of a table of vectors, in the rows and with the binning of the selection."""
     from recon.base.vectors import geometry_of_vectors
 
     assert table.vectors is not None
     if selection.axis_col is not None:
-        raise ConfigError(f"--axis: the vectors of {table.path} already determine the axis. Leave --axis out.")
+        raise ConfigError(f"Omit --axis: the vectors of {table.path} already determine the axis.")
     try:
         views = geometry_of_vectors(table.vectors, source.shape, cone=table.cone)
     except ValueError as error:
@@ -196,13 +204,13 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: ScanSelection) 
     if table.cone != (selection.cone is not None):
         need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
         beam = "a cone" if table.cone else "a parallel beam"
-        raise ConfigError(f"{table.path} has vectors of {beam}, and {source.path} is not said to be one: {need}.")
+        raise ConfigError(f"{table.path} has vectors of {beam}, but {source.path} has another beam: {need}.")
     size = selection.pixel_size_mm
     if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
-        stated = "does not say its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
+        stated = "does not state its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
         raise ConfigError(
-            f"{table.path} has vectors of pixels of {1e3 * views.pixel_pitch:.6g} um, {source.path} {stated}; expected "
-            "the same in mm. Give --pixel-size-um, or vectors in mm."
+            f"{table.path} has vectors for pixels of {1e3 * views.pixel_pitch:.6g} um, but {source.path} "
+            f"{stated}; expected the same size. Give --pixel-size-um, or vectors in mm."
         )
     rows = selection.detector_rows
     return views.rows(rows.start, rows.stop).binned(selection.binning)
@@ -214,12 +222,15 @@ def _pixels(table: PoseTable, source: ScanSource, selection: ScanSelection) -> f
         return 1.0
     if selection.cone is not None:
         raise DataError(
-            f"{table.path}: translations of the sample in mm are no shifts of a cone's views, whose matter is "
-            "magnified by its depth. Give a CSV of shifts in pixels. Nothing was read."
+            f"Give a CSV of shifts in pixels instead of {table.path}: in a cone beam, translations of the "
+            "sample in mm are not shifts of the projections, because the magnification differs along the "
+            "beam. Nothing was read."
         )
     size = selection.pixel_size_mm
     if size is None:
-        raise DataError(f"{table.path} is in mm, and {source.path} does not say its pixel size: give --pixel-size-um.")
+        raise DataError(
+            f"Give --pixel-size-um: {table.path} is in mm, but {source.path} does not state its pixel size."
+        )
     return 1 / size
 
 
@@ -227,7 +238,9 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     """[frame of the scan] its row in the table; -1: none. Angles that both state must agree."""
     n, views = len(source.table), source.table.views
     if table.frames is not None and table.frames != n:
-        raise DataError(f"{table.path} has {table.frames} frames, {source.path} has {n}; expected the same scan.")
+        raise DataError(
+            f"{table.path} has {table.frames} frames, but {source.path} has {n}; expected a file of the same scan."
+        )
     row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.table.angles)
     distances = np.diff(np.unique(np.round(degrees[frames], 9)))
     tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
@@ -244,8 +257,8 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
         into = views if table.by == "view" else np.arange(n)
         if (beyond := table.keys >= into.size).any():
             raise DataError(
-                f"{table.path} states {table.by} {table.keys[beyond][0]:g}; {source.path} has {into.size} {table.by}s, "
-                "counted from 0."
+                f"{table.path} states {table.by} {table.keys[beyond][0]:g}, but {source.path} has "
+                f"{into.size} {table.by}s, counted from 0."
             )
         row_of_frame[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
         if table.angles_deg is not None:
@@ -255,26 +268,27 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
                 at = int(both[off > tolerance][0])
                 stated = table.angles_deg[row_of_frame[at]]
                 raise DataError(
-                    f"{table.path} states frame {at} at {stated:.6g} degrees, {source.path} at "
+                    f"{table.path} states frame {at} at {stated:.6g} degrees, but {source.path} at "
                     f"{degrees[at]:.6g}; expected the poses of the same scan."
                 )
     return row_of_frame
 
 
 def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
-    """Raise DataError if views lack a pose."""
+    """Raise DataError if projections have no pose."""
     unknown, table = view_ids[~poses.stated(view_ids)], poses.table
     if unknown.size:
         degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
-            f"{table.path} states no pose of {unknown.size} of the {view_ids.size} views chosen of {source.path} "
-            f"(the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add them, or choose the others with --views."
+            f"{table.path} has no pose for {unknown.size} of the {view_ids.size} projections chosen from "
+            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add them, or "
+            "choose only the others with --views."
         )
 
 
 def _sentence(table: PoseTable, shifts: F64) -> str:
     if table.vectors is not None:
-        return f"Vectors of {count(table.keys.size, 'view')} from {table.path} state the geometry."
+        return f"The geometry comes from {table.path}: vectors of {count(table.keys.size, 'projection')}."
     across, down = np.ptp(shifts, axis=0)
     roll, tilt = np.abs(table.turns_deg).max(axis=0)
     return (

@@ -1,4 +1,4 @@
-"""Preparation: how flags, darks, flats and counts of a scan are used until line integrals are made of its views."""
+"""Preparation: how flags, darks, flats and counts of a scan are used until its frames are line integrals."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ class Preparation:
     """How frames are converted to line integrals. `checked_views` and `OpenBeam` follow these settings.
 
     Attributes:
-        flags: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
-            the frames now, and its flags count in place of the file's. "ignore": all views are alike.
-        references: "accept": darks and flats are used as they are, also saturated, dark, uneven or lit ones.
-        noise: "log": logarithms of counts; "counts": line integrals and weights carry the likelihood of the counts;
-            "auto": that where the open beam has few photons a pixel.
-        gain: counts a photon, of single pixels; None finds it by the flats.
-        flat_fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components
-            of their changes that the view shows, see `recon.prep.dynamic_flats`.
-        ring_current: "use": views and flats are divided by the ring current that the file has for each frame.
-        floor, hot_threshold, zinger_threshold: which pixels are taken from their neighbours, see
+        flags: "use": projections with an alarm are left out, those with a warning get less weight. "judge": the
+            monitor checks the frames now, and its flags replace those of the file. "ignore": all projections have
+            equal weight.
+        references: "accept": darks and flats are used as they are, also saturated, dark, uneven ones, and darks
+            exposed to the beam.
+        noise: "log": logarithms of counts; "counts": line integrals and weights that represent the likelihood of the
+            counts; "auto": "counts" if the open beam has few photons per pixel.
+        gain: counts per photon, of single pixels; None: found from the flats.
+        flat_fields: "groups": a projection's flat is interpolated between groups of flats; "dynamic": principal
+            components of the flats are added as the projection shows them, see `recon.prep.dynamic_flats`.
+        ring_current: "use": projections and flats are divided by the ring current that the file has for each frame.
+        floor, hot_threshold, zinger_threshold: which pixels are replaced with values of their neighbours, see
             `recon.prep.counts_plan.CorrectionSettings`.
     """
 
@@ -35,16 +37,16 @@ class Preparation:
     flags: str = option(
         "--flags",
         "use",
-        "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, and "
-        "correct views after a jump of the sample. judge: run the monitor on the frames first and use its flags. "
-        "ignore: weigh all views equally.",
+        "use: leave out projections with an alarm of the monitor, halve the weight of projections or "
+        "regions with a warning, and correct projections after a jump of the sample. judge: run the "
+        "monitor on the frames first and use its flags. ignore: weigh all projections equally.",
         choices=("use", "judge", "ignore"),
     )
     references: str = option(
         "--references",
         "check",
-        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven or lit); refuse the scan if "
-        "no group remains. accept: use all as they are.",
+        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven, or darks "
+        "exposed to the beam); stop with an error if no group remains. accept: use all as they are.",
         choices=("check", "accept"),
     )
     noise: Noise = option(
@@ -65,14 +67,16 @@ class Preparation:
     flat_fields: FlatFields = option(
         "--flat-fields",
         "groups",
-        "groups: interpolate the flat of each view between the means of the groups of flats. dynamic: for a beam that "
-        "moves, also add those variations of the flats that the view shows (needs 4 flats or more).",
+        "groups: interpolate the flat of each projection between the means of the groups of flats. "
+        "dynamic: for a beam that moves, also add those variations of the flats that the projection "
+        "shows (needs 4 flats or more).",
         choices=get_args(FlatFields),
     )
     ring_current: str = option(
         "--ring-current",
         "ignore",
-        "use: divide views and flats by the ring current of each frame in the file (control/data of NXtomo).",
+        "use: divide projections and flats by the ring current of each frame in the file (control/data "
+        "of NXtomo). ignore: do not.",
         choices=("ignore", "use"),
     )
     floor: float = 1e-4
@@ -81,26 +85,26 @@ class Preparation:
 
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":
-            raise ValueError("--gain is for --noise counts; it has no effect with --noise log. Leave one of them out.")
+            raise ValueError("Omit --gain or --noise log: --gain has an effect only with --noise counts.")
 
     @property
     def uses_flags(self) -> bool:
-        """Whether flags, those of the file or new ones, decide about views."""
+        """True if flags, those of the file or new ones, decide how projections are used."""
         return self.flags != "ignore"
 
     @property
     def judged(self) -> bool:
-        """Whether the monitor checks the frames first."""
+        """True if the monitor checks the frames first."""
         return self.flags == "judge"
 
     @property
     def accepted(self) -> bool:
-        """Whether all groups of references are used, even faulty ones."""
+        """True if all groups of references are used, even faulty ones."""
         return self.references == "accept"
 
     @property
     def by_current(self) -> bool:
-        """Whether views and flats are divided by the ring current."""
+        """True if projections and flats are divided by the ring current."""
         return self.ring_current == "use"
 
     @property
@@ -110,7 +114,7 @@ class Preparation:
 
     @property
     def needs_finished(self) -> str:
-        sentence = "--flags judge is for a finished scan; a running one is judged while it is taken."
+        sentence = "--flags judge needs a finished scan; the monitor checks a running scan anyway."
         return sentence if self.judged else ""
 
     def memory(self, part: ScanPart) -> StepMemory:

@@ -1,4 +1,4 @@
-"""References: which darks and flats are used, and the open beam of each view that they give."""
+"""Flats and darks: which of them are used, and the open beam of each projection that they give."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from recon.prep.dynamic_flats import find_dynamic_flats
 from recon.prep.references import References, dark_at, dead_pixels
 from recon.prep.spots import without_spots
 
-_STEADY = 0.01  # of the ring current: top-up keeps it so
+_STEADY = 0.01  # relative change of the ring current; top-up keeps it this constant
 
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """Which pixels of darks and flats are read, binned, and the spots found in them.
+    """Which pixels of darks and flats are read, binned, and the zingers found in them.
 
     Attributes:
         light: counts of the open beam.
-        spots: pixels of bright spots, by frame.
+        spots: pixels of zingers, by frame.
     """
 
     scan: ScanEvidence
@@ -49,7 +49,7 @@ class _Reading:
         return cls(scan, rows, binning, not selection.step(Preparation).uses_flags, light)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
-        """The frames [row, col] that may be used, one by one, without bright spots."""
+        """The frames [row, col] that may be used, one by one, without zingers."""
         used = list[int]()
 
         def good() -> Iterator[NDArray[Any]]:
@@ -65,7 +65,9 @@ class _Reading:
             yield used[at], image
 
     def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
-        """Mean of the frames that may be used, each times its weight [frame of the scan]; None where none may."""
+        """Mean of the frames that may be used, each multiplied by its weight [frame of the scan]; None if no frame
+        may be used.
+        """
         total: NDArray[np.float64] | float = 0.0
         n = 0
         for frame, image in self.images(frames):
@@ -74,7 +76,7 @@ class _Reading:
         return np.asarray(total / n) if n else None
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
-        """(exposure in s, mean dark) of each exposure; (NaN, mean of all) where exposures are equal or unknown."""
+        """(exposure in s, mean dark) of each exposure; (NaN, mean of all) if exposures are equal or unknown."""
         means = [(seconds, self.mean(some)) for seconds, some in self.scan.by_exposure(frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
@@ -82,12 +84,13 @@ class _Reading:
 def read_references(
     scan: ScanEvidence, rows: slice, selection: ScanSelection, warn: Warn = lambda sentence: None
 ) -> References:
-    """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
+    """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are
+    required.
 
-    Frames that are damaged (see ScanSource) are left out, unless the selection uses all, and bright spots of single
-    frames are filled, with a note. The light of flats with an exposure of their own is scaled to the projections':
-    dark + (flat - its dark) * t / t_flat, where both are known. Of darks of several exposures each kind of frame has
-    its own, see `recon.prep.references.dark_at`.
+    Damaged frames (see ScanSource) are left out, unless the selection uses all. Zingers in single frames are
+    replaced, with a note. Flats with an exposure of their own are scaled to that of the projections: dark + (flat -
+    its dark) * t / t_flat, if both are known. If darks have several exposures, each kind of frame has its own dark,
+    see `recon.prep.references.dark_at`.
 
     Raises:
         DataError: all frames of a kind are damaged.
@@ -106,18 +109,19 @@ def read_references(
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
-            f"{scan.source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are "
-            "not what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
+            f"{scan.source.path}: all {'darks' if dark is None else 'flats'} are damaged: each frame is "
+            "unreadable or differs from its stored checksum. Use an intact copy of the file. --flags "
+            "ignore uses the frames whose checksum differs."
         )
     if reading.spots:
         n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
-        spots = f"Bright spots of single darks and flats (zingers: {count(n, 'pixel')} in frames {frames})"
-        warn(Note(f"{spots} were filled from the frames beside them."))
+        spots = f"Zingers in darks and flats ({count(n, 'pixel')} in frames {frames})"
+        warn(Note(f"{spots} were replaced with the values of neighbouring frames."))
     return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(scan.table.part_starts.tolist()))
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
-    """The dark of an exposure; the mean of all where it is unknown. None without darks."""
+    """The dark of an exposure; the mean of all if the exposure is unknown. None without darks."""
 
     if len(darks) < 2:
         return darks[0][1] if darks else None
@@ -146,13 +150,13 @@ def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, 
     try:
         dynamic = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
     except ValueError as error:
-        raise ConfigError(f"--flat-fields dynamic: {scan.source.path}: {error}. Leave it out.") from error
+        raise ConfigError(f"Omit --flat-fields dynamic: {scan.source.path}: {error}.") from error
     return replace(references, dynamic=dynamic)
 
 
 def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.float64]:
-    """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown. With
-    `by_current` also from its own ring current.
+    """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown.
+    With `by_current` also from its own ring current.
     """
 
     scale = _to_median(scan.exposures, scan.table.views)
@@ -160,30 +164,29 @@ def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.floa
 
 
 def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The median of the projections over each frame's own; 1 where one is unknown."""
+    """The median of the projections divided by each frame's own value; 1 if one is unknown."""
     known = values[views][np.isfinite(values[views])]
     return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
 def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
-    """Factor [frame] that scales each frame from its own ring current to the median of the projections'.
+    """Factor [frame] that scales each frame from its own ring current to the median of the projections.
 
     Raises:
-        ConfigError: the file has none for some view or flat.
+        ConfigError: the file has none for some projection or flat.
     """
     used = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
     currents = scan.table.currents
     if currents is None or not np.isfinite(currents[used]).all():
-        lacking = "no ring current" if currents is None else "no ring current for some views or flats"
-        raise ConfigError(
-            f"--ring-current use: {scan.source.path} has {lacking} (control/data of NXtomo). Leave it out."
-        )
+        lacking = "no ring current" if currents is None else "no ring current for some projections or flats"
+        raise ConfigError(f"Omit --ring-current use: {scan.source.path} has {lacking} (control/data of NXtomo).")
     return _to_median(currents, scan.table.views)
 
 
 def uncorrected_current(scan: ScanEvidence, selection: ScanSelection) -> str:
-    """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
-    change."""
+    """The warning that the ring current changed between flats and projections and is not corrected; "" if it did not
+    change.
+    """
     known = scan.table.currents
     if not scan.in_counts or selection.step(Preparation).by_current or known is None:
         return ""
@@ -191,8 +194,9 @@ def uncorrected_current(scan: ScanEvidence, selection: ScanSelection) -> str:
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
         return ""
     return (
-        f"The ring current of flats and views (control/data) varies from {currents.min():.6g} to {currents.max():.6g}, "
-        f"{currents.max() / currents.min() - 1:.0%}, and no air beside the sample corrects it: say --ring-current use."
+        "Use --ring-current use: the ring current of flats and projections (control/data) varies by "
+        f"{currents.max() / currents.min() - 1:.0%} (from {currents.min():.6g} to {currents.max():.6g}), "
+        "and there is no air next to the sample to correct this."
     )
 
 
@@ -202,30 +206,34 @@ def flats_sentence(scan: ScanEvidence, references: References, by_current: bool)
     sentences = []
     if scan.views_differ:
         views = scan.table.exposures[scan.table.views]
-        sentences.append(f"Exposures of the views: {views.min():g} to {views.max():g} s; corrected.")
+        sentences.append(
+            f"Exposure times of the projections vary from {views.min():g} to {views.max():g} s; this was corrected."
+        )
     if by_current:
         currents = 1 / current_scale(scan)[scan.table.views]
         sentences.append(
-            f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
+            f"The ring current of the projections varies from {currents.min():.3f} to "
+            f"{currents.max():.3f} times its median; this was corrected."
         )
     if references.dynamic is not None:
         n = len(references.dynamic.components)
         sentences.append(
-            f"Flats: {count(n, 'component')} of their changes, weighed for each view (dynamic)."
+            f"Dynamic flats: {count(n, 'principal component')} of the flats, with a weight for each projection."
             if n
-            else "Flats: they do not differ by more than noise; their mean is used."
+            else "Dynamic flats were not used, because the flats do not differ by more than noise; their mean is used."
         )
     return " ".join(sentences)
 
 
 def warn_of_parts_without_flats(scan: ScanEvidence, references: References, warn: Warn) -> None:
-    """A warning for each part of the scan whose views are corrected by the flats of another part."""
+    """A warning for each part of the scan whose projections are corrected with the flats of another part."""
     starts = scan.table.part_starts
     flats = [position for position, _ in references.flats]
     for start, end in zip(starts, [*starts[1:], len(scan.table)], strict=True):
         has_views = scan.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
             warn(
-                f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. The "
-                f"nearest flats of another part correct their views, though the beam may have changed."
+                f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. Their projections "
+                "are corrected with the nearest flats of another part, although the beam may have "
+                "changed."
             )

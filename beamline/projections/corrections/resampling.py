@@ -1,4 +1,6 @@
-"""Resampling: the tilt of the axis and the distortion of the lens are taken out of the views, in one step."""
+"""Resampling: corrects the in-plane tilt of the axis and the distortion of the lens in one interpolation of the
+projections.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +29,10 @@ if TYPE_CHECKING:
     from recon.prep.projections import Projections
 
 _MOST_TILT_DEG = 45.0
-_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # bands of rows, rows of each, and views that --tilt auto measures
-_NOTHING = 0.05  # px over the rows, not worth new pixels
+_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # bands of rows, rows of each, and projections that --tilt auto uses
+_NOTHING = 0.05  # px over the rows; a smaller tilt is not worth an interpolation
 _ROUNDS = 5
-_COPIES = 20  # float32 copies of all bands while their axes are found
+_COPIES = 20  # float32 copies of all bands while their axes are searched for
 
 
 def _tilt(text: str) -> float | str:
@@ -42,12 +44,12 @@ def _tilt(text: str) -> float | str:
     except ValueError:
         number = math.nan
     if not abs(number) <= _MOST_TILT_DEG:
-        raise ValueError(f"{text!r} is neither auto nor degrees within {_MOST_TILT_DEG:g} of 0")
+        raise ValueError(f"{text!r} is wrong; expected auto, or degrees within {_MOST_TILT_DEG:g} of 0")
     return number
 
 
 def _distortion(text: str) -> resample.Distortion:
-    """The distortion that a text file says."""
+    """The distortion that a text file states."""
     from recon.prep.resample import Distortion
 
     try:
@@ -60,11 +62,11 @@ def _distortion(text: str) -> resample.Distortion:
 
 @dataclass(frozen=True)
 class TiltAndLens:
-    """Settings for resampling views: tilt and lens distortion.
+    """Settings for resampling projections: tilt and lens distortion.
 
     Attributes:
-        tilt: degrees by which the axis leans in the detector's plane; its column grows by tan(tilt) a row. "auto": it
-            is found. None: it is unknown, and views are used as they are.
+        tilt: degrees of the axis in the detector's plane; the axis's column grows by tan(tilt) per row. "auto": it
+            is searched for. None: it is unknown, and projections are used as they are.
         distortion: of the lens; None: none.
     """
 
@@ -73,16 +75,17 @@ class TiltAndLens:
     tilt: float | str | None = option(
         "--tilt",
         None,
-        "Lean of the rotation axis in the detector's plane, positive if its column grows with the rows; views are "
-        "turned by it. auto: find it by all rows. Default: use views as they are, with a warning if they show a tilt.",
+        "In-plane tilt of the rotation axis in degrees, positive if its column grows with the rows; "
+        "projections are rotated by it. auto: find it from all rows. Default: use projections as they "
+        "are, with a warning if they show a tilt.",
         parse=_tilt,
         metavar="DEGREES|auto",
     )
     distortion: resample.Distortion | None = option(
         "--distortion",
         None,
-        "Correct the radial distortion of the lens by FILE, the text file that discorpy writes (backward model: "
-        "xcenter, ycenter, factor0 ...).",
+        "Correct the radial distortion of the lens with FILE, the text file that discorpy writes "
+        "(backward model: xcenter, ycenter, factor0 ...).",
         parse=_distortion,
         metavar="FILE",
         path=True,
@@ -90,17 +93,17 @@ class TiltAndLens:
 
     @property
     def sought(self) -> bool:
-        """Whether the tilt is to be found from the views."""
+        """True if the tilt is to be found from the projections."""
         return self.tilt == "auto"
 
     @property
     def tilt_deg(self) -> float:
-        """The roll of the views in degrees, as far as it is known."""
+        """The roll of the projections in degrees, as far as it is known."""
         return self.tilt if isinstance(self.tilt, float | int) else 0.0
 
     @property
     def needs_finished(self) -> str:
-        sentence = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
+        sentence = "--tilt auto needs a finished scan, because it uses all projections. Give the tilt in degrees."
         return sentence if self.sought else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
@@ -122,7 +125,7 @@ class TiltAndLens:
             resampling.apply(views.data, first)
             return replace(views, masked=resampling.nearest(views.masked, first))
 
-        turned = f"Views are turned by {self.tilt_deg:g} degrees." if self.tilt_deg else ""
+        turned = f"The projections are rotated by {self.tilt_deg:g} degrees." if self.tilt_deg else ""
         return ViewFilter(apply, resampling.reach, "--tilt and --distortion mix"), self.done(turned)
 
     def done(self, sentence: str) -> StepDone:
@@ -133,15 +136,15 @@ class TiltAndLens:
         return StepDone(sentence, parameters)
 
     def of(self, source: ScanSource, selection: ScanSelection) -> resample.Resampling | None:
-        """The resampling of the views; None if they are used as recorded.
+        """The resampling of the projections; None if they are used as recorded.
 
         Raises:
-            ConfigError: a cone's axis is to be levelled.
+            ConfigError: --tilt was given for a cone beam.
         """
         from recon.prep.resample import Resampling
 
         if (self.tilt_deg or self.sought) and selection.cone is not None:
-            raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
+            raise ConfigError(f"Omit --tilt: it is for a parallel beam, and {source.path} is a cone-beam scan.")
         if not self.tilt_deg and self.distortion is None:
             return None
         lens = self.distortion
@@ -153,16 +156,16 @@ class TiltAndLens:
 def with_tilt(
     scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> tuple[ScanSelection, dict[str, StepDone]]:
-    """The selection with the tilt found from all detector rows, if it asks for that; and what was done, by the name of
-    the step, where it does.
+    """The selection with the tilt found from all detector rows, if that was asked for; and what was done, by the
+    name of the step.
 
     Args:
-        frames: views that may be used.
+        frames: projections that may be used.
         progress: takes how many bands of rows were corrected, and how many there are at most.
 
     Raises:
         ConfigError: a cone.
-        DataError: the views do not tell it.
+        DataError: the projections do not determine the tilt.
     """
     from beamline.projections.tilt import MATTERS, tilt_text
     from recon.base.views import spread_views
@@ -170,7 +173,7 @@ def with_tilt(
 
     step = selection.step(TiltAndLens)
     source = scan.source
-    step.of(source, selection)  # refuses a cone
+    step.of(source, selection)  # raises an error for a cone beam
     if not step.sought:
         return selection, {}
     rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
@@ -178,24 +181,28 @@ def with_tilt(
         tilt, uncertainty = _refined(scan, replace(selection, rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
-            f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
+            f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or omit --tilt."
         ) from error
     if abs(tilt) > STEEPEST:
         raise DataError(
-            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, beyond the "
-            f"{math.degrees(STEEPEST):g} that are searched. Check the views; give the tilt with --tilt DEGREES."
+            f"Check the projections of {source.path}: the axis seems to be tilted by "
+            f"{math.degrees(tilt):.1f} degrees, and at most {math.degrees(STEEPEST):g} are searched. Give "
+            "the tilt with --tilt DEGREES."
         )
-    lean = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
+    lean = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
-        warn(f"{lean}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
+        warn(
+            "Check the first and the last slices for double edges, because the tilt is not known to half a "
+            f"pixel. {lean}."
+        )
     straight = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING
     step = replace(step, tilt=0.0 if straight else math.degrees(tilt))
-    done = step.done(f"{lean}: not corrected." if straight else f"{lean}; views are turned.")
+    done = step.done(f"{lean}; not corrected." if straight else f"{lean}; the projections are rotated to correct it.")
     return selection.with_steps(step), {step.name: done}
 
 
 def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
-    """Bytes that `with_tilt` takes at most, if it is to find the tilt."""
+    """Bytes that `with_tilt` needs at most, if it searches for the tilt."""
     from beamline.projections.correction import at_once_memory
     from recon.prep.tilt import STEEPEST
 
@@ -211,7 +218,8 @@ def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
 def _refined(
     scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], progress: BandsDone
 ) -> tuple[float, float]:
-    """The tilt by views that were levelled by the tilt of the last round, and its uncertainty; radians.
+    """The tilt, measured in projections that were corrected by the tilt of the last round, and its uncertainty;
+    radians.
 
     Raises:
         ValueError: see `find_tilt`.
@@ -234,7 +242,7 @@ def _refined(
 
 
 def _without_blur(selection: ScanSelection) -> ScanSelection:
-    """The selection without the corrections that blur the views."""
+    """The selection without the corrections that blur the projections."""
     sharp = tuple(step for step in selection.steps if not isinstance(step, BlurringStep))
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)
     return replace(selection, steps=sharp).with_steps(logarithms)

@@ -1,4 +1,6 @@
-"""Width: a pixel's spread on the detector, and what the stage turned during an exposure and its readout."""
+"""Ray width: the size and blur of a detector pixel, and the rotation of the stage during an exposure and its
+readout.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,12 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import Value
     from recon.base.geometry import Geometry
 
-_MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
-_LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
+_MOST_PX, _MOST_DEG = 20.0, 30.0  # with larger values a projection shows no detail
+_LEAST_PX = 1.0  # at the edge of the field of view; `auto` models a motion from this size on
 
 
 class _Motion(NamedTuple):
-    """Radians that the stage turned: during an exposure, and from one row of the detector to the next; signed."""
+    """Radians of stage rotation: during an exposure, and from one detector row to the next; signed."""
 
     arc: float
     skew: float
@@ -40,12 +42,16 @@ def _spread(text: str) -> str:
         except ValueError:
             blur = math.nan
         if not 0 < blur <= _MOST_PX:
-            raise ValueError(f"{text!r} is neither none, nor pixel, nor a blur up to {_MOST_PX:g} pixels, e.g. 0.7")
+            raise ValueError(
+                f"{text!r} is unknown; expected none, pixel, or a blur of up to {_MOST_PX:g} pixels, e.g. 0.7"
+            )
     return text
 
 
 def _arc(text: str) -> str:
-    """auto, none, or degrees of the exposure, with those from the first row to the last. ValueError for others."""
+    """auto, none, or degrees of rotation during the exposure and from the readout of the first row to that of the
+    last. ValueError for others.
+    """
     if text not in ("auto", "none"):
         try:
             numbers = [float(part) for part in text.split(":")]
@@ -53,7 +59,7 @@ def _arc(text: str) -> str:
             numbers = []
         if not (0 < len(numbers) <= 2 and all(abs(number) <= _MOST_DEG for number in numbers) and numbers[0] >= 0):
             raise ValueError(
-                f"{text!r} is neither auto, nor none, nor ARC[:READOUT] of 0 to {_MOST_DEG:g} degrees, e.g. 0.5"
+                f"{text!r} is unknown; expected auto, none, or ARC[:READOUT] of 0 to {_MOST_DEG:g} degrees, e.g. 0.5"
             )
     return text
 
@@ -63,9 +69,10 @@ class Width:
     """Widths of the rays: the arc of an exposure, and the pixel.
 
     Attributes:
-        spread: "none": rays. "pixel": a pixel's own area. A number: that, and a Gaussian blur of so many pixels.
-        arc: "auto": the motion that the file states, where it is a pixel or more. "none": the stage stood.
-            "ARC[:READOUT]": degrees during an exposure, and from the first row of the detector to its last.
+        spread: "none": thin rays. "pixel": a pixel's own area. A number: that area, and a Gaussian blur of this many
+            pixels.
+        arc: "auto": the motion that the file states, if it is a pixel or more. "none": the stage stood still.
+            "ARC[:READOUT]": degrees of rotation during an exposure, and from the first detector row to the last.
     """
 
     name: ClassVar[str] = "width"
@@ -73,16 +80,17 @@ class Width:
     spread: str = option(
         "--ray-width",
         "none",
-        "What a pixel sees. none: one ray. pixel: its own area. SIGMA: its area with a Gaussian blur of SIGMA pixels.",
+        "Width of the rays in the model. none: thin rays. pixel: the area of a pixel. SIGMA: the area of "
+        "a pixel with a Gaussian blur of SIGMA pixels.",
         parse=_spread,
         metavar="none|pixel|SIGMA",
     )
     arc: str = option(
         "--exposure-arc",
         "auto",
-        "Degrees that the stage turns: ARC during an exposure, READOUT from the readout of the first row to that of "
-        "the last (negative: the last row is read first). auto: from the file of a fly scan, if ARC is 1 px or more at "
-        "the edge of the field. none: the stage stands still.",
+        "Rotation of the stage in degrees: ARC during an exposure, READOUT from the readout of the first "
+        "row to that of the last (negative: the last row is read first). auto: from the file of a fly "
+        "scan, if ARC is 1 px or more at the edge of the field of view. none: the stage stands still.",
         parse=_arc,
         metavar="auto|none|ARC[:READOUT]",
     )
@@ -91,7 +99,7 @@ class Width:
     def needs_finished(self) -> str:
         if self.spread == "none" and self.arc in ("auto", "none"):
             return ""
-        return "--ray-width and --exposure-arc are for a finished scan"
+        return "--ray-width and --exposure-arc need a finished scan"
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
@@ -100,7 +108,8 @@ class Width:
         """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:
-            ConfigError: rows of a cone, or of views that roll or tilt or may do so, that see angles of their own.
+            ConfigError: a readout arc in a cone beam, or for projections that roll or tilt or may do so: each row
+                then has angles of its own.
         """
         from recon.base.ray_width import RayWidth
 
@@ -108,9 +117,12 @@ class Width:
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         stated, motion = self._motion(source), _Motion(0.0, 0.0)
         if (table := stated_poses(source, selection)) is not None and table.vectors is not None:
-            stated = None  # vectors are of the middle of an exposure
+            stated = None  # vectors already are those of the middle of an exposure
             if self.arc not in ("auto", "none"):
-                raise ConfigError(f"--exposure-arc {self.arc}: views by vectors, of {table.path}, have none.")
+                raise ConfigError(
+                    f"Omit --exposure-arc {self.arc}, because the projections are given by the vectors of "
+                    f"{table.path}, which do not allow for an arc."
+                )
         parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if stated is not None:
@@ -119,14 +131,14 @@ class Width:
             if self.arc != "auto":
                 motion = stated
                 if bent and stated.skew:
-                    beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
+                    beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated for roll or tilt"
                     raise ConfigError(
                         f"--exposure-arc {self.arc}: a readout arc is supported only for an untilted parallel "
                         f"beam, and this is {beam}. Give the exposure arc alone. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
-            elif stated.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
+            elif stated.arc:  # too short to be modelled, but the angles are still those of the middle of the exposure
                 geometry = replace(geometry, angles=geometry.angles + stated.arc / 2)
                 parameters["middle_of_exposure_deg"] = math.degrees(stated.arc / 2)
         if not (width or any(motion)):
@@ -137,17 +149,17 @@ class Width:
         turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
         statements = [
             *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
-            *([f"a view is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at the edge of the "
-               "field)"] if motion.arc else []),
-            *([f"the last row sees {turned[1]:.2g} degrees more than the first"] if motion.skew else []),
+            *([f"a projection is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
+                "the edge of the field of view)"] if motion.arc else []),
+            *([f"the last row is seen {turned[1]:.2g} degrees later than the first"] if motion.skew else []),
         ]  # fmt: skip
         parameters |= {
             "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
         }  # fmt: skip
-        return seen, StepDone(f"In the model of the views {', '.join(statements)}.", parameters)
+        return seen, StepDone(f"Ray width in the reconstruction: {', '.join(statements)}.", parameters)
 
     def _motion(self, source: ScanSource) -> _Motion | None:
-        """The motion asked for, or stated by the file; None: the stage stood, or the file does not say."""
+        """The motion asked for, or stated by the file; None: the stage stood still, or the file does not state it."""
         if self.arc == "none":
             return None
         if self.arc != "auto":
@@ -158,9 +170,9 @@ class Width:
 
 
 def stated_motion(source: ScanSource) -> _Motion | None:
-    """The motion stated by the file of a fly scan; None if the stage stood or the file states nothing.
+    """The motion stated by the file of a fly scan; None if the stage stood still or the file states nothing.
 
-    The speed is that of the median step from view to view, so that passes and lost views do not count.
+    The speed is that of the median step between projections, so that passes and missing projections do not matter.
     """
     import numpy as np
 
@@ -175,7 +187,7 @@ def stated_motion(source: ScanSource) -> _Motion | None:
 
 
 def _step(angles: NDArray[np.float64]) -> float:
-    """The median step from view to view in radians."""
+    """The median step between projections in radians."""
     import numpy as np
 
     steps = np.diff(angles)

@@ -1,1 +1,1 @@
-"""Readers: scans of any format behind one Protocol."""
+"""Readers: scan files of any format, behind one interface (Protocol)."""

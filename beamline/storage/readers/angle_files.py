@@ -1,4 +1,4 @@
-"""Angles from outside the scan file: read, and given to frames only where their number fits."""
+"""Angles from a separate file: reads them, and assigns them to the frames if their number matches."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
     """Radians from a file, or from an array in radians.
 
     Args:
-        unit: "deg" or "rad", whatever the file says; None: as it says.
+        unit: "deg" or "rad", whatever the file states; None: the unit that it states.
 
     Raises:
         DataError: they cannot be read, or several lists could be meant.
@@ -50,14 +50,14 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
 
 
 def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy: a list or a column.
 
     Args:
-        where: "": the only list whose unit is one of angles, or the only array.
-        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
+        where: "": the only list with a unit of angles, or the only array.
+        unit: "deg" or "rad", whatever the file states; None: the unit that it states, or `default` if it states none.
 
     Raises:
-        DataError: it is not there, is no list, or nothing says its unit.
+        DataError: the array does not exist, is not a list, or has no known unit.
     """
     with closing(open_array_file(path)) as file, hdf5.readable(path):
         if not where and isinstance(file, h5py.File):
@@ -77,8 +77,8 @@ def _only_angles(file: h5py.File) -> str:
     ]
     if len(names) != 1:
         raise DataError(
-            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
-            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the "
+            "right one: --angles FILE::DATASET. If it states no unit, also give --angles-unit deg or rad."
         )
     return names[0]
 
@@ -92,10 +92,10 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
     try:
         text, stated = _column(content.splitlines(), column)
         if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
-            raise ValueError(f"the unit of its angles is {stated!r}; say --angles-unit deg or rad")
+            raise ValueError(f"the unit of its angles is {stated!r}; give --angles-unit deg or rad")
         return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
-        table = ". Of a table, FILE::COLUMN is one column: its name, or its number from 0" * (
+        table = ". For a table, FILE::COLUMN names one column: by its name, or its number from 0" * (
             "column" in str(error) or "its angle" in str(error)
         )
         raise DataError(f"{name}: {error}{table}.") from error
@@ -119,8 +119,8 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
     chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
     chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
     if len(chosen) != 1 or chosen[0] >= len(names):
-        held = ", ".join(names) if titled else f"{len(names)} without names"
-        raise ValueError(f"its columns are {held}; expected one that is named after angles")
+        held = f"its columns are {', '.join(names)}" if titled else f"its {len(names)} columns have no names"
+        raise ValueError(f"{held}; expected one whose name is a word for angle")
     for number, line in enumerate(lines):
         cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
         lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)
@@ -133,7 +133,7 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
     match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
     if match is None:
         raise DataError(
-            f"--angle-rows {shlex.quote(rows)} is not of the form A:B, from 0 and B not included, such as 10:101."
+            f"--angle-rows {shlex.quote(rows)} is wrong; expected A:B, counted from 0 and without B, such as 10:101."
         )
     first = int(match[1] or 0)
     last = int(match[2] or angles.size)
@@ -145,18 +145,20 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
 def assign(
     source: ScanSource, angles: NDArray[np.float64], name: str, *, of_views: bool = False
 ) -> NDArray[np.float64]:
-    """Assign an angle in radians to each frame of a source, NaN where unknown.
+    """Assign an angle in radians to each frame of a source, NaN if unknown.
 
-    There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
-    each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
-    whose steps are equal from end to end has no rows of darks and flats, for which a stage stands.
+    There may be one angle for each projection; or one for each number of a series of files of which some are missing;
+    or one for each frame, if the order of all frames is known. A log with nan for each dark and flat also tells that
+    order. A log whose steps are equal from end to end contains no rows of darks and flats, because the stage stands
+    still for these.
 
     Args:
         name: where the angles come from, for messages.
         of_views: the angles are those of projections alone.
 
     Raises:
-        DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
+        DataError: the angles fit none of these cases. The message names the rows that are certainly those of the
+            projections, if there are any.
     """
     projections, numbers = source.table.views, source.table.numbers
     series = None if numbers is None else numbers[projections]
@@ -178,12 +180,12 @@ def assign(
 
 
 def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
-    """Whether the numbers of files, no two of them the same, go from the first to the last of n."""
+    """True if the numbers of files, no two of them the same, go from the first to the last of n."""
     return bool(numbers.min() >= 0 and np.ptp(numbers) + 1 == n and np.unique(numbers).size == numbers.size)
 
 
 def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
-    """Whether no step is half as long again, or half as short, as the typical one."""
+    """True if no step is half as long again, or half as short, as the typical one."""
     steps = np.diff(angles)
     typical = float(np.median(steps))
     return bool((np.abs(steps - typical) < abs(typical) / 2).all())
@@ -193,66 +195,68 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
     n, frames = source.table.views.size, len(source.table)
     if frames == 1 < angles.size:
         return (
-            f"{name} has {angles.size} angles, and {source.path} holds one image of {source.shape[0]} x "
-            f"{source.shape[1]} pixels. As a sinogram it has as many rows, or columns, as views: give so many angles, "
-            "or say with --angle-rows A:B which of these are theirs (from 0, B not included)."
+            f"{name} has {angles.size} angles, but {source.path} is one image of {source.shape[0]} x "
+            f"{source.shape[1]} pixels. If the image is a sinogram, its rows or its columns are the "
+            "projections: give that many angles, or use --angle-rows A:B to choose those that belong to "
+            "it (from 0, without B)."
         )
     if angles.size < n:
-        message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
+        message = f"{name} has {angles.size} angles for {n} projections, so {n - angles.size} projections have no angle"
     elif angles.size == frames:
         message = (
-            f"{name} has {angles.size} angles, one for each frame, and {source.path} does not say when its darks and "
-            f"flats were taken"
+            f"{name} has {angles.size} angles, one for each frame, but {source.path} does not state when "
+            "its darks and flats were taken"
         )
     else:
-        message = f"{name} has {angles.size} angles, but there are {n} projections among {frames} frames"
+        message = f"{name} has {angles.size} angles, but {n} of the {frames} frames are projections"
     if others := [field.value for field in source.not_used if field.where == OTHER_FILES]:
         message += (
-            f". By its OME metadata {source.path} is one file of a set, the others hold {others[0]} images: give them "
-            "with --append FILE"
+            f". According to its OME metadata, {source.path} is one file of a set, and the others contain "
+            f"{others[0]} images: add them with --append FILE"
         )
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
-            f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
-            f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
+            f". The image numbers run from {series.min()} to {series.max()} and leave out {gaps}: with "
+            f"{np.ptp(series) + 1} angles, one for each number, each image would get its own angle"
         )
     elif series is not None and n < angles.size != frames:
         lost = angles.size - n
         message += (
-            f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
-            f"{angles.size}, the first {lost} or the last {lost} may be lost"
+            f". The image numbers run from {series.min()} to {series.max()} without a gap. If the scan "
+            f"had {angles.size} images, either the first {lost} or the last {lost} are missing"
         )
     if angles.size < n:
         return (
-            f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order. Images "
-            "among them that are darks or flats are given with --darks and --flats, or named by --frames."
+            f"{message}. Is the list cut off, or does it belong to another scan? Give one angle for each "
+            "projection, in their order. If some of the images are darks or flats, name them with "
+            "--frames, or give them with --darks and --flats."
         )
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
         order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
-        sinograms = f"If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+        sinograms = f"If each image is a sinogram of {angles.size} projections, give --order {order}. If not, use"
         if not source.table.are_views.all():
             sinograms = (
-                f"If an image is a sinogram of {angles.size} views, give it alone as FILE, and the others with --darks "
-                "and --flats; if not, say"
+                f"If one image is a sinogram of {angles.size} projections, give it alone as FILE, and the "
+                "others with --darks and --flats. If not, use"
             )
     message += (
-        f". {sinograms or 'Say'} with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
+        f". {sinograms or 'Use'} --angle-rows A:B to choose the {n} angles of the projections (from 0, without B)"
     )
     if window is None:
         return f"{message}."
     low, high = np.degrees(angles[list(window)])
     return (
-        f"{message}; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, from "
-        f"{low:.4f} to {high:.4f} degrees."
+        f"{message}. --angle-rows {window[0]}:{window[1] + 1} uses the {n} consecutive angles with the "
+        f"most equal steps, from {low:.4f} to {high:.4f} degrees."
     )
 
 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
     """First and last row of the n consecutive rows with the most equal steps; None if the choice is ambiguous.
 
-    A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
-    rows, other rows would do as well: then views were lost, and nothing tells which.
+    A scan's angle log often also contains the darks and flats, during which the stage stands still. If equal steps
+    continue beyond these n rows, other rows would fit as well: then projections are missing, and it is unknown which.
     """
     if n < 3 or angles.size <= n or not np.isfinite(angles).all():
         return None

@@ -1,4 +1,4 @@
-"""Scans whose views are means of several frames."""
+"""Scans whose projections are the means of several frames."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from drivers.base.frame import FrameKind
 JOINED_DEG = "frames_per_view_joined_deg"
 """Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
 _MEASURED = ("angles", "times", "aside", "shifts", "energies", "currents")
-_EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds
+_EXACT = 2  # bytes of a whole number, whose sums over a projection uint32 holds
 
 
 class AveragedSource(Frames):
-    """A ScanSource whose projections are means of those of `base`; darks and flats are unchanged, invalid frames are
-    omitted.
+    """A ScanSource whose projections are means of several projections of `base`; darks and flats are unchanged, invalid
+    frames are omitted.
 
-    A view is up to `n` projections that follow one another, closer in angle than the last frames of a view and the
-    first of the next. So a view that lacks frames takes none of its neighbour's. Of a growing file a view is there once
-    a frame of the next one is, or its n-th.
+    A mean combines up to `n` consecutive frames that are closer in angle than frames of different projections. So a
+    projection with missing frames takes none of its neighbour's. In a growing file a projection is complete as soon as
+    a frame of the next one, or its n-th frame, exists.
 
-    The mean is that of the frames without an alarm, or of all where each has one. Whole numbers are summed as such,
-    real ones in float64; their mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be
-    read have no part in it.
+    The mean is that of the frames without an alarm, or of all if each has one. Integers are summed as such, real
+    numbers in float64; the mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be read
+    are left out.
     """
 
     def __init__(self, base: ScanSource, n: int) -> None:
-        """Raises ConfigError where no view would have more than one frame."""
+        """Raises ConfigError if no projection would have more than one frame."""
         self._base, self._n, self._groups = base, n, list[list[int]]()
         super().__init__(
             base,
@@ -52,8 +52,8 @@ class AveragedSource(Frames):
         if base.finished and not any(len(group) > 1 for group in self._groups):
             views = base.table.views.size
             raise ConfigError(
-                f"--frames-per-view {n}: no two of the {views} projections of {base.path} that follow one another are "
-                "closer in angle than views are. Leave it out. Nothing was read."
+                f"Omit --frames-per-view {n}: no two consecutive projections of the {views} in "
+                f"{base.path} are at the same angle, so there is nothing to average. Nothing was read."
             )
 
     def _update(self) -> None:
@@ -66,7 +66,7 @@ class AveragedSource(Frames):
         super()._update()
 
     def _joined(self, known: FrameTable) -> FrameTable:
-        """The first frame of each view, with the means of what is measured."""
+        """The first frame of each projection, with the means of what is measured."""
 
         def means(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
             if values is None:
@@ -86,7 +86,7 @@ class AveragedSource(Frames):
         )
 
     def _apart(self) -> float:
-        """Radians from a view's first frame, beyond which a frame belongs to another view."""
+        """Radians from a projection's first frame, beyond which a frame belongs to another projection."""
         table = self._base.table
         planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
         angles = planned if planned.size > self._n else table.angles[table.views]
@@ -95,7 +95,7 @@ class AveragedSource(Frames):
         return float(np.median(steps)) * (1 - 0.5 / self._n) if steps.size else np.inf
 
     def _since(self, apart: float, first: int) -> list[list[int]]:
-        """The rows of base from `first` on, by view; without those of a view that may still get frames."""
+        """The rows of base from `first` on, by projection; without those of a projection that may still get frames."""
         keys, angles, groups = self._base.table.kinds, self._base.table.angles, list[list[int]]()
         view, may_grow = list[int](), False
         for row in (first + np.flatnonzero(keys[first:] != FrameKind.INVALID)).tolist():
@@ -107,7 +107,7 @@ class AveragedSource(Frames):
         return groups[:-1] if may_grow and not self._base.finished else groups
 
     def _and_joined(self, known: Attributes) -> Attributes:
-        """The scan's attributes, with how many frames were left out, and the largest angle between two of a view."""
+        """The scan's attributes, with the number of omitted frames and the largest angle within a projection."""
         angles, out = self._base.table.angles, sum(map(len, self._usable)) - sum(map(len, self._used))
         joined = float(np.degrees(max((np.ptp(angles[rows]) for rows in self._groups if len(rows) > 1), default=0.0)))
         facts = {"frames_per_view": self._n, "frames_left_out_by_alarms": out, JOINED_DEG: joined}
@@ -134,6 +134,6 @@ class AveragedSource(Frames):
 
 
 def stated_frames_per_view(source: ScanSource) -> int:
-    """Frames per view by the plan in the file; 1 if it has no plan."""
+    """Frames per projection by the plan in the file; 1 if it has no plan."""
     stated = source.plan.get("frames_per_view", 1)
     return stated if isinstance(stated, int) and stated > 1 else 1

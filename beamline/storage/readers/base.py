@@ -1,4 +1,6 @@
-"""ScanSource: a scan of any file format; a format adds a subclass, and a ScanFormat for the registry."""
+"""ScanSource: the interface of a scan file of any format. A format adds a subclass, and a ScanFormat for the
+registry.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,9 @@ WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field of a file that is ignored: its path, its value, why or what to do, whether it may matter, and whether a
-    volume without it is wrong by more than a hundredth."""
+    """A field of a file that is ignored: its path, its value, the reason or what to do, whether it may matter, and
+    whether a volume without it is wrong by more than a hundredth.
+    """
 
     where: str
     value: str
@@ -60,14 +63,14 @@ class ScanSource(ABC):
         central_ray: (row, column) that it meets, by the file, which is shown and not used; NaN: not stated.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
         row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
-        in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
-            they were taken.
+        in_order: the frames are in the order of acquisition. False: darks and flats stand before the projections,
+            whenever they were taken.
         untyped: the file does not say whether the bits of pixels are those of whole or of real numbers.
-        pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
+        pixel_mask: bool [row, col], pixels that the file says not to use; None if it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
         not_used: what the file states of geometry, units, order and validity, and what is not used.
         unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
-        plan: the requested scan, as our files record it; empty if unknown.
+        plan: the requested scan, as this program's files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
         stated_ending: `ending` of a format in which it does not change.
@@ -111,7 +114,7 @@ class ScanSource(ABC):
 
     @property
     def finished(self) -> bool:
-        """Whether no more frames will come. Check before refresh(): refresh() then finds all frames."""
+        """True if no more frames will come. Check before refresh(): refresh() then finds all frames."""
         return True
 
     @property
@@ -126,7 +129,7 @@ class ScanSource(ABC):
 
     @property
     def checksummed(self) -> bool:
-        """Whether the file has a checksum for every frame."""
+        """True if the file has a checksum for every frame."""
         return False
 
     @property
@@ -172,7 +175,7 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
     if indices.size == 0:
         return np.empty(0, np.int64)
     if indices.ndim != 1 or indices.dtype.kind not in "ui":
-        raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
+        raise IndexError(f"Frames are chosen by a slice or by integers, but {indices.dtype} {indices.shape} was given.")
     indices = indices.astype(np.int64)
     if indices.min() < -n or indices.max() >= n:
         raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{n - 1} can be read.")
@@ -180,9 +183,9 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
 
 
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-    """`source.read`, with NaN (0 for integers) for unreadable frames: see its `unreadable`.
+    """`source.read`, with NaN (0 for integers) for unreadable frames, see `unreadable`.
 
-    A real number beyond LARGEST, which no detector counts and which float32 may not hold, is NaN, too.
+    Real numbers beyond LARGEST, which no detector counts and which float32 may not represent, also become NaN.
     """
     try:
         return measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
@@ -213,7 +216,7 @@ def measured(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class TakesTooLongError(DataError):
-    """The check was ended because it would take too long; findings so far are valid."""
+    """The check was ended because it would take too long; the findings so far are valid."""
 
 
 @dataclass(frozen=True)
@@ -222,9 +225,10 @@ class Opening:
 
     Attributes:
         follow: the file may still be growing.
-        own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
-        one_series: the caller says the kind of each frame; names of files say none.
-        counts: the caller says that pixels are counts, and gives no references: they may lie beside the views.
+        own_angles: the file's angles are used; False: the caller supplies the angles, so the file need not have any.
+        one_series: the caller states the kind of each frame; names of files are not used for that.
+        counts: the caller states that pixels are counts, and gives no darks and flats: they may lie next to the
+            projections.
     """
 
     follow: bool = False

@@ -1,4 +1,4 @@
-"""Scans as Data Exchange: the /exchange group (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224)."""
+"""Scan files in the Data Exchange format: the /exchange group (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from beamline.storage.readers.orders import (
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
-_UNKNOWN = "the names are unknown; theta:y:x is taken"
+_UNKNOWN = "the names are unknown; theta:y:x is assumed"
 _DETECTOR = "measurement/instrument/detector"
 _FLATS = "process/acquisition/flat_fields"
 _ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
@@ -93,8 +93,8 @@ class ExchangeSource(StacksSource):
     """A scan in a Data Exchange file.
 
     Attributes:
-        own_angles: those of the file are used.
-        grows: it was still being written when it was opened. Its frames are numbered as they come.
+        own_angles: the angles of the file are used.
+        grows: it was still being written when it was opened. Its frames are numbered as they arrive.
     """
 
     own_angles: bool = True
@@ -115,11 +115,11 @@ class ExchangeSource(StacksSource):
         return len(self.table)
 
     def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
-        """Sort darks and flats among the views, if the file says when flats were taken.
+        """Sort darks and flats among the projections, if the file says when flats were taken.
 
         Args:
             thetas: radians at which the darks and the flats were taken, where the file states them.
-            later: the first of the flats that were taken after the views; None: the acquisition does not say.
+            later: the first of the flats that were taken after the projections; None: the acquisition does not say.
         """
         table, place = self.table, np.full(len(self.table), -1.0)
         views = table.angles[table.views]
@@ -130,7 +130,8 @@ class ExchangeSource(StacksSource):
             at = np.abs(views - theta[:, None]).argmin(axis=1)
             place[table.of_kind(kind)] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
         turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
-        if later is None and not in_turn and turned.size == 1:  # views in any order; flats at two places of the stage
+        # projections in any order; flats at two places of the stage
+        if later is None and not in_turn and turned.size == 1:
             later = int(turned[0])
         if later is not None:
             place[table.flats[later:]] = views.size
@@ -148,15 +149,16 @@ def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, ND
 
 
 def _later_flats(file: h5py.File, n: int) -> int | None:
-    """The first of n flats that were taken after the views, where the acquisition says that it took them at both ends,
-    as many each time."""
+    """The first of n flats that were taken after the projections, if the acquisition states that it took equally many
+    before and after.
+    """
     mode = datasets.dataset(file, f"{_FLATS}/flat_field_mode")
     each = datasets.scalar(file, f"{_FLATS}/num_flat_fields", _ANY) or n // 2
     return n // 2 if mode is not None and _words(mode).lower() == "both" and 2 * each == n > 0 else None
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Angles [frame] in radians, in the unit of the views if none is stated; None without a list of this length."""
+    """Angles [frame] in radians; default unit: that of the projections. None without a list of this length."""
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
@@ -167,7 +169,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
 
 
 def _set_exposures(table: FrameTable, file: h5py.File) -> None:
-    """Set exposures: one for all frames or for each view, and that of the flats if another one is stated."""
+    """Set exposures: one for all frames or for each projection, and that of the flats if another one is stated."""
     seconds = _seconds(file, f"{_DETECTOR}/exposure_time", table.views.size)
     if seconds is None:
         return
@@ -201,7 +203,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
 
 
 def _order(item: h5py.Dataset) -> Order | None:
-    """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
+    """Which dimensions are frames, rows and columns, by the attribute `axes`; None if that says nothing."""
     return order_of_axes(_axes(item))
 
 
@@ -224,12 +226,16 @@ def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
 def _measured(
     source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
 ) -> float | None:
-    """A positive number; without a unit it is taken as SI, as the format says, if it then lies in a range."""
+    """A positive number. Without a unit it is assumed to be SI, as the format says, if the value is then in a plausible
+    range.
+    """
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
     source.not_used += (
-        NotUsed(where, datasets.text_of(item), "it has no attribute `units`, and in the SI's it cannot be", True),
+        NotUsed(
+            where, datasets.text_of(item), "it has no attribute `units`, and in SI units the value is impossible", True
+        ),
     )
     return None
 
@@ -247,13 +253,14 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
         if start is not None and step and abs(step) <= math.pi:
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
-            f"{file.filename} has no /exchange/theta, and neither /process/acquisition/rotation nor attributes of "
-            "/exchange state one start and one step of the rotation, of 180 degrees at most. Some readers then assume "
-            "0 to 180 degrees; we do not: give them with --angles FILE (degrees, one a line)."
+            f"Give the angles with --angles FILE (degrees, one per line): {file.filename} has no "
+            "/exchange/theta, and neither /process/acquisition/rotation nor attributes of /exchange "
+            "state one start and one step of the rotation of at most 180 degrees. Some programs assume 0 "
+            "to 180 degrees in this case; this one does not."
         )
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
-        way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
+        way = f" If the scan ended early, use the first angles: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
             f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"
@@ -262,8 +269,9 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 
 
 def _of_rotation(file: h5py.File, what: str) -> float | None:
-    """The one number, in radians, that the acquisition or attributes of the exchange data state of the rotation, in
-    degrees unless it has a unit; None: several or none."""
+    """The one number, in radians, that the acquisition or attributes of the exchange data state for the rotation, in
+    degrees unless it has a unit; None: several or none.
+    """
     attributes = [item.attrs.get(f"rotation_{what}") for item in (file["exchange"], file["exchange/data"])]
     by_group = datasets.scalar(
         file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}

@@ -1,4 +1,4 @@
-"""Fields of foreign files that bear on geometry, units, order and validity, and what we do with each.
+"""Fields in files of other programs that affect geometry, units, frame order or validity, and how each is used.
 
 `NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `stated_in` for those that a file states
 and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
@@ -86,8 +86,8 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
-    """The effect of taking one length for all views, where the file states others for some, and their share; "" if it
-    is not visible.
+    """The effect of taking one length for all projections, where the file states others for some, and their share; ""
+    if it is not visible.
     """
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:
@@ -143,99 +143,119 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _ONE = (
-    "it differs from view to view, one value is taken for all, and so images differ in size, by up to {:.2g} px at the "
-    "edge of the field. Scale the images about the rotation axis to one pixel size, or say the one that holds with "
-    "--pixel-size-um (of a cone --cone)"
+    "it differs between projections, but one value is used for all of them. Images differ in size by up to {:.2g} px "
+    "at the edge of the field of view. Scale the images about the rotation axis to one pixel size, or state the right "
+    "one with --pixel-size-um (cone beam: --cone)"
 )
-_POSES = "give the shifts of views with --poses"
-_POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
-UPRIGHT = "the detector is taken to stand upright to the beam"
-_ENERGY = "energy, where the beams above state none"
-_WAVELENGTH = "energy, where no beam states one"
-_DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
+_POSES = "give the shifts of the projections with --poses"
+_POINTS = "NeXus does not define its direction on the detector; state it with --poses FILE:x,-y"
+UPRIGHT = "the detector is assumed to be perpendicular to the beam"
+_ENERGY = "energy, if the beams above state none"
+_WAVELENGTH = "energy, if no beam states one"
+_DONE = (
+    "frames are corrected as if they were raw; if they are corrected already, give --quantity line-integrals, or the "
+    "raw frames"
+)
 
 NXTOMO: tuple[Entry, ...] = (
-    Entry("definition", "tells the kind of the file; the structure decides, not the name"),
-    Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
-    Entry("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
-    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
-    Entry("detector/count_time", "exposure of each frame", units=datasets.TIME_UNITS),
+    Entry("definition", "states the kind of the file, but the structure of the file decides"),
+    Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not state another order"),
+    Entry("detector/image_key", "kind of each frame; a frame with an undefined code is invalid"),
+    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it overrides image_key"),
+    Entry("detector/count_time", "exposure time of each frame", units=datasets.TIME_UNITS),
     Entry(
         "detector/x_pixel_size",
-        "width of a pixel: at the sample for a parallel beam, on the detector for a cone",
+        "width of a pixel: at the sample (parallel beam) or on the detector (cone beam)",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "detector/y_pixel_size",
-        "height of a pixel; slices of a parallel beam are as far apart, others are refused",
+        "height of a pixel, and distance of the slices in a parallel beam; otherwise pixels must be square",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "sample/x_pixel_size",
-        "width of a pixel at the sample; goes before the detector's",
+        "width of a pixel at the sample; overrides that of the detector",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "sample/y_pixel_size",
-        "height of a pixel at the sample; goes before the detector's",
+        "height of a pixel at the sample; overrides that of the detector",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "detector/distance",
-        "from the sample to the detector: phase, and the magnification of a cone",
+        "distance from sample to detector, for the phase filter and the magnification of a cone beam",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "instrument/source/distance",
-        "from the source to the sample, of either sign, also of an NXsource of another name: a cone beam, unless it "
-        "magnifies by less than 1 % and a ray leaves its parallel by less than half a pixel in the whole field",
+        "distance from source to sample, of either sign, also of an NXsource with another name. It means a cone beam, "
+        "unless the magnification is below 1 % and every ray is parallel within half a pixel in the field of view",
         units=datasets.LENGTH_UNITS,
     ),
-    Entry("detector/x_flipped", "frames are mirrored left to right as they are read"),
-    Entry("detector/y_flipped", "frames are mirrored upside down as they are read"),
+    Entry("detector/x_flipped", "frames are mirrored left to right when they are read"),
+    Entry("detector/y_flipped", "frames are mirrored top to bottom when they are read"),
     Entry(
         "detector/transformations",
-        "half turns about the axes, by the direction of `gravity`, mirror the frames; other turns are named",
+        "180° rotations about the axes (relative to `gravity`) mirror the frames; other rotations are reported",
     ),
-    Entry("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
+    Entry(
+        "sample/rotation_angle", "angle of each frame, in its `units`; without units the command stops with an error"
+    ),
     Entry(
         "sample/depends_on",
-        "where sample/rotation_angle is absent: the rotation that changes, at the end of its chain or on the way",
+        "if sample/rotation_angle is missing: the rotation that changes, anywhere in this chain",
     ),
     Entry("sample/name", "name in reports"),
     Entry("title", "name in reports"),
-    Entry("start_time", "shown"),
-    Entry("end_time", "shown"),
-    Entry("instrument/name", "shown"),
-    Entry("control/data", "ring current of each frame, or another monitor of the beam: --ring-current use"),
+    Entry("start_time", "shown by `info`"),
+    Entry("end_time", "shown by `info`"),
+    Entry("instrument/name", "shown by `info`"),
+    Entry("control/data", "ring current, or another beam monitor, of each frame; used with --ring-current use"),
     Entry("instrument/beam/incident_energy", "energy", units=datasets.ENERGY_UNITS),
     Entry("beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
     Entry("sample/beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
     Entry("instrument/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
     Entry("beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
     Entry("sample/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
-    Entry("instrument/monochromator/energy", "energy, where the beam states none", units=datasets.ENERGY_UNITS),
+    Entry("instrument/monochromator/energy", "energy, if no beam states one", units=datasets.ENERGY_UNITS),
     Entry(
         "instrument/monochromator/wavelength",
-        "energy, where nothing else states it",
+        "energy, if nothing else states it",
         units=datasets.WAVELENGTH_UNITS,
     ),
     Entry(
-        "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
-    ),
-    Entry("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
-    Entry("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
-    Entry("detector/field_of_view", "the views show whether the field is half", False),
-    Entry("detector/half_acquisition", "the views show whether the field is half", False),
-    Entry("detector/beam_center_x", "a cone's central ray is taken to meet the rotation axis; --axis places it", False),
-    Entry(
-        "detector/beam_center_y",
-        "a cone's central ray is taken to meet the middle of the rows; --central-row places it",
+        "detector/x_rotation_axis_pixel_position",
+        "its origin is not defined; the axis is found in the projections, or given with --axis",
         False,
     ),
-    Entry("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
-    Entry("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
-    Entry("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
+    Entry("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
+    Entry(
+        "detector/estimated_cor_from_motor",
+        "its origin is not defined; the axis is found in the projections, or given with --axis",
+        False,
+    ),
+    Entry("detector/field_of_view", "the projections show whether it is a half acquisition", False),
+    Entry("detector/half_acquisition", "the projections show whether it is a half acquisition", False),
+    Entry(
+        "detector/beam_center_x",
+        "the central ray of a cone is assumed to meet the rotation axis; --axis states its column",
+        False,
+    ),
+    Entry(
+        "detector/beam_center_y",
+        "the central ray of a cone is assumed to meet the middle row; --central-row states its row",
+        False,
+    ),
+    Entry("detector/x_pixel_offset", "pixels are assumed to be evenly spaced", False),
+    Entry("detector/y_pixel_offset", "pixels are assumed to be evenly spaced", False),
+    Entry(
+        "detector/magnification",
+        "pixel sizes are used as stated; give --pixel-size-um if they are not at the sample",
+        False,
+        _disagrees,
+    ),
     Entry("detector/polar_angle", UPRIGHT, False, _true),
     Entry("detector/azimuthal_angle", UPRIGHT, False, _true),
     Entry("detector/x_translation", _POINTS, False, _moves),
@@ -243,45 +263,49 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("sample/x_translation", _POINTS, False, _moves),
     Entry("sample/y_translation", _POINTS, False, _moves),
     Entry("sample/z_translation", _POINTS, False, _moves),
-    Entry("sample/distance", "the sample is taken to be at the rotation axis", False),
-    Entry("sample/propagation_distance", "follows from the distances of source and detector", False),
-    Entry("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
+    Entry("sample/distance", "the sample is assumed to be at the rotation axis", False),
+    Entry("sample/propagation_distance", "it follows from the distances of source and detector", False),
+    Entry("sample/polar_angle", "the rotation axis is assumed to lie along the columns", False, _true),
     Entry("detector/flatfield_applied", _DONE, False, _true),
-    Entry("detector/pixel_mask_applied", "defective pixels are searched", False),
-    Entry("detector/pixel_mask", "pixels of whole numbers that are not 0 in it are filled; others are searched"),
-    Entry("detector/flatfield", "flats are the frames whose image_key is 1", False),
-    Entry("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
-    Entry("detector/countrate_correction_applied", "frames are taken as they are", False),
-    Entry("detector/saturation_value", "saturation is judged by the frames", False),
-    Entry("detector/underload_value", "frames are taken as they are", False),
-    Entry("detector/bit_depth_readout", "saturation is judged by the frames", False),
-    Entry("detector/sequence_number", "frames are taken in the order of the file", False),
-    Entry("detector/frame_start_number", "frames are taken in the order of the file", False),
+    Entry("detector/pixel_mask_applied", "defective pixels are found in the frames", False),
+    Entry(
+        "detector/pixel_mask",
+        "in frames of whole numbers, pixels that are not 0 in this mask are filled; others are found in the frames",
+    ),
+    Entry("detector/flatfield", "flats are the frames with image_key 1", False),
+    Entry("detector/angular_calibration_applied", "frames are used as they are", False, _true),
+    Entry("detector/countrate_correction_applied", "frames are used as they are", False),
+    Entry("detector/saturation_value", "saturation is found in the frames", False),
+    Entry("detector/underload_value", "frames are used as they are", False),
+    Entry("detector/bit_depth_readout", "saturation is found in the frames", False),
+    Entry("detector/sequence_number", "frames are used in the order of the file", False),
+    Entry("detector/frame_start_number", "frames are used in the order of the file", False),
     Entry("detector/real_x_pixel_size", "x_pixel_size is used", False),
     Entry("detector/real_y_pixel_size", "y_pixel_size is used", False),
 )
 
 EXCHANGE: tuple[Entry, ...] = (
-    Entry("implements", "shown"),
-    Entry("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
-    Entry("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
-    Entry("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
+    Entry("implements", "shown by `info`"),
+    Entry("exchange/data", "projections; the attribute `axes` states the order of the dimensions (default theta:y:x)"),
+    Entry("exchange/data_white", "flats, in the order of `axes`, or of exchange/data"),
+    Entry("exchange/data_dark", "darks, in the order of `axes`, or of exchange/data"),
     Entry(
         "exchange/theta",
-        "angle of each projection, by its `units`; degrees without them. Without it, `start` and `step` in "
-        "`process/acquisition/rotation`, or the attributes `rotation_start` and `rotation_step` of exchange or data",
+        "angle of each projection, in its `units` (default degrees). If theta is missing, `start` and `step` in "
+        "`process/acquisition/rotation` are used, or the attributes `rotation_start` and `rotation_step` of exchange "
+        "or data",
     ),
     Entry("exchange/title", "name in reports"),
     Entry("measurement/sample/name", "name in reports"),
     Entry(
         "measurement/instrument/monochromator/energy",
-        "energy by its `units`; without them joule, as the format says",
+        "energy, in its `units` (default joule, as the format defines)",
         units=EXCHANGE_ENERGY_UNITS,
     ),
     Entry(
         "measurement/instrument/detector/x_pixel_size",
-        "width of a pixel by its `units`; without them metre, as the format says. It is on the detector: times "
-        "x_binning, over objective/magnification",
+        "width of a pixel on the detector, in its `units` (default metre, as the format defines). It is multiplied by "
+        "x_binning and divided by objective/magnification",
         units=EXCHANGE_LENGTH_UNITS,
     ),
     Entry(
@@ -289,44 +313,55 @@ EXCHANGE: tuple[Entry, ...] = (
         "height of a pixel, as x_pixel_size",
         units=EXCHANGE_LENGTH_UNITS,
     ),
-    Entry("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
-    Entry("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
-    Entry("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
-    Entry("exchange/theta_white", "where flats stand among the views, which then have the flats around them"),
-    Entry("exchange/theta_dark", "where darks stand among the views"),
+    Entry("measurement/instrument/detector/x_binning", "number of detector pixels in one column of the data"),
+    Entry("measurement/instrument/detector/y_binning", "number of detector pixels in one row of the data"),
+    Entry("measurement/instrument/detector/objective/magnification", "gives the pixel size at the sample"),
+    Entry("exchange/theta_white", "angles of the flats; each projection is then corrected with the flats around it"),
+    Entry("exchange/theta_dark", "angles of the darks"),
     Entry("exchange/data_shift_x", _POSES, False, _shifts),
     Entry("exchange/data_shift_y", _POSES, False, _shifts),
-    Entry("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
-    Entry("exchange/y", "pixels are taken to be evenly spaced; y_pixel_size is used", False),
-    Entry("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
-    Entry("measurement/instrument/source/current", "one value for the whole scan", False),
+    Entry("exchange/x", "pixels are assumed to be evenly spaced; x_pixel_size is used", False),
+    Entry("exchange/y", "pixels are assumed to be evenly spaced; y_pixel_size is used", False),
+    Entry("measurement/instrument/source/energy", "it is the energy of the ring, not of the photons", False),
+    Entry("measurement/instrument/source/current", "it is one value for the whole scan", False),
     Entry(
         "measurement/instrument/detector/exposure_time",
-        "exposure of darks, flats and views, or of each view; seconds without units",
+        "exposure time of darks, flats and projections, or of each projection (default unit: seconds)",
         units=EXCHANGE_TIME_UNITS,
     ),
     Entry(
         "process/acquisition/flat_fields/flat_exposure_time",
-        "exposure of flats, where different_flat_exposure says that it is another; seconds without units",
+        "exposure time of flats, if different_flat_exposure says that it differs (default unit: seconds)",
         units=EXCHANGE_TIME_UNITS,
     ),
-    Entry("process/acquisition/flat_fields/flat_field_mode", "Both: flats were taken before and after the views"),
-    Entry("process/acquisition/flat_fields/num_flat_fields", "how many each time; of Both, half of data_white"),
-    Entry("process/acquisition/flat_fields/different_flat_exposure", "Different: flats have flat_exposure_time"),
-    Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
-    Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
+    Entry(
+        "process/acquisition/flat_fields/flat_field_mode",
+        "`Both` means that flats were taken before and after the projections",
+    ),
+    Entry(
+        "process/acquisition/flat_fields/num_flat_fields", "number of flats each time; with `Both`, half of data_white"
+    ),
+    Entry(
+        "process/acquisition/flat_fields/different_flat_exposure",
+        "`Different` means that flats have flat_exposure_time",
+    ),
+    Entry("measurement/instrument/detector/roi/x1", "columns count from the first one in the data", False),
+    Entry("measurement/instrument/detector/roi/y1", "rows count from the first one in the data", False),
     Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
     Entry("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
     Entry("measurement/sample/geometry/translation/distances", _POSES, False),
     Entry(
-        "measurement/sample/geometry/orientation/value", "the rotation axis is taken to stand along the columns", False
+        "measurement/sample/geometry/orientation/value", "the rotation axis is assumed to lie along the columns", False
     ),
     Entry(
-        "measurement/instrument/interferometer/number_of_grid_steps", "phase steps are not combined", False, _disagrees
+        "measurement/instrument/interferometer/number_of_grid_steps",
+        "the phase steps are not combined",
+        False,
+        _disagrees,
     ),
     Entry(
         "measurement/instrument/detection_system/objective/resolution",
-        "not in the format; give it as --pixel-size-um",
+        "it is not part of the format; give it with --pixel-size-um",
         False,
     ),
     Entry("process/acquisition/rotation/start", "theta is used", False),

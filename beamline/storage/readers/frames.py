@@ -1,4 +1,4 @@
-"""Frames: a scan made of the frames of others, such as its parts, or what comes before them; with changed pixels."""
+"""Frames: a scan composed of the frames of other scan files, such as its parts, also with changed pixels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Frames(ScanSource):
 
         Args:
             pixels: how they come from those of the sources; None: as they are.
-            table: likewise.
+            table: in the same way.
             own: attributes that differ: each a value, or a function of what the sources say.
         """
         self._sources, self._pixels, self._change, self._own = sources, pixels, table, own

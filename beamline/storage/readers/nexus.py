@@ -1,5 +1,6 @@
-"""What NeXus files state, and where: the detector with frames and image keys, angles, pixels, energy, a cone beam, and
-mirrored frames."""
+"""Facts in NeXus files and where they are stored: the detector with frames and image keys, angles, pixel size,
+energy, a cone beam, and mirrored frames.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ class Places:
 
     @property
     def keys(self) -> h5py.Dataset:
-        """The codes of the kinds of frames; of two lists that which has alignment frames, too."""
+        """The codes of the kinds of frames; if there are two lists, the one that also has alignment frames."""
         return datasets.dataset(self.detector, "image_key_control") or self.image_key
 
     def kinds(self) -> NDArray[np.int32]:
@@ -64,7 +65,7 @@ def find(file: h5py.File) -> list[Places]:
                 if key is not None and data is not None and data.ndim == 3:
                     places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
-        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
+        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back next to this one.")
     return places
 
 
@@ -92,7 +93,7 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
     name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = datasets.dataset(data, name)
-        return angle, "" if angle is not None else f"{_link(data, name)} is not there", 1
+        return angle, "" if angle is not None else f"{_link(data, name)} does not exist", 1
     rotations = _rotations_of_sample(entry)
     if len(rotations) == 1:
         return rotations[0][0], "", rotations[0][1]
@@ -101,15 +102,16 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
     lists = [item for item in datasets.arrays_in(entry.file, (1,)) if item.size == n]
     units = ((item, datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)) for item in lists)
     names = [str(item.name) for item, known in units if known is not None]
-    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} takes them" if names else ""
+    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} uses them" if names else ""
     return None, f"{entry.name} has no sample/rotation_angle{which}", 1
 
 
 def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
-    """The rotations with several angles that the sample depends on, and their sense: those that change, or all.
+    """The rotations with several angles that the sample depends on, and their sense: those that change, or else all.
 
-    The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
-    group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
+    The chain of NXtransformations begins at `sample/depends_on` and continues with the attribute of each step; a step
+    may be a group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the
+    vector.
     """
     here, where, steps, rotations = (
         datasets.resolve(entry, "sample"),
@@ -132,7 +134,7 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
     """The one detector to read: the one whose frames are `data`, or the one named by `default` of file and entry.
 
-    DataError: there is none, or several fit.
+    Raises DataError if there is none, or if several fit.
     """
     if not found:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
@@ -148,13 +150,13 @@ def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Pla
             return some[0]
     names = ", ".join(f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in found[:_LISTED])
     raise DataError(
-        f"{file.filename} has several detectors with frames, and no attribute `default` names one of them: {names}. "
-        f"Say which: --data-path {found[0].data.name}."
+        f"{file.filename} has several detectors with frames, and no attribute `default` names one of "
+        f"them: {names}. Choose one: --data-path {found[0].data.name}."
     )
 
 
 def _is_default(places: Places) -> bool:
-    """Whether the NXdata that an entry's `default` names shows these frames."""
+    """True if the NXdata that an entry's `default` names shows these frames."""
     name = datasets.attribute(places.entry, "default")
     data = datasets.resolve(places.entry, name) if name else None
     if not isinstance(data, h5py.Group):
@@ -176,10 +178,10 @@ class NexusGeometry:
 
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
-        cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
-        central_ray: (row, column) that it meets, counted as frames are read; NaN where it is not stated.
+        cone: mm from the source to the sample and to the detector; None also for a beam that is practically parallel.
+        central_ray: (row, column) where it meets the detector, counted as frames are read; NaN if it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
-        turned: turns of the detector that are not used, as text; "" for none.
+        turned: rotations of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
     """
 
@@ -195,7 +197,7 @@ def read_geometry(places: Places) -> NexusGeometry:
     """The geometry of a file of another program.
 
     Raises:
-        DataError: distances that cannot be.
+        DataError: impossible distances.
     """
     detector, entry = places.detector, places.entry
     own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
@@ -207,14 +209,14 @@ def read_geometry(places: Places) -> NexusGeometry:
         pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
     if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
-        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back as they are read"
+        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back when they are read"
     beside = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
     row, col = (_central(places, i, beside[i], mirrored[1 - i]) for i in (1, 0))
     return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)
 
 
 def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> float:
-    """The pixel along x (0) or y (1) that the central ray meets, by a length or a number of pixels; NaN: not stated."""
+    """The pixel along x (0) or y (1) that the central ray meets, stated in mm or in pixels; NaN: not stated."""
     pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
     pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
     at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
@@ -224,7 +226,7 @@ def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> 
 def _cone_of(
     places: Places, own: float | None, at_sample: float | None
 ) -> tuple[tuple[float, float] | None, dict[str, str]]:
-    """The cone of `NexusGeometry`, and a remark on a beam that is as good as parallel; widths of a pixel in mm."""
+    """The cone of `NexusGeometry`, and a remark on a beam that is practically parallel; widths of a pixel in mm."""
     upstream, beyond = (
         _source_distance(places.entry),
         datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS),
@@ -234,16 +236,20 @@ def _cone_of(
     sod, sdd = abs(upstream), abs(upstream) + beyond
     if not (sod > 0 and beyond >= 0):
         raise DataError(
-            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the detector {beyond:g} "
-            "mm behind it; expected distances of the source that are not 0, and of the detector from 0 on. Correct "
-            "them in a copy of the file."
+            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the "
+            f"detector {beyond:g} mm behind it; expected a source distance other than 0 and a detector "
+            "distance of 0 or more. Correct them in a copy of the file."
         )
     width, cols = at_sample or (None if own is None else own * sod / sdd), places.data.shape[2]
     diverged = None if width is None else width * cols / 2 / sod * cols / 2
     if sdd / sod > 1 + _MAGNIFIED or (diverged is not None and diverged > _DIVERGED):
         return (sod, sdd), {}
-    by = "" if diverged is None else f", and rays leave their parallels by {diverged:.2g} px in the field"
-    return None, {"source_distance": f"{sod:g} mm: a parallel beam (magnification {sdd / sod:.4f}{by})"}
+    by = (
+        ""
+        if diverged is None
+        else f", and rays deviate from parallel ones by {diverged:.2g} px within the field of view"
+    )
+    return None, {"source_distance": f"{sod:g} mm, treated as a parallel beam (magnification {sdd / sod:.4f}{by})"}
 
 
 def differing(height: float | None, width: float | None) -> float | None:
@@ -262,9 +268,9 @@ def require_order(places: Places) -> None:
         ]
         if order_of_axes(axes) not in (None, (0, 1, 2)):
             raise DataError(
-                f"{nxdata.name} in {places.entry.file.filename} says that its axes are {', '.join(axes)}; expected "
-                "frames [frame, row, col]: the rotation angle, then y, then x. Turn the frames in a copy of the file, "
-                "or correct the attribute `axes`."
+                f"{nxdata.name} in {places.entry.file.filename} states the axes {', '.join(axes)}; "
+                "expected frames [frame, row, col]: the rotation angle, then y, then x. Reorder the "
+                "frames in a copy of the file, or correct the attribute `axes`."
             )
 
 
@@ -299,7 +305,7 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
 
 
 def _source_distance(entry: h5py.Group) -> float | None:
-    """mm, negative before the sample, as NXsource has it; some write it without the sign."""
+    """mm, negative in front of the sample, as NXsource defines it; some programs write it without the sign."""
     instrument = datasets.resolve(entry, "instrument")
     for group in groups(instrument):
         if datasets.attribute(group, "NX_class") == "NXsource" or str(group.name).endswith("/source"):
@@ -352,7 +358,7 @@ def _flag(detector: h5py.Group, name: str) -> bool:
 
 
 def _direction(item: h5py.Dataset) -> int | None:
-    """Which of x, y, z the attribute `vector` runs along; None for none of them."""
+    """Which of x, y, z the attribute `vector` is parallel to; None if to none of them."""
     vector = np.ravel(np.asarray(item.attrs.get("vector", ())))
     if vector.dtype.kind not in "iuf":
         return None

@@ -1,4 +1,5 @@
-"""NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it, and as `nxtomo` reads ours.
+"""NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it; base of the reader of this
+program's own files (`nxtomo`).
 
 What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
 """
@@ -54,10 +55,11 @@ class NexusSource(ScanSource):
     """A scan with the structure of NXtomo; see ScanSource."""
 
     def __init__(self, path: Path, file: h5py.File, own_angles: bool = True, data: str | None = None) -> None:
-        """Read the open file. `own_angles` False: the caller brings the angles, so the file's may be absent or without
+        """Read the open file. `own_angles` False: the caller supplies the angles, so the file need not have any, or no
         units.
 
-        `data` is where the frames are, of several detectors; None: of the only one, or the file's default.
+        `data`: where the frames are, if there are several detectors; None: those of the only one, or of the file's
+        default.
         """
         self.path, self._file, self._own_angles, self.n = path, file, own_angles, 0
         self._mirrored_by, self._remarks = (False, False), dict[str, str]()
@@ -76,10 +78,10 @@ class NexusSource(ScanSource):
         self._read_stated(found if data is None else [])
 
     def _read_stated(self, found: list[Places]) -> None:
-        """What the file states of the scan, and the state of its frames.
+        """What the file states about the scan, and the state of its frames.
 
         Args:
-            found: scans of the file, of which those that are not read are named.
+            found: scans in the file; those that are not read are reported.
         """
         geometry = read_geometry(self._places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
@@ -109,7 +111,7 @@ class NexusSource(ScanSource):
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
             raise DataError(
-                f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
+                f"{self.path} refers to frames in {lost[0]}, which does not exist or differs ({len(lost)} such)."
             )
 
     @property
@@ -188,7 +190,7 @@ class NexusSource(ScanSource):
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
-            why = f"it is another scan of this file: --data-path {where}"
+            why = f"it is another scan in this file; --data-path {where} selects it"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
@@ -216,7 +218,7 @@ class NexusSource(ScanSource):
         return datasets.dataset(group, path)
 
     def _column(self, path: str) -> NDArray[np.int64] | None:
-        """Whole numbers [frame]; None where the file has no such list."""
+        """Whole numbers [frame]; None if the file has no such list."""
         item = self._item(self._places.entry, path)
         values = None if item is None else np.asarray(datasets.values_of(item))
         if values is None or values.ndim != 1 or values.size < self.n or values.dtype.kind not in "ui":
@@ -224,7 +226,7 @@ class NexusSource(ScanSource):
         return values[: self.n].astype(np.int64)
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
-        """Seconds of each frame; NaN where the file states none."""
+        """Seconds of each frame; NaN if the file states none."""
         values = datasets.in_units(self._item(group, path), datasets.TIME_UNITS)
         if values is None or 1 != values.size < self.n:
             return np.full(self.n, np.nan)

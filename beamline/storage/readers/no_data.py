@@ -1,4 +1,6 @@
-"""Detectors of several modules: pixels in the gaps hold a mark instead of counts, and photon counters have no dark."""
+"""Detectors of several modules: pixels in the gaps have a marker value instead of counts, and photon counters have
+no darks.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ _FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
 
 
 def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
-    """A scan whose pixels without data are 0 in all frames, flats included, so that they are filled like unlit ones;
-    and whether it is one of counted photons, whose dark is 0 and absent.
+    """A scan whose pixels without data are 0 in all frames, also in flats, so that they are replaced like pixels
+    without beam; and True for counted photons, whose dark is 0 and absent.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
@@ -32,21 +34,22 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
         images[:, no_data[rows]] = 0
         return images
 
-    facts = {"pixels_without_data": f"{no_data.mean():.2%}, filled from their neighbours"}
+    facts = {"pixels_without_data": f"{no_data.mean():.2%}, replaced with values of their neighbours"}
     not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
     source = Frames(base, pixels=pixels, not_used=not_used, attributes=lambda known: {**known, **facts})
     counter = not base.table.darks.size and counts_photons(source)
     if counter:
-        facts["darks"] = "0, as flats vary as counted photons do"
+        facts["darks"] = "0, because flats vary as counted photons do"
     return source, counter
 
 
 def no_data_of(source: ScanSource) -> Mask | None:
-    """bool [row, col], pixels without data by the file's mask, or at the maximum of their type in all frames.
+    """bool [row, col], pixels without data, from the file's mask, or because they are at the maximum of their type in
+    all frames.
 
-    Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. Types
-    of 8 and 16 bits may end by too much light, so that whole rows and columns alone are marks there, and nothing else
-    may be at the end. None where nothing is marked, or more than half.
+    Only integers have such markers: the largest value of an unsigned type, and values below 0 of the others. Types of 8
+    and 16 bits may also reach their end because of too much light; for these only whole rows and columns count as
+    markers, and no other pixel may be at the end. None if nothing is marked, or more than half.
     """
     if source.dtype.kind not in "iu":
         return None
@@ -65,7 +68,7 @@ def no_data_of(source: ScanSource) -> Mask | None:
 
 
 def _ends(source: ScanSource) -> list[Mask]:
-    """Pixels at the end of their type in sampled flats and views; [] if one of these frames has none."""
+    """Pixels at the end of their type in sampled flats and projections; [] if one of these frames has none."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         for row in spread(source.table.of_kind(kind), _LOOKED_AT):
@@ -76,17 +79,17 @@ def _ends(source: ScanSource) -> list[Mask]:
 
 
 def _end_in(source: ScanSource, row: int) -> Mask:
-    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is taken."""
+    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is needed."""
     half = source.shape[0] // 2
     parts = (read_known(source, [row], rows)[0] for rows in (slice(0, half), slice(half, source.shape[0])))
     return np.concatenate([part < 0 if part.dtype.kind == "i" else part == np.iinfo(part.dtype).max for part in parts])
 
 
 def counts_photons(source: ScanSource) -> bool:
-    """Whether flats fluctuate like counted photons: with the variance of their mean, so that they have no offset.
+    """True if flats fluctuate like counted photons, with the variance of their mean, so that they have no offset.
 
-    Of a camera the variance over the mean is its gain, times the share of the light in its counts, which is less where
-    there is less light, as in dark corners: both halves of the pixels must agree.
+    For a camera, variance over mean is its gain times the share of the light in its counts. That share is smaller where
+    there is less light, as in dark corners; so both halves of the pixels must agree.
     """
     rows = source.table.flats[: 2 * _LOOKED_AT]
     if rows.size < 2 or source.dtype.kind not in "iu":

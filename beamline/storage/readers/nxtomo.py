@@ -1,4 +1,4 @@
-"""Scans as NXtomo lays them out: ours, also while they grow, and those of other programs (`nexus_source`)."""
+"""NXtomo scan files: those of this program, also while they grow, and those of other programs (`nexus_source`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(NexusSource):
-    """A scan file of ours: the frames that its writer has counted, with their log, checksums and flags."""
+    """A scan file of this program: the frames that its writer has marked as complete, with their log, checksums and
+    flags.
+    """
 
     def _read_stated(self, found: list[Places]) -> None:
         self._damaged: set[int] = set()
@@ -45,8 +47,9 @@ class OwnScan(NexusSource):
             return None
         if sod <= 0 or beyond < 0:
             raise DataError(
-                f"{self.path}: the source is {sod:g} mm before the sample and the detector {beyond:g} mm behind it; "
-                "expected a positive distance of the source. Correct it in a copy of the file."
+                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector "
+                f"{beyond:g} mm behind it; expected a source distance above 0. Correct it in a copy of "
+                "the file."
             )
         return sod, sod + beyond
 
@@ -66,13 +69,14 @@ class OwnScan(NexusSource):
         return n
 
     def _committed(self) -> int:
-        """The frames that the writer of our file counts; where they are more than before, their pixels are read
-        anew."""
+        """The number of frames that the writer of the file has marked as complete; if it has grown, their pixels are
+        read again.
+        """
         committed = self._file[layout.COMMITTED]
         hdf5.look_again(committed)
         n = int(committed[()])
         if n < 0:
-            raise ValueError(f"{n} frames are committed")
+            raise ValueError(f"{n} frames are marked as complete")
         if n > self.n:  # those that are open here: HDF5 2.0 reads wrong values if another handle refreshes them
             for item in {self._places.data, self._places.image_key, self._places.angle} - {None}:
                 hdf5.look_again(item)
@@ -133,7 +137,7 @@ class OwnScan(NexusSource):
 
 
 def open_nxtomo(path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> NexusSource:
-    """The scan in an open file; arguments as of `NexusSource`."""
+    """The scan in an open file; arguments as for `NexusSource`."""
     file = hdf5.open_hdf5(path, follow)
     with hdf5.closed_on_error(file):
         return (OwnScan if layout.COMMITTED in file else NexusSource)(path, file, own_angles, data)

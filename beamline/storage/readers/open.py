@@ -1,4 +1,4 @@
-"""open_scan: a scan in any format of the registry, recognised by what is in it."""
+"""open_scan: opens a scan in any format of the registry; the format is recognised from the content."""
 
 from __future__ import annotations
 
@@ -85,29 +85,31 @@ class SourceOptions:
             .txrm, the folder of a scene of R²-Gaussian.
         quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
             darks of 0.
-        angles: replace the file's: a file in degrees (a text with one a line, a table with a column named so, .npy), a
-            list in an HDF5 file by its unit, FILE::NAME of one of several, or an array in radians; one angle for each
-            projection, one for each frame where the order of all frames is known, or one for each number of a series
-            of files, from its first to its last.
-        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) are those of the
+        angles: replace the file's. A file in degrees (a text with one per line, a table with a column for angles,
+            .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an array in radians. One
+            angle for each projection; or one for each frame, if the order of all frames is known; or one for each
+            number of a series of files, from its first to its last.
+        angle_rows: "a:b", which rows of these angles (or of the angle file next to a TIFF series) are those of the
             projections.
-        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
-            (FILE::DATASET where it has several).
-        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are; of an NXtomo with several
+        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or a separate HDF5 file
+            (FILE::DATASET if it has several).
+        data_path: in an HDF5 file of any layout: where its projections [frame, row, col] are; in an NXtomo with several
             detectors: where the frames of one are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
-        angles_path: of any HDF5 file: where the angles are, instead of `angles`.
-        angles_unit: "deg" or "rad", of these or of `angles`, instead of what the file says.
+        angles_path: in any HDF5 file: where the angles are, instead of `angles`.
+        angles_unit: "deg" or "rad", of these or of `angles`, instead of the unit that the file states.
         order: of the dimensions of the projections, such as "row,view,col" for a stack of sinograms, or "view,col" for
-            one; of images in files one after the other, too.
-        earlier: files of the same scan, which have ended; their frames come before those of `path`.
-        horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
-        frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds. "0::2": every second view, as `transforms.selected` says.
+            one sinogram; also for a series of image files.
+        earlier: finished files of the same scan; their frames come before those of `path`.
+        horizontal_axis: the rotation axis is parallel to the rows: frames are rotated by 90 degrees.
+        frames: "darks=0:5,flats=5:10": the kind of frames, by their rows; all others are projections. Names of files in
+            a folder are then not used for that. "0::2": every second projection, see `transforms.selected`.
         then: further files of the same scan, whose frames follow.
-        side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
+        side_file: settings file of the scanner's maker: distances, pixel size, angles and white level, see
+            `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
-        frames_per_view: consecutive projections that are averaged to one; None: as many as the plan in the file says.
+        frames_per_view: consecutive projections that are averaged to one; None: the number that the plan in the file
+            states.
     """
 
     path: Path | str
@@ -132,7 +134,7 @@ class SourceOptions:
 
     @property
     def stated(self) -> bool:
-        """Whether the caller says more of the scan than its path: then it is no volume."""
+        """True if the caller states more about the scan than its path: then it cannot be a volume."""
         return any(getattr(self, field.name) is not field.default for field in fields(self)[1:])
 
     def open(self, *, follow: bool = False) -> ScanSource:
@@ -148,9 +150,10 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         follow: the file may still be growing; refresh() then finds new frames.
 
     Raises:
-        DataError: not there, not a format that we read, or not consistent; the message says what was found.
-        ConfigError: columns outside the detector; a number of frames a view that is less than 1.
-        NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
+        DataError: the file does not exist, has no supported format, or is not consistent; the message says what was
+            found.
+        ConfigError: columns outside the detector; a number of frames per projection that is less than 1.
+        NotReadyError (a DataError, `follow` only): the file does not exist yet or is just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
     path = Path(options.path)
@@ -163,7 +166,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(f"{error} Beside it lies {side.path.name}: {side.option} takes it ({side}).") from error
+        raise DataError(f"{error} {side.path.name} lies next to it: {side.option} uses it ({side}).") from error
     except BaseException:
         base.close()
         raise
@@ -211,7 +214,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     )
     if angles is not None:
         of_each = n if views is None else views.step or 1
-        if angles.size * of_each == base.table.views.size:  # one for each view applies to its frames
+        if angles.size * of_each == base.table.views.size:  # one for each projection applies to its frames
             angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
@@ -256,7 +259,7 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
 def _angle_table(
     options: SourceOptions, base: ScanSource, side: SideFile | None
 ) -> tuple[NDArray[np.float64] | None, str]:
-    """The angles that are given or stand beside a TIFF series, and where they come from; None: the scan's own."""
+    """The angles that are given, or that lie next to a TIFF series, and where they come from; None: the scan's own."""
     table = None if options.angles is None else load_angles(options.angles, options.angles_unit)
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
@@ -270,7 +273,7 @@ def _angle_table(
         table = parse_angles(base.angle_text[1], origin)
     if options.angle_rows is not None:
         if table is None:
-            raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
+            raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from; give --angles FILE.")
         table = select_rows(table, options.angle_rows)
     return table, origin
 
@@ -292,8 +295,8 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The type that pixels really have: reals stored as whole numbers, or unsigned counts that wrapped, wide enough for
-    all of them; None: as stored.
+    """The type that pixels really have: real numbers stored as integers, or unsigned counts that overflowed, wide
+    enough for all of them; None: as stored.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]
@@ -328,8 +331,8 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
-            f"folder or .zip of one or more images.{_WAYS.get(path.suffix.lower(), '')}"
+            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr. A scan must be "
+            f"one of these, or a folder or .zip of images.{_WAYS.get(path.suffix.lower(), '')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -338,16 +341,16 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         with opened_reconstruction(path) as record:
             made_by = record.method or "another program"
         raise DataError(
-            f"{path} is a volume, made by {made_by}, not a scan: `beamline view {path}` shows it, and `beamline "
-            "export` writes it in another format."
+            f"{path} is a volume made by {made_by}, not a scan. `beamline view {path}` shows it, and "
+            "`beamline export` writes it in another format."
         )
     raise DataError(
-        f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
-        "--angles-path, --darks-path, --flats-path."
+        f"{path} contains no scan in a known format: {known}. {held} Name the datasets of the scan: "
+        "--data-path, --angles-path, --darks-path, --flats-path."
     )
 
 
-_VOLUME = " It may be a volume: `beamline view` shows those of NIfTI."
+_VOLUME = " It may be a volume: `beamline view` shows NIfTI volumes."
 _WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}
 
 
@@ -366,13 +369,13 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
-            "frames, and more are still to come."
+            "frames, and more frames will arrive."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:
-            raise DataError(f"--{one} and --{other.replace('_', '-')} name the same thing twice: give one of them.")
+            raise DataError(f"--{one} and --{other.replace('_', '-')} state the same thing. Give only one of them.")
     for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
         of_angles = name == "angles_unit" and isinstance(options.angles, Path | str)
         if getattr(options, name) is not None and getattr(options, needed) is None and not of_angles:
             dashed = (f"--{each.replace('_', '-')}" for each in (name, needed))
-            raise DataError("{} goes with {}: give both, or neither.".format(*dashed))
+            raise DataError("{} requires {}: give both, or neither.".format(*dashed))

@@ -1,4 +1,6 @@
-"""Orders of dimensions: which of an array's are frames, rows and columns, by what is stated and by shapes."""
+"""Order of dimensions: which dimensions of an array are frames, rows and columns, from what the file or the user
+states and from the shapes.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ Order = tuple[int | None, int | None, int | None]
 
 
 class TurnedFrames:
-    """An array read as [frame, row, col], whatever the order of its dimensions; any further ones have length one."""
+    """An array read as [frame, row, col], for any order of its dimensions; additional ones have length one."""
 
     def __init__(self, item: Any, order: Order) -> None:
         self.item, self._order = item, order
@@ -56,7 +58,7 @@ class TurnedFrames:
 def order_of_axes(axes: Sequence[str]) -> Order | None:
     """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
 
-    x, u, columns or horizontal; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
+    x, u, columns or horizontal are columns; y, v or rows are rows; any other name (theta, rotation_angle) means frames.
     """
     names = [axis.strip().lower() for axis in axes]
     cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith(("col", "horizontal"))]
@@ -78,8 +80,8 @@ SINOGRAM = (0, None, 1)
 
 
 def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape, length by place. Surplus ones have length one: the last, which cannot be columns,
-    goes first, then the first.
+    """The n dimensions of a shape, length by place. Surplus dimensions must have length one; the last is dropped first
+    if it cannot be columns, then the first.
     """
     sizes = dict(enumerate(shape))
     while len(sizes) > n and 1 in sizes.values():
@@ -102,7 +104,7 @@ def as_frames(item: Any, order: Order = USUAL) -> Any:
 
 
 def _with_axes(new: Mapping[int, int], order: Order) -> Order:
-    """The order with other numbers of the dimensions; those that have none are not there."""
+    """The order with other numbers of the dimensions; dimensions without a number are dropped."""
     frames, rows, cols = (None if axis is None else new.get(axis) for axis in order)
     return frames, rows, cols
 
@@ -111,8 +113,8 @@ def stated_order(names: str) -> Order:
     """The order that a caller states, as in "row,view,col". DataError for another text."""
     if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
-            "a sinogram."
+            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or "
+            "view,col for a sinogram."
         )
     return order
 
@@ -120,10 +122,10 @@ def stated_order(names: str) -> Order:
 def order_by_shapes(
     views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
 ) -> Order:
-    """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
+    """Which dimensions are frames, rows and columns, from the shapes of darks and flats and the number of angles.
 
-    MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
-    views in the middle are sinograms, as ASTRA has them, with columns first.
+    MATLAB's first dimension is the last one here, and in its images rows come before columns. Stacks with the
+    projections in the middle are sinograms, as in ASTRA, with columns first.
     """
     if len(views) != 3:
         lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
@@ -143,29 +145,30 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     """A scan read from images whose dimensions, one image after the other, are those of `order`: "row,view,col".
 
     Args:
-        order: None: the images are views. But where there is one image, or images of one row or column, and another
-            dimension is as long as there are angles, they are a sinogram.
+        order: None: the images are projections, with one exception. They are a sinogram if there is one image, or
+            images of one row or column, and another dimension is as long as the list of angles.
 
     Raises:
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
     """
     sizes, alike = (len(base.table), *base.shape), base.table.are_views.all()
     fits = [axis for axis, n in enumerate(sizes) if n == n_angles]
-    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are views
+    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are projections
     if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or not alike or counted):
         return base
     if order is None and len(fits) > 1:
         raise DataError(
-            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
+            f"Give --order view,col or --order col,view: {base.path} is one image of {n_angles} x "
+            f"{n_angles} pixels. Because there are {n_angles} angles it is a sinogram, but either its "
+            "rows or its columns may be the projections."
         )
     order = order or ("col,view" if max(sizes[: fits[0]]) > 1 else "view,col")
     images = as_frames(_ImageStack(base), places := stated_order(order))
     if not isinstance(images, TurnedFrames) or not alike:
         raise DataError(
             f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
-            "flats with --darks and --flats."
+            f"{base.shape[1]} pixels. It must name each dimension, and all images must show the sample: "
+            "give darks and flats with --darks and --flats."
         )
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Darks and flats from outside the scan file: an array, images, or a file of their own, as httomo and Savu have."""
+"""Darks and flats from outside the scan file: an array, images, or a separate file, as in httomo and Savu."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def stated_references(
 
     Args:
         given: by the caller.
-        white: counts of the open beam by the maker's file.
+        white: counts of the open beam from the maker's file.
 
     Raises:
-        DataError: what is no transmission.
+        DataError: the pixels cannot be transmission.
     """
     darks, flats = given
     nothing = np.zeros((1, *base.shape), base.dtype)
@@ -64,13 +64,14 @@ def stated_references(
         return nothing if darks is None else darks, flats
     if darks is not None or flats is not None:
         raise DataError(
-            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+            "Omit --darks and --flats, because --quantity transmission means that the frames were "
+            "already divided by flats."
         )
     if base.dtype.kind != "f":
         raise DataError(
-            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, such as 65535, or the counts of air beside the sample, give it: --flats 65535 --darks 0, "
-            "without --quantity."
+            f"{base.path} has {base.dtype} pixels, but transmission is a real number from 0 to 1. If an "
+            "integer such as 65535, or the counts of air next to the sample, represents a transmission "
+            "of 1, give it without --quantity: --flats 65535 --darks 0."
         )
     return nothing, np.ones_like(nothing)
 
@@ -80,17 +81,17 @@ _LISTED = 8  # datasets that an error names
 
 
 def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Read reference frames [frame, row, col] into memory.
+    """Read darks or flats [frame, row, col] into memory.
 
-    In an HDF5 file they are the dataset that is named, or the frames of this kind by its image_key, or those of Data
-    Exchange, or the only images of this shape.
+    In an HDF5 file these are the dataset that is named, or the frames of this kind according to its image_key, or those
+    of Data Exchange, or the only images of this shape.
 
     Args:
         kind: DARK or FLAT.
         shape: (rows, cols) of the scan's frames; None: any.
 
     Raises:
-        DataError: they cannot be read, are no images, or several could be meant.
+        DataError: they cannot be read, are not images, or several could be meant.
     """
     if not isinstance(images, Path | str):
         return _stack(np.asarray(images), "The array of reference frames")
@@ -111,7 +112,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return _in_rows(_of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape), shape)
     if dataset:
-        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
+        raise DataError(f"{path} is not an HDF5 file, so it has no dataset {dataset}.")
     return _in_rows(_of_images(path), shape)
 
 
@@ -136,7 +137,7 @@ def _of_images(path: Path) -> NDArray[Any]:
         parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
-        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
+        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape or as HDF5"
         raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
     return _stack(stack, str(path), untyped)
 
@@ -162,8 +163,8 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
     option = f"--{kind.name.lower()}s"
     if candidates:
-        raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
-    raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
+        raise DataError(f"{path} contains several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
+    raise DataError(f"{path} contains no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
 
 
 def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
@@ -181,8 +182,11 @@ def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -
 
 
 def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> NDArray[np.float64] | None:
-    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: it
-    does not say. Numbers beyond n count other frames, too: then the first flat is at the first frame."""
+    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: not
+    stated.
+
+    If numbers exceed n, they also count other frames: then the first flat is assumed at the first frame.
+    """
     if not isinstance(images, Path | str) or not Path(images).is_file() or not hdf5.is_hdf5(Path(images)):
         return None
     with hdf5.open_hdf5(Path(images)) as file, hdf5.readable(Path(images)):
@@ -200,7 +204,7 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
-        raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
+        raise DataError(f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or differs.")
     frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")

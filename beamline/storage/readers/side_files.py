@@ -1,4 +1,4 @@
-"""Files that makers of CT scanners write beside their images: distances, pixel size, angles and white level.
+"""Settings files that CT scanners write next to their images: distances, pixel size, angles and white level.
 
 Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
 the "data settings XRE.txt" of TESCAN (FleXray), by keys that
@@ -35,13 +35,13 @@ class MakerKeys:
 
     Attributes:
         sod, sdd: distances from the source to the axis and to the detector, mm.
-        pixel: width of a pixel in mm, times `unit`; at the sample where `at_sample`.
+        pixel: width of a pixel in mm, times `unit`; at the sample if `at_sample`.
         count: of the projections.
-        step, span: degrees from one to the next, or of all.
-        first, last: degrees of the first one, and of the last.
+        step, span: degrees between two projections, or of all.
+        first, last: degrees of the first projection, and of the last.
         white: counts of the open beam.
         scale: a factor of both distances.
-        helix: keys that say "true" where the source goes round on another path than a circle.
+        helix: keys that are "true" if the source moves on another path than a circle.
     """
 
     maker: str
@@ -131,12 +131,12 @@ class SideFile:
 
 
 def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
-    """A scan with the distances and the pixel size of a vendor's file; DataError where that has another number of
+    """A scan with the distances and the pixel size of a vendor's file; DataError if that has another number of
     projections.
     """
     views = base.table.views.size
     if views != side.count:
-        raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
+        raise DataError(f"{side.path} describes {side.count} projections, but {base.path} has {views}.")
     return Frames(
         base,
         cone=side.cone,
@@ -157,16 +157,18 @@ def read_side_file(path: Path) -> SideFile:
         values = _values(path)
     except (OSError, ValueError, configparser.Error, ElementTree.ParseError, RecursionError) as error:
         why = getattr(error, "strerror", None) or error
-        raise DataError(f"{path} cannot be read as a file of a CT scanner ({why}).") from error
+        raise DataError(f"{path} cannot be read as a settings file of a CT scanner ({why}).") from error
     for keys in MAKERS:
         if keys.suffix == path.suffix.lower() and keys.sod in values:
             return _side_file(path, keys, values)
     known = ", ".join(f"{keys.maker} {keys.suffix}" for keys in MAKERS)
-    raise DataError(f"{path} is not a supported file of a CT scanner ({known}).")
+    raise DataError(f"{path} is not a supported settings file of a CT scanner ({known}).")
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The vendor's file in or beside a folder of images, or a TIFF, if exactly one has as many projections."""
+    """The vendor's file in a folder of images, or next to it or to a TIFF, if exactly one has the same number of
+    projections.
+    """
     if not source.format.startswith("tiff"):
         return None
     views, found = source.table.views.size, []
@@ -178,7 +180,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 
 
 def reconstructed_pixel_mm(log: Path) -> float | None:
-    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None where it states none."""
+    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None if it states none."""
     with suppress(Exception):  # whatever the log of another program holds
         edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
         return edge if 0 < edge < _LARGEST else None
@@ -188,7 +190,7 @@ def reconstructed_pixel_mm(log: Path) -> float | None:
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} uses it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:
@@ -205,7 +207,7 @@ def _values(path: Path) -> dict[str, str]:
     text, values = _text(path), dict[str, str]()
     if path.suffix.lower() == ".xml":
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError("it defines entities")
+            raise ValueError("it defines XML entities, which are not read")
         _of_element(ElementTree.fromstring(text), "", values)
     elif text.lstrip().startswith("{"):
         _of_json(json.loads(text), "", values)
@@ -222,7 +224,7 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str:
-    """The content of a small file; its numbers and keys also where a program of Windows wrote its own characters."""
+    """The content of a small file; numbers and keys are also read if a Windows program wrote its own characters."""
     require_regular(path, SETTINGS)
     return decoded(path.read_bytes(), "replace")
 
@@ -260,7 +262,7 @@ _LARGEST = 1e7  # of these numbers: no scan has as many projections, and no dist
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = _numbers(path, keys, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
-        raise DataError(f"{path} says {other}: only scans on a circle are supported.")
+        raise DataError(f"{path} states {other}: only scans on a circle are supported.")
     sod, sdd, pixel, count = (number[name] or 0.0 for name in _NEEDED)
     if lacking := [getattr(keys, name) for name in _NEEDED if not 0 < (number[name] or 0) < _LARGEST]:
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers below {_LARGEST:g}.")
@@ -272,7 +274,7 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
 
 
 def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
+    """Degrees of each projection: as listed beside the file, or in equal steps; None if nothing is stated."""
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)

@@ -1,4 +1,5 @@
-"""StacksSource: a scan with a stack of projections and others of darks and flats, such as HDF5 under any names.
+"""StacksSource: a scan with one stack of projections and others of darks and flats, such as HDF5 datasets of any
+name.
 
 Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
 projections.
@@ -76,7 +77,8 @@ class StacksSource(ScanSource):
 
     def number_frames(self, sizes: Sequence[int]) -> None:
         """Number the frames of stacks of these sizes, new ones after those known so far; angles and exposures become
-        NaN."""
+        NaN.
+        """
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
         self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
@@ -93,17 +95,18 @@ class StacksSource(ScanSource):
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(
-                    f"{self.path}: expected frames [frame, row, col] of one shape, beside dimensions of length one; "
-                    f"found {shapes}. --order view,row,col says another order of dimensions."
+                    f"{self.path}: expected frames [frame, row, col] of one shape, apart from dimensions "
+                    f"of length one; found {shapes}. --order view,row,col states another order of "
+                    "dimensions."
                 )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
-                    raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
+                    raise DataError(f"{self.path} refers to frames in {lost[0]}, which does not exist or differs.")
         if not len(views.frames):
             none = DataError if self.finished else hdf5.NotReadyError
-            raise none(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
+            raise none(f"{self.path} contains no projections: {views.name} has shape {views.frames.shape}.")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
@@ -137,7 +140,8 @@ def open_stacks(
     Args:
         data: of the projections, None: the only array of images. Their dimensions may follow it, as in
             `/images:view,col,row`, and those of darks and flats are in the same order.
-        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the views.
+        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the
+            projections.
 
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
@@ -159,7 +163,7 @@ def open_stacks(
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
         lists = [item.name for item in arrays_of(file) if item.ndim == 1 and item.size == len(stacks[-1].frames)]
         if lists and angles is None:
-            source.facts = {**facts, "angles": f"--angles-path {lists[0]} takes those of {', '.join(lists[:_LISTED])}"}
+            source.facts = {**facts, "angles": f"--angles-path {lists[0]} uses those of {', '.join(lists[:_LISTED])}"}
         if isinstance(file, ArrayFile) and angles is None:
             _take_angles(source, [file[name] for name in lists if _ANGLES.search(name)])
         _take_geometry(source, views)
@@ -167,7 +171,7 @@ def open_stacks(
 
 
 def _take_angles(source: StacksSource, lists: list[NamedArray]) -> None:
-    """Take the one list that is named so, in the unit that it states, or in which it goes round half a turn or one."""
+    """Use the one list with a name for angles, in the unit that it states, or in which it covers 180 or 360 degrees."""
     if len(lists) != 1:
         return
     item, values, turns = lists[0], np.unique(lists[0][...]), {"rad": 2 * np.pi, "deg": 360.0}
@@ -184,7 +188,8 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
     """Take the geometry that CIL states beside `views`, the dataset of the projections; lengths in mm.
 
     CIL turns the object by its angles counter-clockwise about the axis, which is the beam turned by their negative (its
-    `convert_geometry_to_astra_vec_3D`). Here the view turns by θ in the frame of the detector: columns, beam, rows.
+    `convert_geometry_to_astra_vec_3D`). Here the projection turns by θ in the frame of the detector: columns, beam,
+    rows.
     """
     config = datasets.resolve(views.parent.parent, "config") if isinstance(views, h5py.Dataset) else None
     if not isinstance(config, h5py.Group) or "pixel_size_h" not in views.attrs:
@@ -209,7 +214,7 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
 
 
 def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
-    """Radians of views in the frame of their detector, from those of CIL's object; others as they are.
+    """Radians of projections in the frame of their detector, from those of CIL's object; others as they are.
 
     Args:
         angles: the values of `item` in radians.
@@ -247,8 +252,8 @@ def _only_images(file: ArrayFile) -> str:
     images = [name for name, item in file.items() if item.ndim > 1]
     if len(images) != 1:
         raise DataError(
-            f"{file.filename} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the "
-            "scan: --data-path, --angles-path, --darks-path, --flats-path."
+            f"{file.filename} contains {len(images)} arrays that may be images. {datasets_text(file)} "
+            "Name those of the scan: --data-path, --angles-path, --darks-path, --flats-path."
         )
     return images[0]
 

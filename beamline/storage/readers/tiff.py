@@ -1,4 +1,4 @@
-"""TIFF images: reading them whole, and what all readers of them ask. Images as .npy and PNG are read whole, too."""
+"""Single images: reads a TIFF, .npy or PNG as a whole; helper functions for all readers of images."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ class Complaints(logging.Handler):
 
 
 def is_hidden(name: str) -> bool:
-    """Whether a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
+    """True if a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
     return name.rpartition("/")[2].startswith(".")
 
 
 def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
-    """A TIFF and the pages in it: where it is one of a set, its metadata list the pages of all files."""
+    """A TIFF and the pages in it. If it is one file of a set, its metadata list the pages of all files."""
     if isinstance(file, Path):
         require_regular(file)
     return tifffile.TiffFile(file, is_ome=False, is_mmstack=False, is_ndtiff=False)
@@ -69,8 +69,8 @@ def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
     """Groups of pages of one shape and type, without copies of reduced resolution, masks, and thumbnails.
 
-    Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
-    that it has a header for the first alone.
+    Pages that tifffile wrote are used as pages, whether they were written together or appended, unless the file states
+    that only its first page has a header.
     """
     tif.is_shaped = tif.is_shaped and '"truncated": true' in tif.pages.first.description
     return [part for part in tif.series if not part.keyframe.subfiletype & _NO_IMAGE] or [*tif.series]
@@ -83,7 +83,7 @@ def orientation(tif: tifffile.TiffFile) -> int:
 
 
 def is_untyped(tif: tifffile.TiffFile) -> bool:
-    """Whether a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
+    """True if a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
     tag = images_of(tif)[0].keyframe.tags.get(339)
     return tag is None or int(np.ravel(tag.value)[0]) not in (1, 2, 3)
 
@@ -99,14 +99,16 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     """The images of a TIFF that are not used: copies, and those of other files.
 
     Raises:
-        DataError: its OME metadata say that pages go along several axes, which of them the views are is not known.
+        DataError: its OME metadata state several axes, and it is not known which of them is that of the projections.
     """
-    listed, why = 0, "frames are the images of full resolution in this file"
+    listed, why = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
         sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', pixels) if int(n) > 1}
         listed += math.prod(sizes.values())
         if len(sizes) > 1:
-            raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, along one.")
+            raise DataError(
+                f"{path} contains images along several axes (OME: {sizes}). Save only the projections, along one axis."
+            )
     copies = sum(len(part.levels) for part in tif.series) - len(images_of(tif))
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
@@ -143,7 +145,7 @@ FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read:
 
 
 def images_among(names: Sequence[str]) -> list[str]:
-    """The images among files, of the first kind that there is: other kinds beside it are no frames of the scan."""
+    """The images among files, of the first kind that there is: other kinds next to it are no frames of the scan."""
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])
@@ -153,12 +155,13 @@ def no_image(path: Path, names: Sequence[str]) -> str:
     """A sentence on a folder without images that can be read, or on a picture of a kind that is not read."""
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:
-        return f"{path} holds no image: no .tif, .tiff, .npy or .png file."
+        return f"{path} contains no image: no .tif, .tiff, .npy or .png file."
     return (
-        f"{path}: pictures such as {foreign} are not read: their 8 bits, or what their compression leaves out, spoil "
-        "line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
-        "nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L')"
-        f".save(n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
+        f"Export 16-bit TIFF or PNG from the program that has the frames: in {path}, pictures such as "
+        f"{foreign} are not read, because 8 bits or lossy compression make line integrals wrong. If there "
+        'are no other images, convert them to PNG in the folder: python -c "from PIL import Image; '
+        "import glob; [Image.open(n).convert('L').save(n + '.png') for n in "
+        f"glob.glob('*{foreign[foreign.rfind('.') :]}')]\"."
     )
 
 
@@ -185,7 +188,7 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     first, stored = tif.pages.first, tif.filehandle.size
     claimed = first.nbytes * len(tif.pages)
     if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
-        raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
+        raise ValueError(f"its header states {claimed / 1e9:.3g} GB, but the file has {stored} bytes")
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
@@ -193,8 +196,8 @@ def refuse_packed(tif: tifffile.TiffFile) -> None:
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(
-            f"its pixels are packed, {bits} bits each: pip install imagecodecs, which unpacks them, or write the "
-            "images with 16 bits a pixel"
+            f"its pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks them, "
+            "or write the images with 16 bits per pixel"
         )
 
 
@@ -202,5 +205,6 @@ def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
     """Raise DataError for slices of a volume that this program wrote."""
     if VOLUME in tif.pages.first.description:
         raise DataError(
-            f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
+            f"{path} is a volume that this program wrote, not a scan. Give the scan; `beamline info` "
+            "shows what the volume contains"
         )

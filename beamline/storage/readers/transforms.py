@@ -1,4 +1,6 @@
-"""Scans that are read otherwise than they are stored: some columns, other kinds or types, or the frames of several."""
+"""Scans that are read differently from how they are stored: some columns only, other kinds or pixel types, or the
+frames of several files.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +23,18 @@ UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read 
 
 
 def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
-    """The scan for callers that only describe it: TakesTooLongError where `over` returns True before a read, or a read
-    would take long or much memory. The order of dimensions or the chunks of a file can make any frame cost all of it.
+    """The scan for callers that only describe it: raises TakesTooLongError if `over` returns True before a read, or if
+    a read would need much time or memory.
+
+    The order of dimensions or the chunks of a file can make reading any frame as expensive as reading all.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
         n = frame_indices(frames, len(base.table)).size * len(range(base.shape[0])[rows])
         if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
             raise TakesTooLongError(
-                "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
-                "validate` looks at them."
+                "Not all frames that may show a fault of the scan were checked, because it would take "
+                "too long. `beamline validate` checks them all."
             )
         return read(frames, rows)
 
@@ -67,21 +71,21 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
 
 
 _TURNED = (
-    "Frames are turned by a quarter turn, so that the last column becomes the first row. If the camera was turned the "
-    "other way, the volume is the mirror image of the sample."
+    "The frames are rotated by 90 degrees, so that the last column becomes the first row. If the camera "
+    "was rotated the other way, the volume is the mirror image of the sample."
 )
 
 
 def turned(base: ScanSource) -> ScanSource:
-    """A scan with its frames rotated by a quarter turn: a horizontal rotation axis becomes vertical.
+    """A scan with its frames rotated by 90 degrees: a horizontal rotation axis becomes vertical.
 
-    What was the last column is the first row. Any rows take reading whole frames.
+    The last column becomes the first row. Reading any rows requires reading whole frames.
 
     Raises:
         DataError: a scan with flags, which has a vertical axis.
     """
     if base.table.flags is not None:
-        raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
+        raise DataError(f"Omit --horizontal-axis: {base.path} is a scan with a vertical rotation axis.")
     sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
     return Frames(
         base,
@@ -99,15 +103,15 @@ def turned(base: ScanSource) -> ScanSource:
 
 
 def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
-    """A scan whose kinds of frames are assigned by the caller, or which has only the frames of one energy.
+    """A scan whose kinds of frames the caller states, or which has only the frames of one energy.
 
     Args:
-        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without views
-            all other frames are projections, else invalid. "none=30:38" alone makes these invalid, and others stay.
-            "energy=20" makes frames of other energies invalid, by the file.
+        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without "views"
+            all other frames are projections, with it they are invalid. "none=30:38" alone makes these invalid, and the
+            others keep their kind. "energy=20" makes frames of other energies invalid, according to the file.
 
     Raises:
-        DataError: they are no such text, lie outside the scan, or the file states no such energy.
+        DataError: the text is wrong, rows are outside the scan, or the file states no such energy.
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
@@ -122,7 +126,7 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
 
 
 def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
-    """The kinds and the views that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
+    """The kinds and the projections that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
     words = [] if frames is None else frames.split(",")
     matches = [_VIEWS.fullmatch(word) for word in words]
     taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]
@@ -132,18 +136,20 @@ def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
 
 
 def selected(base: ScanSource, views: slice) -> ScanSource:
-    """Some views of a scan, counted from 0 without darks and flats; the others are invalid frames.
+    """Some projections of a scan, counted from 0 without darks and flats; the others are invalid frames.
 
-    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the views were, so that
-    those of the same turn are selected, counted from 0, too. Else all of them are.
+    If the number of darks (flats) is a multiple of the step, they were taken in turn like the projections, so those of
+    the same turn are selected, also counted from 0. Otherwise all of them are used.
 
     Raises:
-        DataError: no view is left.
+        DataError: no projection is left.
     """
     table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
     if first >= end:
-        raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
+        raise DataError(
+            f"--frames selects no projection: {base.path} has {n} of them, counted from 0 without darks and flats."
+        )
     for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
         rows = table.of_kind(kind)
         in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
@@ -152,12 +158,12 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
 
 
 def only_left_out(kinds: str | None) -> bool:
-    """Whether the caller says of no frame which kind it has, but of some that they are left out."""
+    """True if the caller states no kinds of frames, only that some are left out."""
     return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
 
 
 def _stated_keys(kinds: str, known: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The kind of each frame by what the caller says, or by what is known where he says only which are left out."""
+    """The kind of each frame from the caller, or the known kinds if the caller only leaves frames out."""
     stated, named = np.full(known.size, -1), _ranges(kinds, known.size)
     for kind, first, end in named:
         if (stated[first:end] >= 0).any():
@@ -172,10 +178,10 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
     try:
         kev = float(word.removeprefix(_ENERGY))
     except ValueError:
-        raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
+        raise DataError(f"--frames {word}: expected a number in keV, such as energy=20.") from None
     known = source.table.energies
     if known is None:
-        raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
+        raise DataError(f"Omit --frames {word}: {source.path} does not state the energy of each frame.")
     others = np.abs(known - kev) > _SAME_ENERGY * kev
     if not (np.isfinite(known) & ~others).any():
         raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
@@ -214,9 +220,10 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
             first, end = (int(match[1] or 0), int(match[2] or n)) if match else (0, 0)
             if name not in _KINDS or not first < end <= n:
                 raise DataError(
-                    f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
-                    "such as darks=0:5,flats=5:10+95:100, none=30:38+61:62 for frames that are left out, counted from "
-                    "0 in the order of the scan (`beamline info` shows it), or 0::2 for every second view."
+                    f"--frames {kinds}: {word.strip()!r} is not one of {', '.join(_KINDS)} with frames of "
+                    f"0:{n}. Expected, for example, darks=0:5,flats=5:10+95:100, none=30:38+61:62 for "
+                    "frames to leave out (counted from 0 in the order of the scan, which `beamline info` "
+                    "shows), or 0::2 for every second projection."
                 )
             ranges.append((_KINDS[name], first, end))
     return ranges
@@ -226,8 +233,8 @@ def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
     """A scan whose pixels are read as their true type: unsigned counts that were stored as signed ones, or reals that
     were stored as whole numbers.
     """
-    wrapped = f"int{8 * dtype.itemsize} that wrapped"
-    what = "real numbers by their bits, as no SampleFormat in the TIFF says" if dtype.kind == "f" else wrapped
+    wrapped = f"int{8 * dtype.itemsize} that overflowed"
+    what = "real numbers, judging by their bits, because the TIFF has no SampleFormat" if dtype.kind == "f" else wrapped
     fact = f"{what}, read as {dtype}"
     return Frames(
         base,
@@ -245,10 +252,10 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The real type of whole numbers [..., col] that are the bits of real ones; None where they are whole.
+    """The real type of integers [..., col] that are the bits of real numbers; None if they are integers.
 
-    Real numbers of one quantity lie close together by their bits. Whole numbers would do so only if nearly all of them
-    lay within four per cent of the range of their type, around a quarter or three quarters of it.
+    Real numbers of one quantity are close together in their bits. Integers would be so only if nearly all of them were
+    within four per cent of the range of their type, around a quarter or three quarters of it.
     """
     size = images.dtype.itemsize
     if images.dtype.kind != "u" or size < 4 or images.shape[-1] < 2:
@@ -271,10 +278,10 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
     signed.
 
-    Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
-    without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
-    noise around 0, or marks pixels without data by one value, has not wrapped. Four bytes may hold those of two, where
-    a file has views as int16 beside flats as uint16.
+    Images are smooth: where counts pass the end of the signed type, neighbours differ by its whole range, but not if
+    they are read without a sign. Counts that are all beyond the end are negative, which light cannot be. Values that
+    are negative because of noise around 0, or that mark pixels without data by one value, have not overflowed. Four
+    bytes may contain values of two, if a file has projections as int16 next to flats as uint16.
     """
     if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
         return None
@@ -297,12 +304,12 @@ _SMOOTH = 3.0  # times the least change beside an edge: the step across the end,
 
 
 def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> int:
-    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
+    """Number of edges in counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
 
-    Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
-    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
-    is near the top on both sides, something opaque has such an edge, unless the step across the end is as those beside
-    it.
+    Two pixels on either side must be in their half of the range, which is not so for a hot pixel or a zinger. If nearly
+    all at the top have one value, the light was cut off (saturation). 0 if fewer than one in ten rows has such an edge.
+    If a `flat` [..., col] is near the top on both sides, something opaque makes such an edge, unless the step across
+    the end is as smooth as its surroundings.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0
@@ -338,8 +345,8 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
     for source in earlier:
         if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
             raise DataError(
-                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, {last.path} "
-                f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
+                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, but {last.path} "
+                f"has {last.quantity} of {last.dtype} {last.shape}: they are not parts of one scan."
             )
     in_order = all(source.in_order for source in (*earlier, last))
     if path is None:

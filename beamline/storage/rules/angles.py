@@ -1,4 +1,4 @@
-"""Stated angles: every view has one, they are degrees, and together they go round half a turn."""
+"""Rules on stated angles: every projection has one, they are in degrees, and together they cover 180 degrees."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from recon.base.units import gone_round, look_like_degrees
 from recon.voxels.view_weights import angular_weights
 
 FARTHEST = 1e6  # degrees
-_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
-_UNWEIGHED = 9.0  # degrees that no view's weight covers: FBP loses a twentieth of the density
-_SAME = 0.1  # of the mean step: views so close are one
-_EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the detector to a direction
-_FALSE_ALARM = 1e-3  # of scans whose views are at random
+_GAP = 0.5  # degrees without a projection beyond the others, of projections in even steps
+_UNWEIGHED = 9.0  # degrees that no projection's weight covers: FBP loses a twentieth of the density
+_SAME = 0.1  # of the mean step: projections so close are one
+_EQUAL, _FEW = 1e-3, 4  # degrees between projections of one direction; columns of the detector to a direction
+_FALSE_ALARM = 1e-3  # of scans whose projections are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
-_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_COUNTED = " The values are 0, 1, 2 and so on: are they frame numbers?"
 _LISTED = 20  # groups of frames in a sentence
-_MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
+_MANY = 30  # projections: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
@@ -31,14 +31,14 @@ def angles_unknown(scan: ScanEvidence) -> str:
     runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
     listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
     return "" if not unknown.size else (
-        f"No angle for {unknown.size} of {views.size} projections (first: frame {unknown[0]}){why}. Give them with "
-        "--angles FILE (degrees, one a line)"
-        f"{f', or leave these views out: --frames none={listed}' * (unknown.size < views.size)}."
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give "
+            "the angles with --angles FILE (degrees, one per "
+            f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
     )  # fmt: skip
 
 
 def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
-    """The projections have different directions, over half a turn, and their angles may be in degrees."""
+    """The projections have different directions, over 180 degrees, and their angles may be in degrees."""
     angles = scan.table.angles[scan.table.views]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -47,59 +47,62 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "error",
             "angle-spread",
-            f"The projections are at up to {farthest:.3g} degrees; expected at most {FARTHEST:g}, beyond which "
-            "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
+            f"The angles of the projections reach {farthest:.3g} degrees; expected at most {FARTHEST:g}, "
+            "because larger ones are not exact. Is their unit right? Give them with --angles FILE "
+            "(degrees, one per line).",
         )
         return
     degrees = np.asarray(np.degrees(angles), np.float64)
     span = float(np.ptp(degrees))
     distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:
-        yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
+        yield Finding(
+            "error", "angle-spread", f"All {angles.size} projections have the same angle, {distinct[0]:g} degrees."
+        )
         return
     step = span / (distinct.size - 1)
     if (text := _no_degrees(angles, distinct)) is not None:
-        # A plan is of our own scans, whose angles are in degrees.
+        # A plan is of this program's own scans, whose angles are in degrees.
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
-        span_text = (
-            f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
-        )
+        span_text = f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
+            f"The projections {span_text} (limited angle): in {unseen:.4g} of 180 degrees there is no "
+            "projection." + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
     elif scan.cone is None and (n := directions(angles)) <= min((distinct.size + 1) / 2, scan.source.shape[1] / _FEW):
         yield Finding(
             "warning",
             "angle-spread",
-            f"Views half a turn apart see the same rays: in steps of {step:.4g} degrees, {distinct.size} views see "
-            f"{n} directions only, few for {scan.source.shape[1]} columns. FBP leaves streaks there: compare with "
-            "--method fista-tv. A step that does not divide 180 degrees sees more directions.",
+            f"Compare with --method fista-tv, because FBP leaves streaks: the {distinct.size} projections "
+            f"show only {n} directions, which is few for {scan.source.shape[1]} columns. With steps of "
+            f"{step:.4g} degrees many projections are 180 degrees apart, and these measure the same rays. "
+            "Next time, use a step that does not divide 180 degrees.",
         )
 
 
 def directions(angles: NDArray[np.float64]) -> int:
-    """The directions of rays that parallel views [view], in rad, see: half a turn later they are the same."""
+    """The directions of rays that parallel projections [view], in rad, see: 180 degrees later they are the same."""
     half = np.mod(np.degrees(angles), 180.0)
     return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Degrees of half a turn without a view, beyond the spacing of the views [view] in rad: the largest gap, or all.
+    """Degrees of 180 degrees without a projection, beyond the spacing of the projections [view] in rad: the largest
+    gap, or all.
 
-    All gaps count in which `angular_weights` take views for missing, if these are a twentieth of half a turn.
+    All gaps count in which `angular_weights` take projections for missing, if these are a twentieth of 180 degrees.
 
-    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
-    distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such views in a thousand,
-    and one of ten views in a hundred, exceed what is allowed for. Views in even steps have gaps alike, and half a
-    degree more is named.
+    Projections 180 degrees apart see the same rays. Of projections at random, the largest gap exceeds the next by an
+    exponentially distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such
+    projections in a thousand, and one of ten projections in a hundred, exceed what is allowed for. Projections in even
+    steps have gaps alike, and half a degree more is named.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)
-    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # projections side by side are one
     if gaps.size < 2:
         return 180.0
     *others, second, largest = np.sort(gaps)
@@ -108,13 +111,13 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
     limit = second + max(_GAP, times * uneven)
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
-        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the projections: one that was lost is no wedge
     unweighed = 180.0 - float(np.degrees(angular_weights(angles).sum()))
     return max(float(largest) if largest > limit else 0.0, unweighed if unweighed > _UNWEIGHED else 0.0)
 
 
 def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
-    """What shows that angles [view], in rad as they were read, were not in degrees; None where they may have been.
+    """What shows that angles [view], in rad as they were read, were not in degrees; None if they may have been.
 
     Args:
         distinct: the same in degrees, each once and ascending.
@@ -122,26 +125,27 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
         return (
-            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: "
-            "these look like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a "
-            "line)."
+            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} "
+            "in radians. These look like degrees that are labelled as radians. If so, give them with "
+            "--angles FILE (degrees, one per line)."
         )
     if between >= 360:
         return (
-            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees, {between:.4g} from one to "
-            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
-            "degrees with --angles FILE (one a line); if they are right, give them less whole turns."
+            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees in steps of "
+            f"{between:.4g}, a whole turn or more. These look like counts of an encoder or of motor "
+            "steps. Give the angles in degrees with --angles FILE (one per line). If they are right, "
+            "subtract whole turns."
         )
     if (unit := _smaller_unit(distinct, angles.size)) is not None:
         return (
-            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give them in degrees with "
-            "--angles FILE (one a line), or say --angles-unit rad with it."
+            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give the angles "
+            "in degrees with --angles FILE (one per line), or add --angles-unit rad."
         )
     return None
 
 
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
-    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
+    """What n angles under a label of degrees, distinct and ascending, are instead; None if they may be degrees."""
     if part := gone_round(degrees, 2 * np.pi):
-        return f"these look like radians: {'half a turn' if part < 4 else 'a turn'} is {part:.5g}."
+        return f"these look like radians: {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
     return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

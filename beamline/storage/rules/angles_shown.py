@@ -1,4 +1,6 @@
-"""Angles that views show: views that see the same rays by the stated angles look the same, and no others do."""
+"""Rules that compare angles with images: projections of the same rays, by their stated angles, look the same, and no
+others do.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,19 @@ from recon.base.views import spread
 from recon.prep.align import mirror_mismatch
 from recon.prep.unmeasured import DARK
 
-_LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
-OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
+_LEAST_SEEN = 8  # projections, and columns: fewer do not show a turn
+OTHER = 0.08  # of 180 degrees, and two steps: nearer ones are alike where the projection that is sought was spoilt
 _FACTORS = 2.0, 0.5  # of degrees in what is stated: twice or half the turn, by a gear or its pulses
-PAIRS = 6  # of views that are stated half a turn apart, which are compared
+PAIRS = 6  # of projections that are stated 180 degrees apart, which are compared
 UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
-_FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
-_AROUND = 9  # views about the best of some that are looked at
+_FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a projection
+_AROUND = 9  # projections about the best of some that are looked at
 _LEAST_LIGHT = 1e-3  # of the beam
-_FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
-_SINGLE = 0.1  # of the views: so few wrong angles are named one by one
+_FAR, _NEXT = 4.0, 1.5  # steps from which two projections are stated to be apart, and up to which side by side
+_SINGLE = 0.1  # of the projections: so few wrong angles are named one by one
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
-_MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
+# of some projections: as many look like others that are far from them, if the frames were in another order
+_MOST = 0.75
 _STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
 _EQUAL = 1e-6  # 1 minus the correlation of equal frames, which rounding makes a little more or less than 0
 ORDER = "angle-order"
@@ -36,10 +39,10 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class CoarseViews:
-    """Coarse line integrals of views of a scan, each read once.
+    """Coarse line integrals of projections of a scan, each read once.
 
     Attributes:
-        rows: views that have an angle and can be read, in the order of the file.
+        rows: projections that have an angle and can be read, in the order of the file.
         degrees: float64 [frame], as stated.
     """
 
@@ -49,8 +52,8 @@ class CoarseViews:
     _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """Line integrals [row, col] of a view, each row less its mean, smoothed along its rows, so that it has two
-        columns less."""
+        """Line integrals [row, col] of a projection, each row less its mean, smoothed along its rows, so that it has
+        two columns less."""
         if row not in self._depths:
             lines = self._lines(row)
             lines = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
@@ -78,18 +81,18 @@ class CoarseViews:
         return brightness(cells, dark, flat) > LEAST * self.scan.brightest
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether views have light and show a sample [view]."""
+        """Whether projections have light and show a sample [view]."""
         return np.array([self._is_lit(row) for row in rows.tolist()], np.bool_)
 
     def lit_pairs(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
-        """A few pairs of views, evenly spread, both with light."""
+        """A few pairs of projections, evenly spread, both with light."""
         some = spread(np.arange(first.size), PAIRS)
         some = some[self.lit(first[some]) & self.lit(second[some])]
         return list(zip(first[some].tolist(), second[some].tolist(), strict=True))
 
     def unlike(self, pair: Pair, mirrored: bool = False) -> float:
-        """1 minus the correlation of two views; of mirror images about the column of best agreement, which is sought
-        in the middle half, and in the whole field where it lies at the edge of that."""
+        """1 minus the correlation of two projections; of mirror images about the column of best agreement, which is
+        sought in the middle half, and in the whole field where it lies at the edge of that."""
         one, other = self.depth(pair[0]), self.depth(pair[1])
         if not mirrored:
             power = float(np.linalg.norm(one) * np.linalg.norm(other))
@@ -106,7 +109,7 @@ class CoarseViews:
         return float(curve.min())
 
     def all_unlike(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """`unlike` of every two of these views [view, view]."""
+        """`unlike` of every two of these projections [view, view]."""
         depths = np.stack([self.depth(row).ravel() for row in rows.tolist()])
         norms = np.array([np.linalg.norm(depth) for depth in depths])
         products = np.stack([(depth * depths).sum(axis=1) for depth in depths])
@@ -119,7 +122,7 @@ class CoarseViews:
 
 
 def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
-    """The coarse views of a scan, if it has enough views, and their line integrals are known."""
+    """The coarse projections of a scan, if it has enough projections, and their line integrals are known."""
     views = scan.table.views_with_angles
     if scan.source.quantity == "unknown" or scan.table.shifts is not None:
         return None
@@ -132,7 +135,7 @@ def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
 
 
 def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
-    """Views show the turns, and the order of angles, that the file states."""
+    """Projections show the turns, and the order of angles, that the file states."""
     if (seen := coarse_views(scan)) is not None:
         yield from angles_stand(seen)
         yield from angles_seen(seen)
@@ -156,20 +159,23 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
     )
     if across > _TURNED * beside:
         n = int(np.median(lengths[lengths >= _STANDS]))
-        first_of_each = f" Or --frames 0::{n} takes the first view of each angle." if (lengths[:-1] == n).all() else ""
+        first_of_each = (
+            f" Or use the first projection of each angle: --frames 0::{n}." if (lengths[:-1] == n).all() else ""
+        )
         yield Finding(
             "warning",
             "angle-spread",
-            f"Angles stand for {n} frames each, which differ (frames {first[0]} and {last[0]}, both stated at "
-            f"{seen.degrees[first[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were "
-            f"read back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} "
-            f"views by --angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly."
-            f"{first_of_each}",
+            f"Each angle is stated for {n} frames, but these differ: frames {first[0]} and {last[0]}, "
+            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as "
+            "much as neighbours do. The angles were read back more slowly than frames were taken, while "
+            f"the stage rotated. Give the angle of each of the {degrees.size} projections with --angles "
+            f"FILE (degrees, one per line), from {degrees[0]:.6g} in even steps if the stage rotated "
+            f"evenly.{first_of_each}",
         )
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
-    """Parallel views half a turn apart by their angles are mirror images, and no others are.
+    """Parallel projections 180 degrees apart by their angles are mirror images, and no others are.
 
     Their rays see the same from both sides, whatever the sample is, also one that is wider than the field. How much
     neighbours differ tells what a turn does to this sample, and what noise does: a round sample shows no angle.
@@ -197,13 +203,13 @@ def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _nearest(seen: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The view that is stated nearest to each of these angles."""
+    """The projection that is stated nearest to each of these angles."""
     return views[np.abs(seen.degrees[views] - degrees[:, None]).argmin(axis=1)]
 
 
 @dataclass(frozen=True)
 class _Turn:
-    """Two frames that look half a turn apart, and two that are stated to be; None: none are."""
+    """Two frames that look 180 degrees apart, and two that are stated to be; None: none are."""
 
     alike: Pair
     degrees: float
@@ -211,7 +217,7 @@ class _Turn:
 
 
 def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float) -> _Turn | None:
-    """Views that repeat after another angle than they should, where those that should do not.
+    """Projections that repeat after another angle than they should, where those that should do not.
 
     Args:
         views, some: all, and some of them, by ascending angle.
@@ -223,7 +229,7 @@ def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int
     within = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
     pairs = np.abs(degrees[partner] - degrees[some] - 180) <= within
     stated = seen.lit_pairs(some[pairs], partner[pairs])
-    # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
+    # The most alike of them: a loose particle makes one pair unlike, wrong angles make all.
     off = min((seen.unlike(pair, mirrored=True) for pair in stated), default=np.inf)
     if off < 2 * UNLIKE * near:
         return None
@@ -245,31 +251,31 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
-        unit = "they are 0, 1, 2 and so on, and count the views"
+        unit = "they are 0, 1, 2 and so on, so they are frame numbers"
     else:
         unit = f"they look {180 / turn.degrees:.3g} times as large as stated"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as views half a turn "
-        f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart "
+        f"are, but they are stated {turn.degrees:.4g} degrees apart"
     )
     if turn.stated is not None:
-        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not"
-    # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
-    # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
+        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not mirror images"
+    # A plan is of this program's own scans, whose angles are in degrees. Without projections stated 180 degrees apart,
+    # a symmetric sample may look so, too. Mistakes are by one of these factors, while a sample that moves may show any.
     sure = not scan.source.plan and turn.stated is not None and (counted or bool(known))
     which = "The" if sure else "Unless the sample moved or is symmetric, the"
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
-        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one per line).",
     )
 
 
 def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames look similar only if their angles are close, and close angles look similar.
 
-    A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
-    it where the list is shifted, so the places are looked at where angles jump.
+    A list in another order than the frames shows so, and a single angle that is wrong. Only one projection of many
+    tells of it where the list is shifted, so the places are looked at where angles jump.
     """
     rows, degrees = seen.rows, seen.degrees[seen.rows] % 360
     order = np.argsort(degrees, kind="stable")
@@ -288,7 +294,7 @@ def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
 
 
 def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
-    """Most views look more like one that is far from them than like their neighbours; rows by ascending angle.
+    """Most projections look more like one that is far from them than like their neighbours; rows by ascending angle.
 
     Of two measured scans (the tooth, Diamond) as if taken in 2, 3, 4 and 6 passes, 5 of 8 show it, those of two passes
     never; as they were taken, none.
@@ -314,9 +320,10 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
     return Finding(
         "warning",
         ORDER,
-        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more alike than neighbours, as {odd.sum()} "
-        f"of {some.size} views looked at do. Unless the sample is symmetric, the angles are not in the order of the "
-        "frames, or the sample went round more often than they state.",
+        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours "
+        f"do, and so do {odd.sum()} of {some.size} projections that were compared. Unless the sample is "
+        "symmetric, the angles are not in the order of the frames, or the sample rotated further than "
+        "they state.",
     )
 
 
@@ -326,12 +333,12 @@ def _stated(seen: CoarseViews, pair: Pair) -> str:
 
 
 def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
-    text = f"{_stated(seen, far)} look alike, and f{_stated(seen, near)[1:]} do not. "
+    text = f"{_stated(seen, far)} look similar, but f{_stated(seen, near)[1:]} do not. "
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
         wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
-        text += f"The angles of {single.size} views are not between those of their neighbours: frames {wrong}. "
-        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one a line).")
+        text += f"The angles of {single.size} projections are not between those of their neighbours: frames {wrong}. "
+        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one per line).")
     text += (
         "The angles are not in the order of the frames. Give one for each projection, in their order, with "
         "--angles FILE."

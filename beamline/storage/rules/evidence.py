@@ -1,4 +1,6 @@
-"""Evidence of a scan: what its references and some views show, computed once a job from frames read once, handed on."""
+"""Evidence of a scan: facts from its darks, flats and some projections, computed once per job from frames read once,
+and passed on.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,16 @@ from recon.base.views import spread
 from recon.prep.references import dark_at
 from recon.prep.unmeasured import with_borders_filled
 
-VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-CELLS_ACROSS = 32  # flats are compared with views by means of pixels: the frame is about so many wide
-WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
+# projections that flats must not look like: so many of all, and so many on either side of each group
+VIEWS, BESIDE = 32, 2
+CELLS_ACROSS = 32  # flats are compared with projections by means of pixels: the frame is about so many wide
+WORST = 99.0  # percentile of the places of a projection that counts, so that zingers do not
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
-LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
-_SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
-_ACROSS = 32  # pixels a side, about, by which a view is suspected
+# share of the light of the brightest projections, in a projection's own bright part: all material leaves that much
+# open
+LEAST = 0.01
+_SUSPECT = 0.1  # share of the flats' light from which a projection is not looked at more closely
+_ACROSS = 32  # pixels a side, about, by which a projection is suspected
 _TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
 
 
@@ -59,9 +64,9 @@ class EvidenceRequest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanEvidence:
-    """What the references and some views of a scan show, beside what its file states.
+    """What the references and some projections of a scan show, beside what its file states.
 
-    It is taken once a job and handed on; of a running scan, `renewed` goes on with the frames recorded by then. What is
+    It is taken once a job and handed on; of a running scan, `renewed` continues the frames recorded by then. What is
     asked for is computed once, and each frame that it needs is read once.
 
     Attributes:
@@ -113,13 +118,13 @@ class ScanEvidence:
 
     @property
     def used(self) -> ReferenceGroups:
-        """The references that correct the views."""
+        """The references that correct the projections."""
         return self.taken if self.asked.accepted else self.good
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on references, flats beside those and the views of their part; errors where none of a kind is good.
-        There are none where pixels are not counts."""
+        """Findings on references, flats beside those and the projections of their part; errors where none of a kind is
+        good. There are none where pixels are not counts."""
         if not self.in_counts:
             return ()
         darks, found = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
@@ -137,7 +142,7 @@ class ScanEvidence:
         )
 
     def _views_beside(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
-        """Views of the whole part, and next to its flats."""
+        """Projections of the whole part, and next to its flats."""
         chosen = set(spread(views, VIEWS).tolist())
         for group in flats:
             at = int(np.searchsorted(views, group[0]))
@@ -202,7 +207,7 @@ class ScanEvidence:
 
     @cached_property
     def views_differ(self) -> bool:
-        """Whether the exposures of the projections differ, and that of each is known."""
+        """True if the exposures of the projections differ, and that of each is known."""
         views = self.table.exposures[self.table.views]
         return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
@@ -221,10 +226,10 @@ class ScanEvidence:
 
     @cached_property
     def exposures(self) -> F64:
-        """Exposure of each frame in s, NaN where unknown.
+        """Exposure of each frame in s, NaN if unknown.
 
-        Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the
-        first for which no place of the views is brighter than the flats.
+        Of flats that state none beside views that differ: the longest, the median or the shortest of the projections',
+        the first for which no place of the projections is brighter than the flats.
         """
         table, exposures = self.table, self.table.exposures
         flats, darks, views = table.flats[~(exposures[table.flats] > 0)], table.darks, table.views
@@ -241,11 +246,11 @@ class ScanEvidence:
                 return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
         return exposures
 
-    # Light of whole views; not of single bands of rows, where a sample may be opaque
+    # Light of whole projections; not of single bands of rows, where a sample may be opaque
 
     @cached_property
     def beam(self) -> tuple[F32, F32] | None:
-        """Cells [cell row, cell col] of the mean dark and flat that are used; None where nothing is divided by them."""
+        """Cells [cell row, cell col] of the mean dark and flat that are used; None if nothing is divided by them."""
         if not (self.in_counts and all(self.used)):
             return None
         dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used)
@@ -253,14 +258,15 @@ class ScanEvidence:
 
     @cached_property
     def brightest(self) -> float:
-        """Brightness of the brightest of some views relative to the flats, see `brightness`; 1 where there is none."""
+        """Brightness of the brightest of some projections relative to the flats, see `brightness`; 1 where there is
+        none."""
         if self.beam is None:
             return 1.0
         seen = [brightness(cells, *self.beam) for cells in self.cells(spread(self.table.views, VIEWS))]
         return float(np.percentile(seen, BRIGHT)) if seen else 1.0
 
     def suspect(self, data: NDArray[np.generic], beam: tuple[F32, F32] | None) -> NDArray[np.bool_]:
-        """bool [view]: views that are dark or uniform in the pixels read, which may be a band of rows.
+        """bool [view]: projections that are dark or uniform in the pixels read, which may be a band of rows.
 
         Args:
             data: [view, row, col], as read.
@@ -276,14 +282,14 @@ class ScanEvidence:
         return uniform | ~(np.array(shares) >= least)
 
     def unlit(self, row: int) -> bool:
-        """Whether a whole view is dark, or uniform while the flats are not; it is looked at once."""
+        """True if a whole projection is dark, or uniform while the flats are not; it is looked at once."""
         if row not in self._lit:
             self._lit[row] = not self._unlit(row)
         return not self._lit[row]
 
     @property
     def known_unlit(self) -> list[int]:
-        """The views of those looked at that have no light."""
+        """The projections of those looked at that have no light."""
         return [row for row, lit in self._lit.items() if not lit]
 
     def _unlit(self, row: int) -> bool:
@@ -318,7 +324,7 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:
-    """Brightness of a view's bright part relative to the flats, corrected for the bias by noise; from images of
+    """Brightness of a projection's bright part relative to the flats, corrected for the bias by noise; from images of
     cells."""
     light = flat - dark
     lit = lit_places(light)

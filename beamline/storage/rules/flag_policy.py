@@ -1,4 +1,6 @@
-"""FlagPolicy: how a reconstruction uses views by their flags, in the words of every command; and flags as a finding."""
+"""FlagPolicy: which projections a reconstruction drops or gives less weight because of monitor flags, and the
+messages about it.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,18 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 
 FLAGS = "flags"
-LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
+LARGEST = 0.5  # of the projection: a flag with a larger region, or none, is of the whole projection
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
 
 @dataclass(frozen=True, eq=False)
 class FlagPolicy:
-    """How the flagged views of a scan are treated.
+    """How the flagged projections of a scan are treated.
 
     Attributes:
         flags: of all frames, those that count.
-        views, left_out, halved, masked: bool [frame of the file]: the views. Of these, those with an alarm, which are
-            left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
+        views, left_out, halved, masked: bool [frame of the file]: the projections. Of these, those with an alarm, which
+            are left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
         parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
     """
@@ -45,28 +47,28 @@ class FlagPolicy:
 
     @property
     def in_words(self) -> str:
-        """One sentence; empty where no view is flagged."""
+        """One sentence; empty if no projection is flagged."""
         parts = []
         for some, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
-            (self.halved, (("has a warning and weighs", "have a warning and weigh"), "half")),
-            (self.masked, (("is", "are"), "flagged in a part, where rays weigh half, with an alarm nothing")),
+            (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
+            (self.masked, (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: none)")),
         ):
             if n := int(some.sum()):
                 parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")
-        return f"Of {self.views.sum()} views {', '.join(parts)}." if parts else ""
+        return f"Of {self.views.sum()} projections, {', '.join(parts)}." if parts else ""
 
 
 def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagPolicy:
-    """How `beamline recon` treats these views, whose frames have this shape, unless it ignores flags.
+    """How `beamline recon` treats these projections, whose frames have this shape, unless it ignores flags.
 
-    A view in which the sample jumped is as good as those after it. Flags of views from opposite sides for the same jump
-    then do not count.
+    A projection in which the sample jumped is as good as those after it. Flags of projections from opposite sides for
+    the same jump then do not count.
     """
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
     flags = flags.without(MotionCheck.bit)
-    if jumped.size:  # what views from the other side show of the jump goes with the views beyond it
+    if jumped.size:  # what projections from the other side show of the jump goes with the projections beyond it
         flags = flags.without(OppositeCheck.bit)
     boxes = [
         (frame, box, bool(flags.bits[frame] >> entry.alarm_bit & 1))
@@ -83,10 +85,10 @@ def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagP
 def boxes_of(
     flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
 ) -> Iterator[tuple[int, PixelBox | None]]:
-    """Frames that a check flagged, each with its region and a margin; None for (nearly) the whole view.
+    """Frames that a check flagged, each with its region and a margin; None for (nearly) the whole projection.
 
-    A view that a check marked when it had seen later ones has no region in the file. It takes the region to which these
-    lead on a straight line.
+    A projection that a check marked when it had seen later ones has no region in the file. It takes the region to which
+    these lead on a straight line.
     """
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)
     for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
@@ -127,21 +129,23 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
-        message += f" Taken again: {count(again.size, 'view')}; the first ({frames_text(again)}) not used."
+        message += (
+            f" Taken again: {count(again.size, 'projection')}; the first attempts ({frames_text(again)}) are not used."
+        )
         rows = np.setdiff1d(rows, again)
         if not rows.size:
             yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
-        message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
+        message += f" Other frames with an alarm: {spans(rows.tolist())}."
     treated = flag_policy(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (
-            f" {n - lost} of {n} views are left, {FEWEST_VIEWS} are needed: repeat the scan. "
-            "`beamline recon --flags ignore` takes all views, flagged ones too."
+            f" Repeat the scan: only {n - lost} of {n} projections have no alarm, and {FEWEST_VIEWS} are "
+            "needed. `beamline recon --flags ignore` uses all projections, also flagged ones."
         )
         yield Finding("error", FLAGS, message)
         return
     if treated.in_words:
-        message += f" A reconstruction (--flags use): {treated.in_words}"
+        message += f" In a reconstruction (--flags use): {treated.in_words}"
     yield Finding("warning", FLAGS, message)

@@ -1,4 +1,6 @@
-"""Light: good references, of one light with the views, each of one scale; what else explains their counts."""
+"""Rules on intensity: flats and darks must be usable and match the projections; otherwise, what else may explain
+their counts.
+"""
 
 from __future__ import annotations
 
@@ -21,19 +23,19 @@ from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
-AT_THE_ENDS = 1e-3  # share of a view's pixels that its least and its largest number may have, where it was scaled
+AT_THE_ENDS = 1e-3  # share of a projection's pixels that its least and its largest number may have, where it was scaled
 ALIKE = 6  # pixels, at most, that had one count by chance before they were scaled
 SPREAD = 16  # grey values between them, at least, where they are whole numbers
-WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its views, others 0.02
+WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its projections, others 0.02
 REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
-BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
-NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of views
+BRIGHTER = 0.2  # line integral by which a ring that is filled again makes projections brighter than their flats
+NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of projections
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
 BELOW, OF_VIEWS = (
     0.005,
     0.25,
-)  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
+)  # shares of the lit places and of the projections that lie below the darks: no spots, no lost rows
 MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
 """Limits, each with its reason."""
 
@@ -51,8 +53,8 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
                 message = f"--references accept: {message}"
             elif finding.severity == "error":
                 message += (
-                    f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
-                    "--references accept` uses these as they are."
+                    f" Do not reconstruct the scan with them: take new {name}, or give others with "
+                    f"--{name}. `beamline recon --references accept` uses these as they are."
                 )
             else:
                 message += f" The other {name} are used instead."
@@ -83,50 +85,58 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         "light",
-        f"Each of {VIEWS} views looked at runs from {low:g} at its darkest pixel to {high:g} at its brightest, which "
-        "are other pixels in each: every image was scaled by itself, as programs that save pictures do, and a grey "
-        "value means another attenuation in each view. Give the images as the camera wrote them, or all scaled by one "
-        "factor.",
+        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled "
+        "one by one, as programs do that save pictures, so that one grey value means a different "
+        f"attenuation in each projection: in each of {VIEWS} projections checked, the darkest pixel is "
+        f"{low:g} and the brightest {high:g}, but these are different pixels.",
     )
 
 
 def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
-    """The air of views is as bright as their flats, apart from the usual drift of a beam during a scan.
+    """The air of projections is as bright as their flats, apart from the usual drift of a beam during a scan.
 
     Args:
-        level: line integral of the air, the median of the views; without air, of the place that absorbs least.
-        air: columns of air were found, whose light was taken off.
+        level: line integral of the air, the median of the projections; without air, of the place that absorbs least.
+        air: columns of air were found, whose light was subtracted.
         accepted: a fault is a warning.
     """
     darker = level > WARN and air
     if darker or level < -BRIGHTER:
-        where = "The air beside the sample" if air else "The place of the views that absorbs least"
-        what = "taken off as a change of the beam" if air else "not taken off, as no air is known beside the sample"
+        where = "The air next to the sample" if air else "The least absorbing place in the projections"
+        what = (
+            "which is subtracted as a change of the beam"
+            if air
+            else "which is not subtracted, because no air is known next to the sample"
+        )
         factor = math.exp(abs(level))
         sentence = (
-            f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats ({level:+.2f} of line "
-            f"integral, {what}); within a scan a beam changes by up to {math.exp(WARN):.2g} times, and a sample only "
-            f"takes light. Were views and references taken and stored in the same way? "
-            f"{_counts_in_words(scan)}"
+            f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats "
+            f"({level:+.2f} in line integral, {what}). During one scan a beam changes by a factor of up "
+            f"to {math.exp(WARN):.2g}, and a sample can only absorb. Were the projections, flats and "
+            f"darks taken with the same settings and stored in the same way? {_counts_in_words(scan)}"
         )
         refused = abs(level) > REFUSE
         if darker:
-            sentence += " If these columns are a sample wider than the field, give --air none."
+            sentence += " If the sample is wider than the field of view and covers these columns, give --air none."
         if refused and not accepted:
-            sentence += " Give references of the views' light, or --references accept, which uses these as they are."
+            sentence += (
+                " Give flats and darks with the settings of the projections, or --references accept, which "
+                "uses these as they are."
+            )
         yield Finding("error" if refused and not accepted else "warning", "light", sentence)
     elif not air and (ratio := _noise_ratio(scan)) > NOISIER:
         yield Finding(
             "warning",
             "light",
-            f"Relative to their counts the flats have {ratio:.2g} times the noise of the views, though one camera has "
-            f"one figure for all images, and no air shows which is right: references that were multiplied (by about "
-            f"{ratio:.2g}), or views that are means of several frames? {_counts_in_words(scan)}",
+            f"The flats have {ratio:.2g} times the noise of the projections (relative to their counts), "
+            "but in images of one camera this ratio is 1. There is no air to show which is right. Were "
+            f"the flats and darks multiplied (by about {ratio:.2g}), or are the projections means of "
+            f"several frames? {_counts_in_words(scan)}",
         )
 
 
 def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
-    """Darks are images, nowhere brighter than the views, and air is not saturated."""
+    """Darks are images, nowhere brighter than the projections, and air is not saturated."""
     if scan.beam is None:
         return
     dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]  # zingers light single darks
@@ -136,8 +146,9 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "light",
-            "All darks are 0, and the flats vary as those of a camera: right where darks were taken off already. Else "
-            "the camera's offset is in views and flats, and makes line integrals too small: give --darks.",
+            "All darks are 0, but the flats vary like those of a camera. This is right if the darks were "
+            "already subtracted. If not, projections and flats include the camera's offset, which makes "
+            "line integrals too small: give --darks.",
         )
     lit = lit_places(flat - dark)
     if not lit.any():
@@ -149,56 +160,59 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
-            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the "
-            f"{light:.4g} of light in the flats), though light only adds: the darks are too high. Were they taken with "
-            "light, with another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
+            f"The darks are too high: in places the projections have {max(deep):.3g} counts less than the "
+            f"darks (limit {limit:.3g}; the beam gives {light:.4g} counts in the flats), but the beam can "
+            "only add counts. Were the darks taken with beam, with another gain or exposure, or stored "
+            "as sums of frames? Give --darks with the settings of the projections."
         )
-        sentence += "" if scan.asked.accepted else " --references accept uses these."
+        sentence += "" if scan.asked.accepted else " --references accept uses these as they are."
         yield Finding("warning" if scan.asked.accepted else "error", "light", sentence)
 
 
 def _counts_in_words(scan: ScanEvidence) -> str:
-    """Sentences on counts and exposures of flats and views, where views are brightest."""
+    """Sentences on counts and exposures of flats and projections, where projections are brightest."""
     views = spread(scan.table.views, VIEWS)
     darks, flats = (np.concatenate(groups) for groups in scan.used)
     seen, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
     lit = lit_places(flat - dark)
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
-    there = f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."
+    there = f"Counts in these places: {counts[0]:.6g} in the flats, {counts[1]:.6g} in the projections."
     return f"{there} {_exposures_in_words(scan, flats, views)}"
 
 
 def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
-    """A sentence on the exposures that the file states of some flats and views."""
+    """A sentence on the exposures that the file states of some flats and projections."""
     exposed = [scan.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
         said = [f"{np.median(each):g} s" for each in exposed]
-        return f"Stated exposures: flats {said[0]}, views {said[1]}."
-    return "No exposure is stated for both: flats that were exposed for another time differ so."
+        return f"Stated exposures: flats {said[0]}, projections {said[1]}."
+    return "The exposures are not both stated; a different exposure of the flats would cause such a difference."
 
 
 def without_air(scan: ScanEvidence, mean: float) -> str:
-    """Sentences on what wrong flats and darks do to line integrals (their mean) of views in which no column is air.
+    """Sentences on what wrong flats and darks do to line integrals (their mean) of projections in which no column is
+    air.
 
-    A factor of the light is one constant in every line integral, and may be matter beyond the field as well. Of cans of
-    1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
+    A factor of the light is one constant in every line integral, and may be material beyond the field as well. Of cans
+    of 1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
     """
     flats, views = scan.table.flats, scan.table.views
     more = math.log1p(MORE_LIGHT)
     return (
-        "No column shows air, so that nothing in the views tells whether flats and darks are right: flats with "
-        f"{MORE_LIGHT:.0%} more light raise every line integral by {more:.3f}, {more / mean:.0%} of the mean, and "
-        f"densities by up to as much; darks higher by {HIGHER:.0%} of the light raise that mean by about "
-        f"{HIGHER * math.expm1(mean):.2g}. {_exposures_in_words(scan, flats, views)} Compare a density that is known."
+        "Compare a density that you know: flats and darks cannot be checked, because no detector column "
+        f"shows air. If the flats are {MORE_LIGHT:.0%} too bright, every line integral is {more:.3f} too "
+        f"large ({more / mean:.0%} of the mean), and densities are too large by up to the same fraction. "
+        f"If the darks are too high by {HIGHER:.0%} of the intensity, the mean line integral is about "
+        f"{HIGHER * math.expm1(mean):.2g} too large. {_exposures_in_words(scan, flats, views)}"
     )
 
 
 def _noise_ratio(scan: ScanEvidence) -> float:
-    """Variance over light of the flats, over that of the views; 0 where it is not known.
+    """Variance over light of the flats, over that of the projections; 0 where it is not known.
 
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
-    the sample adds to the variance of views, so that their quietest places count.
+    the sample adds to the variance of projections, so that their quietest places count.
     """
     views = spread(scan.table.views, VIEWS)
     taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
@@ -217,7 +231,7 @@ def _noise_ratio(scan: ScanEvidence) -> float:
 
 
 def _gain(net: F32, light: F32) -> float:
-    """Variance of counts over their number, in the quietest tiles of an image; NaN where there is none."""
+    """Variance of counts over their number, in the quietest tiles of an image; NaN if there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
         change = np.diff(np.diff(net / light, axis=0), axis=1)
         each = np.where(net > 0, light**2 / net, np.nan)[1:, 1:] * change**2 / 4
@@ -239,34 +253,35 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         views = scan.table.exposures[scan.table.views]
         known = bool((flats > 0).all())
         taken = scan.exposures[scan.table.flats]
-        doubt = f"taken for {usual:g} s" + (
+        doubt = f"scaled to {usual:g} s" + (
             "."
             if known
-            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, so that "
-            "no view is brighter than they: where the sample fills the field, all line integrals may be off by one "
-            "amount."
+            else f". The exposure of the flats is not stated: {np.nan_to_num(taken, nan=usual).max():g} s is "
+            "assumed, so that no projection is brighter than the flats. If the sample fills the field of "
+            "view, all line integrals may be wrong by the same amount."
         )
         yield Finding(
             "info" if known else "warning",
             "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; the light of each is {doubt}",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each is {doubt}",
         )
     darks = darks[darks > 0]
     if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # of NaN never
         yield Finding(
             "warning",
             "exposures",
-            f"The darks were exposed for {darks[0]:g} s and the projections for {usual:g} s: hot pixels and dark "
-            "current are not the same. Take darks with the projections' exposure.",
+            f"Take darks with the exposure of the projections: the darks were exposed for {darks[0]:g} s "
+            f"and the projections for {usual:g} s, so hot pixels and dark current differ.",
         )
 
 
-_IN_A_ROW, _BESIDE = 12, np.radians(20.0)  # views looked at; between them: a wide sample differs from farther sides
+# projections looked at; between them: a wide sample differs from farther sides
+_IN_A_ROW, _BESIDE = 12, np.radians(20.0)
 _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
 
 
 def light_one(scan: ScanEvidence) -> Iterator[Finding]:
-    """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
+    """Projections in a row have one light, except for a drift; else which step takes one, with its flats."""
     flats, views = scan.table.flats, scan.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (
@@ -284,18 +299,22 @@ def light_one(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error" if lights_in_turn(_light_levels(scan, flats[:_IN_A_ROW])) else "warning",
         "light",
-        f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
-        f"apart): thresholds, exposures or energies. A volume can use only one. {_way_of_steps(scan, n, most)}",
+        f"The projections alternate between {n} intensities from frame to frame (from frame {views[0]} "
+        f"on; {np.expm1(change):.0%} apart): thresholds, exposures or energies. A volume can use only one "
+        f"of them. {_way_of_steps(scan, n, most)}",
     )
 
 
 def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
-    """Which step through the views takes one of so many lights, with its flats."""
+    """Which step through the projections takes one of so many lights, with its flats."""
     shares = np.array([_share_of_flats(scan, slice(first, None, n), most) for first in range(n)])
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     if not steps:
-        return f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
-    return f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
+        return (
+            f"No step such as --frames 0::{n} selects projections with flats of the same intensity: also give "
+            "--darks and --flats."
+        )
+    return f"{' or '.join(steps)} selects one of them, with its darks and flats (projections are counted from 0)."
 
 
 def _light_levels(scan: ScanEvidence, rows: I64) -> F64:
@@ -307,7 +326,7 @@ def _light_levels(scan: ScanEvidence, rows: I64) -> F64:
 
 
 def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
-    """Light of the views of a step over that of its flats; 0 where its flats differ, or are darker."""
+    """Light of the projections of a step over that of its flats; 0 where its flats differ, or are darker."""
     table = selected(scan.source, step).table
     flats, views = (_light_levels(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
@@ -315,9 +334,10 @@ def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
 
 
 def several_energies(scan: ScanEvidence) -> str:
-    """The energies at which views were taken, of which a volume requires one."""
+    """The energies at which projections were taken, of which a volume requires one."""
     energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
     return "" if len(parts := frames_by_energy(energies)) < 2 else (
-        f"The views were taken at {len(parts)} energies: {in_words(energies)}; a volume needs one. Choose it, such "
-        f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others."
+        f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one "
+            f"energy. Choose it, for example with --frames energy={parts[0][0]:.6g}, which leaves out all "
+            "other frames."
     )  # fmt: skip

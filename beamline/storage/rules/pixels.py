@@ -1,4 +1,6 @@
-"""Rules on what the values of pixels are: counts, transmission or line integrals, as the scan says, and measured."""
+"""Rules on pixel values: whether they are counts, transmission or line integrals as stated, and whether they were
+measured.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,11 @@ from recon.base.views import spread
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
 _SURELY_BELOW, _FEW = 0.1, 0.005  # of the range below 0, and of the pixels: no noise of a signed number, nor spots
 _SAMPLES = 4  # frames of a kind that are looked at
-SHAPES = 32  # views whose shape is looked at
+SHAPES = 32  # projections whose shape is looked at
 _FALLS = (
-    "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
-    "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
+    "Give --quantity transmission, which takes the logarithm: the values are about 1 at the edges of the "
+    "projections and lower in the sample, like transmission. Line integrals would be 0 at the edges and "
+    "higher in the sample."
 )
 
 
@@ -43,15 +46,18 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
         return
     least, most = np.iinfo(scan.source.dtype).min, np.iinfo(scan.source.dtype).max
     what = (
-        f"{edges} pixels near {most} lie beside ones near {least}" if edges else f"{low} pixels are below {below:.0f}"
+        f"{edges} pixels near {most} are next to pixels near {least}"
+        if edges
+        else f"{low} pixels are below {below:.0f}"
     )
     yield Finding(
         "error",
         WRAPPED,
-        f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {what}, as 16-bit whole numbers do that went "
-        f"beyond {most} and began again at {least}, such as sums of pixels or frames, or below {least} where a dark "
-        "was subtracted. How bright these pixels were is lost, and other references do not help. Make the frames again "
-        "from those of the camera, as 32-bit or real numbers.",
+        "Make the frames again from those of the camera, as 32-bit or real numbers: the 16-bit integers "
+        f"overflowed. In {sum(map(len, frames))} frames checked, {what}. This happens if values beyond "
+        f"{most} start again at {least}, for example in sums of pixels or frames, or if values fall below "
+        f"{least} because a dark was subtracted. The true values of these pixels are lost, and other "
+        "flats or darks do not help.",
     )
 
 
@@ -59,12 +65,12 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
     """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
     if scan.source.quantity == "unknown":
         note = scan.source.attributes.get("quantity")
-        note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
+        remark = "" if note is None else f"The file has only a remark ({str(note)[:80]!r}). "
         yield Finding(
             "error",
             "quantity",
-            f"{note_text} whether pixels are counts, transmission or line integrals: say --quantity counts, "
-            "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(scan) else ""),
+            f"{remark}It is not stated whether pixels are counts, transmission or line integrals: give --quantity "
+            "counts, --quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(scan) else ""),
         )
 
 
@@ -72,8 +78,8 @@ def darks_computed(scan: ScanEvidence) -> str:
     """Darks that are no images of the camera, of which no two pixels read the same without light."""
     darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
     return "" if darks is None or darks.min() < darks.max() else (
-        f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
-        "light. If its darks were taken, give them with --darks."
+        f"The darks are {darks.min():g} in every pixel checked: a constant, not what the camera measures "
+            "without beam. If darks were taken, give them with --darks."
     )  # fmt: skip
 
 
@@ -84,35 +90,37 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
         return
     finite = np.abs(views, dtype=np.float64) <= LARGEST
     if not finite.any():
-        message = f"No finite pixel in the projections looked at: they are all NaN, infinite or beyond {LARGEST:g}."
+        message = f"The projections checked have no finite pixel: all are NaN, infinite or beyond {LARGEST:g}."
         yield Finding("error", "pixels", message)
     elif float(views[finite].min()) == float(views[finite].max()):
-        yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
+        yield Finding("error", "pixels", f"Every pixel of the projections checked is {views[finite][0]:g}.")
     elif not finite.all():
         yield Finding(
             "warning",
             "pixels",
-            f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
+            f"{1 - finite.mean():.3%} of the pixels checked are NaN, infinite or beyond {LARGEST:g}.",
         )
     if scan.source.quantity == "line_integrals" and _falls(scan):
-        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
+        yield Finding(
+            "error", "quantity", f"The pixels are stated to be line integrals, but look like transmission. {_FALLS}"
+        )
     elif scan.source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
             "pixels",
-            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
-            "If so, say --quantity counts, with darks and flats.",
+            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no measurable beam "
+            "passes: are they counts? If so, give --quantity counts, with darks and flats.",
         )
 
 
 def _falls(scan: ScanEvidence) -> bool:
-    """The views look like transmission, which real numbers can be."""
+    """The projections look like transmission, which real numbers can be."""
     views = sample(scan, FrameKind.PROJECTION, SHAPES) if scan.source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
 
 
 def sample(scan: ScanEvidence, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
-    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
+    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None if there is none."""
     rows = scan.table.of_kind(kind)
     if rows.size == 0:
         return None

@@ -1,4 +1,6 @@
-"""Conditions for trust in a scan of any format, one function a rule. Public validators accept NaN angles, not these."""
+"""Rules for a scan of any format, one function per rule. Validators of other programs accept NaN angles; these rules
+do not.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,8 @@ from beamline.storage.rules.pixels import (
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
 from drivers.base.frame import FrameKind
 
-VARYING = "lengths"  # a rule on those that differ from view to view
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
+VARYING = "lengths"  # a rule on those that differ from projection to projection
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one projection
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
@@ -49,9 +51,9 @@ def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
         sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
         planned, taken = scan.source.plan.get("angles_deg", ()), scan.table.views.size
-        of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
-        of_plan += "; it had decided against the others" if ended_by(scan.source.decisions) else ""
-        sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
+        of_plan = f", with {taken} of {len(planned)} projections" if isinstance(planned, list) and planned else ""
+        of_plan += "; the scan itself had decided to omit the others" if ended_by(scan.source.decisions) else ""
+        sentence = f"The scan ended with the status {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         if ending.reason:
             yield Finding("info", "ended", ending.reason)
@@ -63,25 +65,26 @@ def altered_sentence(source: ScanSource) -> str:
     """Sentences on the rows of a scan whose record differs from its checksum."""
     rows = np.flatnonzero(source.table.altered).tolist()
     return (
-        f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "
-        f"checksum written with it: {spans(rows)}. Nothing uses {'it' if len(rows) == 1 else 'them'}. Look for a good "
-        "copy."
+        f"Look for an intact copy of {source.path}: the records of {count(len(rows), 'frame')} (kind, "
+        f"angle, time, trigger) differ from the checksum stored with them: {spans(rows)}. Nothing uses "
+        f"{'this frame' if len(rows) == 1 else 'these frames'}."
     )
 
 
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
     if "beside" in scan.source.attributes:
-        said = f"Darks and flats are those beside the views: {scan.source.attributes['beside']}."
+        said = f"The darks and flats next to the projections are used: {scan.source.attributes['beside']}."
         yield Finding("info", "references", said)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if scan.in_counts and not scan.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {name}: give --{name} FILE, a folder, or their counts as one number where none were "
-                "taken. If the frames were divided by their flats, say --quantity transmission, or line-integrals "
-                "where their logarithm was taken.",
+                f"The frames are counts, but {name} are missing. Give --{name} FILE, a folder, or their "
+                "counts as one number if none were taken. If the frames were already divided by their "
+                "flats, give --quantity transmission; if the logarithm was also taken, --quantity "
+                "line-integrals.",
             )
 
 
@@ -101,8 +104,9 @@ def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"The file says that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
-                f"of {n}). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
+                f"Give {option} {at:.6g} if the file is right: it states that the central ray meets "
+                f"{side} {at:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
+                f"assumes {taken}.",
             )
 
 
@@ -114,14 +118,16 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
     if not width or not 0.01 < height / width < 100:
         width_text = "unknown" if width is None else f"{width:g} mm"
         yield Finding(
-            "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {width_text}. That cannot be."
+            "error",
+            "pixel-height",
+            f"The pixels are stated to be {height:g} mm high, and their width is {width_text}. This is impossible.",
         )
     elif scan.cone is not None:
         yield Finding(
             "error",
             "pixel-height",
-            f"The pixels are {width:g} mm wide and {height:g} mm high, in a cone beam: square pixels are expected. Bin "
-            "the columns or the rows of a copy of the file.",
+            f"Bin the columns or the rows of a copy of the file: the pixels are {width:g} mm wide and "
+            f"{height:g} mm high, and a cone beam needs square pixels.",
         )
     else:
         yield Finding(
@@ -132,13 +138,13 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def joined_views(scan: ScanEvidence) -> str:
-    """Frames of one view that lie so far apart in angle that their mean is blurred."""
+    """Frames of one projection that lie so far apart in angle that their mean is blurred."""
     degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
     blur = np.radians(degrees) * scan.source.shape[1] / 2
     return "" if blur <= _JOINED_BLUR else (
-        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
-        f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
-        "as the scan took at each angle, or leave it out."
+        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} "
+            f"degrees apart, which blurs details at the edge of the field of view by {blur:.0f} pixels. "
+            "Unless you want that, give the number of frames taken at each angle, or omit the option."
     )  # fmt: skip
 
 
@@ -148,13 +154,13 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
         return
     if (joined_file := joined_file_of(scan.source.path)) is not None and is_joined(joined_file[0]):
         joined, n = joined_file
-        sentence = f"This file is one of {n} parts of a scan: give {joined}, which has the frames of all"
+        sentence = f"This file is one of {n} parts of a scan: use {joined}, which has the frames of all parts"
     elif others := other_parts(scan.source.path):
-        sentence = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
+        sentence = f"This file is a part of a run, like {others[0]}, and no file joins the parts"
         sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
     else:
         return
-    yield Finding("error", "parts", f"{sentence}. For this part alone, copy it out of the folder of its run.")
+    yield Finding("error", "parts", f"{sentence}. To use only this part, copy it out of the folder of its run.")
 
 
 @dataclass(frozen=True)
@@ -173,12 +179,13 @@ class Row:
 Rule = Callable[[ScanEvidence], Iterator[Finding]]
 RULES: tuple[Rule, ...] = (
     Row("error", "views", lambda scan: (n := scan.table.views.size) < 2 and (
-        f"{n} projections: a reconstruction needs at least 2, a good one hundreds."
+        f"The scan has {count(n, 'projection')}; a reconstruction needs at least 2, a good one hundreds."
     )),
     Row("error", "angles", angles_unknown),
     Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (
-        f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
-        f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one."
+        f"The angles of {where} are used with the opposite sign, because the vector of their axis is "
+            f"negative. --angles-path {where} uses them as stored; the volume is then the mirror image of "
+            "this one."
     )),
     angles_spread,
     angles_shown,
@@ -191,7 +198,7 @@ RULES: tuple[Rule, ...] = (
     light_one,
     pixels_measured,
     Row("warning", "pixels", lambda scan: (wrong := scan.source.attributes.get("pixels")) and (
-        f"The label of the pixels is wrong or missing: they are {wrong}."
+        f"The type of the pixels is stated wrongly or not at all: they are {wrong}."
     )),
     views_scaled,
     axis_vertical,
@@ -204,10 +211,10 @@ RULES: tuple[Rule, ...] = (
         f"The series of files leaves out the numbers {numbers}."
     )),
     Row("info", "pixel-size", lambda scan: scan.source.pixel_size_mm is None and (
-        "No pixel size: lengths will be in pixels, densities per pixel."
+        "The pixel size is unknown: lengths will be in pixels, densities per pixel."
     )),
     Row("error", "pixel-size", lambda scan: (size := scan.source.pixel_size_mm) is not None and not 0 < size < 10 and (
-        f"A pixel size of {size:g} mm cannot be."
+        f"A pixel size of {size:g} mm is impossible."
     )),
     pixels_square,
     stated_used,

@@ -1,4 +1,4 @@
-"""Rules on the order in which frames are stored: dimensions of a stack, direction of the axis."""
+"""Rules on the order in which frames are stored: dimensions of a stack, direction of the rotation axis."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from beamline.storage.rules.pixels import SHAPES
 from recon.base.views import spread
 from recon.prep.unmeasured import with_borders_filled
 
-_TURNED = 12  # views by which the direction of the axis is found
-_LEAST = 8  # views, rows and columns: fewer tell nothing of it
-_LEAST_SQUARE = 16  # views and rows, as many
+_TURNED = 12  # projections by which the direction of the axis is found
+_LEAST = 8  # projections, rows and columns: fewer tell nothing of it
+_LEAST_SQUARE = 16  # projections and rows, as many
 _ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 
 
 def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
-    """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
+    """The rotation axis is parallel to the columns, so each detector row shows the same material in all projections."""
     views = scan.table.views_with_angles
     if scan.table.shifts is not None or views.size < _LEAST or min(scan.source.shape) < _LEAST:
         return
@@ -34,9 +34,9 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
-            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(scan)}If it is "
-            "horizontal, say --horizontal-axis.",
+            "The rotation axis seems to be horizontal; expected along the columns. Between projections, "
+            f"the total absorption of a row changes {ratio:.3g} times as much as that of a column. "
+            f"{_exchanged(scan)}If the axis is horizontal, give --horizontal-axis.",
         )
 
 
@@ -56,17 +56,18 @@ def _exchanged(scan: ScanEvidence) -> str:
     if scan.source.format == "data_exchange":
         data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
-    say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
+    say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
     return "" if data is None else say
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
-    """Squared change of the row sums of [view, row, col] from view to view, relative to that of the column sums.
+    """Squared change of the row sums of [view, row, col] from projection to projection, relative to that of the column
+    sums.
 
-    About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
-    are. What a drifting beam does to rows is in their ends, too, and so is matter that leaves a narrow field, from each
-    row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends, are taken
-    off.
+    About 1 where there is noise alone. Rotation about the columns moves material along the rows, whose sums stay as
+    they are. What a drifting beam does to rows is in their ends, too, and so is material that leaves a narrow field,
+    from each row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends,
+    are taken off.
     """
     change = depths - depths.mean(axis=0)
     ends = max(1, depths.shape[2] // 16)
@@ -80,10 +81,12 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
 
 
 def views_first(scan: ScanEvidence) -> Iterator[Finding]:
-    """If there are as many views as rows, the first dimension is that of the views, and the second that of the rows.
+    """If there are as many projections as rows, the first dimension is that of the projections, and the second that of
+    the rows.
 
-    In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
-    moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
+    In sinograms it is the other way round: of each image the rows are projections, so that they have one mass, and the
+    first moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do
+    not.
     """
     views = scan.table.views
     angles = scan.table.angles[views]
@@ -105,10 +108,11 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"The {views.size} images look like sinograms: the rows of each hold one mass, whose centre goes along a "
-            f"sine of the angles ({along_rows:.0%} of its change), as views do, and from image to image it does not "
-            f"({along_frames:.0%}). Then the first dimension counts rows of the detector: --order row,view,col, or "
-            "in a file the attribute axes of the dataset (y:theta:x), says so.",
+            f"The {views.size} images look like sinograms, not projections. Within an image all rows have "
+            f"the same total absorption, and its centre follows a sine of the angle ({along_rows:.0%} of "
+            f"its change); from image to image it does not ({along_frames:.0%}). If so, the first "
+            "dimension counts detector rows: give --order row,view,col, or set the attribute axes of the "
+            "dataset in the file (y:theta:x).",
         )
 
 
@@ -116,7 +120,7 @@ SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and 
 
 
 def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
-    """Tell what is taken for the views of an array [view, col], and how to state another order."""
+    """Tell what is taken for the projections of an array [view, col], and how to state another order."""
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size
@@ -127,8 +131,8 @@ def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "info",
             SINOGRAM,
-            f"The array has two dimensions: it is taken as one sinogram of {n} views and {scan.source.shape[1]} "
-            f"columns. If they are the other way round, {option}.",
+            f"The array has two dimensions and is used as one sinogram of {n} projections and "
+            f"{scan.source.shape[1]} columns. If rows and columns are exchanged, {option}.",
         )
 
 
@@ -141,7 +145,7 @@ def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> floa
 
 
 def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Line integrals of some views [view, row, col], coarse, but for what all views share."""
+    """Line integrals of some projections [view, row, col], coarse, except for what all projections share."""
     block = max(1, min(max(scan.source.shape) // 128, min(scan.source.shape) // _LEAST))
     rows, cols = (n // block for n in scan.source.shape)
     darks = scan.table.darks[:1]

@@ -1,4 +1,4 @@
-"""Files that hold a volume, by format."""
+"""Volume files, by format."""
 
 from __future__ import annotations
 
@@ -45,9 +45,13 @@ def entries() -> Registry[FormatEntry]:
     def made(name: str, kind: type[Any]) -> FormatEntry:
         suffixes = tuple(kind().suffixes)
         if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
-            raise ValueError(f"its suffixes are {suffixes}; expected such as '.xyz', none of {sorted(taken)}")
+            raise ValueError(
+                f"its suffixes are {suffixes}; expected suffixes such as '.xyz' that are not in use: {sorted(taken)}"
+            )
         if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
-            raise ValueError(f"its class {kind.__qualname__} is not at the top of the module {kind.__module__}")
+            raise ValueError(
+                f"its class {kind.__qualname__} is not defined at the top level of the module {kind.__module__}"
+            )
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)
 

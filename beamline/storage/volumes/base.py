@@ -1,4 +1,4 @@
-"""The interface of a format of volume files, the conversion of voxels to grey values, and the facts beside them."""
+"""Interface of a volume file format, conversion of voxels to grey values, and the facts stored with them."""
 
 from __future__ import annotations
 
@@ -79,13 +79,13 @@ class VolumeFormat(Protocol):
 
     @property
     def greys(self) -> bool:
-        """Whether the format stores grey values of 8 and 16 bits."""
+        """True if the format stores grey values of 8 and 16 bits."""
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         """Write a new file, slice by slice. Raises OSError if the disk refuses."""
 
     def holds(self, path: Path) -> bool:
-        """Whether the file is a volume in this format, written by this program; False if it cannot be read."""
+        """True if the file is a volume in this format, written by this program; False if it cannot be read."""
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
         """The record of such a file; the volume's voxels are read when they are sliced along z.
@@ -151,7 +151,8 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         )
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise DataError(
-            f"{path} lacks facts that volumes of this program have ({type(error).__name__}: {error}): it was changed."
+            f"{path} was changed: facts that volumes of this program have are missing "
+            f"({type(error).__name__}: {error})."
         ) from error
 
 
@@ -161,7 +162,7 @@ def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | N
     if 0 in values.shape:
         raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")
     if not math.isclose(dy, dx, rel_tol=1e-3):
-        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")
+        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be stored.")
     return ReconRecord(
         volume=Volume(values, Grid(values.shape, dx, slice_pitch=dz)),
         length_unit="px" if spacing is None else "mm",

@@ -1,4 +1,6 @@
-"""The formats of volume files, by the suffix of a name; writing one as a whole, and opening one slice by slice."""
+"""Formats of volume files, chosen by the suffix of the name: writes a volume as a whole, and opens one slice by
+slice.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,7 @@ class NexusVolume:
     greys: bool = False
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
-        raise ValueError(f"{self.name} can only be read; write {NXtomoproc().name}.")
+        raise ValueError(f"{self.name} can be read but not written; write {NXtomoproc().name}.")
 
     def holds(self, path: Path) -> bool:
         if not path.is_file() or not hdf5.is_hdf5(path):
@@ -160,13 +162,13 @@ class Nrrd:
         try:
             facts = marked(notes[0].decode("ascii").replace("\\\\", "\\")) if len(notes) == 1 else None
             if facts is None:
-                raise ValueError(f"its field {_KEY.decode()} is not that of this program")
+                raise ValueError(f"its field {_KEY.decode()} was not written by this program")
             shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])
             dtype = dtype_of({32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]])
             require_held(shape, dtype, begin, path.stat().st_size)
             values = np.memmap(path, dtype, "r", begin, shape)
         except (KeyError, ValueError, OSError) as error:
-            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
+            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off or was changed.") from error
         yield record_of(path, facts, values)
 
 
@@ -186,7 +188,7 @@ class Npy:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        """Whether the file has three axes of numbers."""
+        """True if the file has three axes of numbers."""
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:
@@ -223,11 +225,13 @@ def format_of(path: Path) -> VolumeFormat:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
         if path.name.lower().endswith((".nii", ".nii.gz")):
             raise ValueError(
-                f"{str(path)!r}: NIfTI is read, not written; .nrrd holds the same, and programs that read NIfTI read it"
+                f"{str(path)!r}: NIfTI can be read but not written. Write .nrrd, which holds the same; "
+                "programs that read NIfTI read it"
             )
         raise ValueError(
-            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}"
-            f"{did_you_mean(suffix, [each for kind in formats() for each in kind.suffixes])}."
+            f"{str(path)!r}: the suffix of a volume's name selects its format. {suffix!r} is unknown; "
+            "expected "
+            f"{known}{did_you_mean(suffix, [each for kind in formats() for each in kind.suffixes])}."
         )
     return kind_of_file
 
@@ -253,7 +257,7 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
         write_reconstruction(path, record, replace=replace)
         return 0
     if pixels.window is not None and not kind.greys:
-        raise ValueError(f"{kind.name} holds the values themselves (float32); leave bits and window out.")
+        raise ValueError(f"Omit bits and window: {kind.name} stores the values themselves (float32).")
     slices = Slices(record.volume, pixels)
     with atomic_file(path, replace=replace) as partial:
         kind.write(partial, record, slices)
@@ -289,7 +293,7 @@ def whole_volume(
 
 
 def times_of(path: Path) -> tuple[float, ...]:
-    """Time of each of several volumes, in s from the first view on; empty if the file has no time series."""
+    """Time of each of several volumes, in s from the first projection on; empty if the file has no time series."""
     if not NXtomoproc().holds(path):
         return ()
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -323,5 +327,5 @@ def opened_volume(path: Path, dataset: str | None = None, at: int | None = None)
         return
     values, spacing = read_volume(path, dataset)
     if values.ndim != 3 or values.dtype.kind not in "uifb":
-        raise DataError(f"{path} holds {values.dtype} of shape {values.shape}; expected real numbers [z, y, x].")
+        raise DataError(f"{path} contains {values.dtype} of shape {values.shape}; expected real numbers [z, y, x].")
     yield bare_record(path, values, spacing)

@@ -1,4 +1,5 @@
-"""The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
+"""Layout of this program's HDF5 scan files: every path, type and unit. All datasets are created before the first
+frame and only grow afterwards.
 
     /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
       instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
@@ -48,7 +49,8 @@ from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
 # Not "latest": that writes datatypes that HDF5 1.14 cannot open.
-LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
+# the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open this program's files
+LIBVER = ("v110", "v110")
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
 ESRF_VERSION = 1.5  # Version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest with all of ours
@@ -61,7 +63,7 @@ IMAGE_KEY_CONTROL = f"{DETECTOR}/image_key_control"
 FIELD_OF_VIEW = f"{DETECTOR}/field_of_view"
 ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
-X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with offset views
+X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with offset projections
 PREVIEW = "/entry/digest/preview"
 COUNT_TIME = f"{DETECTOR}/count_time"
 TRIGGER = "/entry/frame_log/trigger"
@@ -74,7 +76,7 @@ STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 REASON = "/entry/progress/reason"
 PASS_ENDS = "/entry/progress/pass_ends"  # rows; only of scans that decide what is measured after a pass
-DECISIONS = "/entry/progress/decisions"  # a line of JSON each, the values of the event `next_chosen`; likewise
+DECISIONS = "/entry/progress/decisions"  # of such scans: a line of JSON each, the values of the event `next_chosen`
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
@@ -90,7 +92,7 @@ _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
 REASON_BYTES = 600
 FULL = "Full"
-_TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
+_TURN_TOLERANCE = np.radians(1.0)  # by which 360 degrees may be short
 
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
@@ -118,7 +120,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def growing(file: h5py.File) -> list[str]:
-    """What has a row for each frame in this file, beside the pixels and their preview."""
+    """The datasets with a row for each frame in this file, apart from the pixels and their preview."""
     return [*COLUMNS, VALID, SCORES, REGIONS, *(path for path in (X_TRANSLATION,) if path in file)]
 
 
@@ -139,16 +141,16 @@ class ScanInfo:
         pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
         exposure, period: s.
         axis_col: rotation axis in 0-based pixel-centre columns.
-        source_distance_mm: source to sample; given only where the beam is a cone (then `pixel_size_mm` is that on the
-            detector, as NXtomo has it).
+        source_distance_mm: source to sample; given only for a cone beam (then `pixel_size_mm` is that on the detector,
+            as in NXtomo).
         plan: JSON; config: YAML; both as text for the record.
         devices: the description of each device, by its name.
         filter: its place, by name.
-        monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
+        monochromator_kev: its present energy; `energy_kev` is then the same. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
-        offset_views: whether some are planned.
-        decides: whether what is measured next is chosen after each pass.
+        offset_views: True if some are planned.
+        decides: True if what is measured next is chosen after each pass.
         diameter_mm: of the sample.
     """
 
@@ -306,7 +308,7 @@ def _columns(
 
 
 def state_field_of_view(file: h5py.File) -> None:
-    """Write whether each view of a full turn saw only half of the sample, as far as the views tell."""
+    """Write whether each projection of 360 degrees saw only half of the sample, as far as the projections tell."""
     field = field_of_view(file)
     if field and FIELD_OF_VIEW in file:
         file[FIELD_OF_VIEW][()] = field.encode()
@@ -315,14 +317,14 @@ def state_field_of_view(file: h5py.File) -> None:
 
 
 def field_of_view(file: h5py.File) -> str:
-    """`Half` if each view of a full turn saw only half of the sample; "" if angles or the axis are unknown."""
+    """`Half` if each projection of 360 degrees saw only half of the sample; "" if angles or the axis are unknown."""
     angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
     axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
     return _field_of_view(angles, file[DATA].shape[1:], axis_col)
 
 
 def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
-    """Angles of the planned views, in radians; unknown where the plan does not say them."""
+    """Angles of the planned projections, in radians; unknown if the plan does not state them."""
     try:
         return np.radians(np.asarray(json.loads(info.plan)["angles_deg"], np.float64))
     except (ValueError, LookupError, TypeError):  # a plan of another program, or none
@@ -330,7 +332,7 @@ def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
 
 
 def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], axis_col: float | None) -> str:
-    """`Half` where a full turn sees half of the sample at a time; "" where angles or the axis are not known."""
+    """`Half` if a 360-degree scan shows half of the sample at a time; "" if angles or the axis are not known."""
     if not np.isfinite(angles).all():
         return ""
     if angles.size < 2 or np.ptp(angles) * angles.size / (angles.size - 1) < 2 * np.pi - _TURN_TOLERANCE:

@@ -1,4 +1,4 @@
-"""NXtomoWriter: a scan's file while it grows, in a state that a reader can trust after every frame.
+"""NXtomoWriter: writes the file of a scan so that a reader can trust it after every frame.
 
 The file is written SWMR (single writer, multiple readers). Others can read flushed frames at once, and these survive
 the death of this process. Every second they are brought to the disk (fsync), where they survive a loss of power.
@@ -57,19 +57,19 @@ class _TouchedError(OSError):
 
 
 def _new_file(path: Path) -> h5py.File:
-    """DataError where the file exists or HDF5 cannot make it; nothing is left of it then."""
+    """DataError if the file exists or HDF5 cannot make it; nothing is left of it then."""
     try:
         return h5py.File(path, "x", libver=layout.LIBVER)
     except FileExistsError as error:
         raise DataError(
-            f"{path} exists. A scan never overwrites a file: name a new one. Nothing was written."
+            f"{path} exists, and a scan never overwrites a file. Give another name. Nothing was written."
         ) from error
     except OSError as error:
         with suppress(OSError):  # made by HDF5, which then failed; one that was there is a FileExistsError
             path.unlink()
         if lock_failure(error) is LockFailure.NO_LOCKS:
             why = no_locks_sentence(path.parent, error.errno)
-            raise DataError(f"{path} cannot be created: {why}. Nothing is left of it.") from error
+            raise DataError(f"{path} cannot be created: {why}. Nothing of it was left on the disk.") from error
         why = hdf5.reason(error)
         raise DataError(f"{path} cannot be created ({why}). Check that its folder exists and is writable.") from error
 
@@ -97,7 +97,7 @@ class NXtomoWriter:
             preview_bin: the bin that the digests' previews are made with.
             flush_every: frames between flushes; a crash loses at most the frames since the last one.
 
-        DataError where the file exists or cannot be made.
+        DataError if the file exists or cannot be made.
         """
         if flush_every < 1:
             raise ValueError(f"flush_every is {flush_every}; it must be at least 1.")
@@ -127,7 +127,7 @@ class NXtomoWriter:
             self.path.unlink()
             if isinstance(error, OSError | RuntimeError):
                 raise DataError(
-                    f"{self.path} cannot be created ({hdf5.reason(error)}). Nothing is left of it."
+                    f"{self.path} cannot be created ({hdf5.reason(error)}). Nothing of it was left on the disk."
                 ) from error
             raise
         self._table = Rows(self._file)
@@ -158,7 +158,7 @@ class NXtomoWriter:
             with suppress(*FAILURES):
                 self.flush()  # the rows before may still fit
             self._broken = True
-            raise self._disk_error("take the frame", error) from error
+            raise self._disk_error("store the frame", error) from error
 
     @property
     def rows(self) -> int:
@@ -173,8 +173,8 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Committed frames that are known to be on the disk: after a failed fsync all since the last successful one may
-        be lost.
+        """Committed frames that are known to be on the disk: after a failed fsync, all since the last successful one
+        may be lost.
         """
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
@@ -198,7 +198,7 @@ class NXtomoWriter:
         self._append_last(layout.PASS_ENDS, self._rows, "the end of a pass")
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass, likewise."""
+        """Record what was chosen after a pass, in a file made for it (ScanInfo.decides); errors as in `end_pass`."""
         self._append_last(layout.DECISIONS, json_of(values).encode(), "a decision")
 
     def _append_last(self, path: str, value: int | bytes, what: str) -> None:
@@ -211,7 +211,7 @@ class NXtomoWriter:
             self.flush()
         except FAILURES as error:
             self._broken = True
-            raise self._disk_error(f"take {what}", error) from error
+            raise self._disk_error(f"store {what}", error) from error
 
     def close(
         self,
@@ -229,10 +229,10 @@ class NXtomoWriter:
             status, missing, reason: see ScanEnding.
             beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
 
-        DataError where the disk does not take it; the frames committed stay readable.
+        DataError if the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
-            raise ValueError(f"Status {status!r} is not known; expected {', '.join(STATUSES)}.")
+            raise ValueError(f"Status {status!r} is unknown; expected {', '.join(STATUSES)}.")
         if not self._open:
             return
         self._open = False
@@ -286,9 +286,9 @@ class NXtomoWriter:
             raise
 
     def _let_go(self, reason: str) -> None:
-        """Mark the end where there is room for it already, and leave the rest as a dead writer would.
+        """Mark the end where space was already reserved for it, and leave the rest as a killed process would.
 
-        Readers see every frame committed.
+        Readers see every committed frame.
         """
         try:
             state_words(self._last, ScanEnding("failed", reason=reason))
@@ -301,7 +301,7 @@ class NXtomoWriter:
                 self._file.close()
 
     def _require_untouched(self) -> None:
-        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        """Raise OSError if another program has cut the file or deleted it: HDF5 would write on, into a hole."""
         now = os.fstat(self._handle)
         if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
             raise _TouchedError(errno.ENOENT, "it was deleted")
@@ -314,34 +314,38 @@ class NXtomoWriter:
         faults = {
             "the file is closed": not self._open,
             "an earlier write failed": self._broken,
-            f"it is {counts.dtype} {counts.shape}, expected uint16 {self._shape}": unlike,
-            f"its preview is {preview.shape}, expected {self._preview_shape}": preview.shape != self._preview_shape,
-            f"its index is {frame.index}, expected {self._rows}, the next row": frame.index != self._rows,
+            f"it is {counts.dtype} {counts.shape}; expected uint16 {self._shape}": unlike,
+            f"its preview is {preview.shape}; expected {self._preview_shape}": preview.shape != self._preview_shape,
+            f"its index is {frame.index}; expected {self._rows}, the next row": frame.index != self._rows,
         }
         if wrong := next((fault for fault, there in faults.items() if there), ""):
-            raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
+            raise DataError(
+                f"Frame {frame.index} was not written to {self.path}: {wrong}. The earlier frames are safe."
+            )
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
         if isinstance(error, _TouchedError):
             return DataError(
-                f"{self.path} was touched by another program while it was written: {error.strerror}. Of the "
-                f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
-                "the copy, and scan again."
+                f"Another program changed {self.path} while the scan was writing it ({error.strerror}). "
+                f"Some or all of the {self._committed} frames are lost. Copy the file, run `beamline "
+                "recover` on the copy, and repeat the scan."
             )
         free = ""
         with suppress(OSError):  # the folder may have moved
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"
         return DataError(
-            f"{self.path} could not {what} ({hdf5.reason(error)}){free}. "
-            f"The first {self.safe} frames are safe in it: `beamline recover` makes an ordinary file of them."
+            f"{self.path} could not {what} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
+            "safe in it: `beamline recover` makes an ordinary file of them."
         )
 
     def _put_exchange_view(self) -> None:
-        """Add the /exchange view, which SWMR writing cannot, as it creates datasets; no frame depends on it."""
+        """Add the /exchange view. This is impossible while writing SWMR, because it creates datasets; no frame depends
+        on it.
+        """
         if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
             self.remarks.append(
-                f"{self.path} has no /exchange view, as this program has the file open by h5py. Close it there, then "
-                "`beamline recover` adds the view."
+                f"{self.path} has no /exchange view, because this program has the file open with h5py. "
+                "Close it there; then `beamline recover` adds the view."
             )
             return
         try:

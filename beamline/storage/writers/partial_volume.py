@@ -1,4 +1,4 @@
-"""Partial volumes: the slabs of a volume that are finished, in a file that stays readable however its writer ends.
+"""Partial volumes: the finished slabs of a volume, in a file that stays readable even if the process is killed.
 
 An NXtomoproc file whose places are all allocated when it is made, and written through memory maps, so that nothing of
 its structure changes later. Slices that two slabs share are kept beside while one of them is added. A slab that was
@@ -44,7 +44,7 @@ class PartialVolume:
     Attributes:
         slabs: all of them.
         made_from: data and settings, by name; the slabs to come must be made from the same.
-        kept: what else the slabs to come need, as JSON holds it.
+        kept: what else the slabs to come need, in a form that JSON can represent.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class PartialVolume:
         return self._maps["volume"]
 
     def has(self, n: int) -> bool:
-        """Whether slab n is finished."""
+        """True if slab n is finished."""
         return bool(self._maps["state"][n] == _DONE)
 
     @property
@@ -88,7 +88,7 @@ class PartialVolume:
         self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
 
     def _written(self, name: str) -> None:
-        """Return when it is on the disk: after a loss of power no slab counts that is not there."""
+        """Return when it is on the disk, so that after a loss of power no slab counts that is not there."""
         self._maps[name].flush()
 
     def _take_out(self) -> None:
@@ -163,11 +163,12 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 def _refuse_unusable(path: Path) -> None:
     if not is_partial(path):
         raise DataError(
-            f"{path} is not a partial volume; `beamline recon` leaves one if it is stopped after the first slab."
+            f"{path} is not a partial volume. `beamline recon` leaves one if it is stopped after the first slab."
         )
     if held(path):
         raise DataError(
-            f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
+            f"{path} is open in another process that writes slabs to it or reads it. Wait until that "
+            "process ends. Nothing was changed."
         )
 
 
@@ -176,7 +177,7 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a file is a partial volume, by its content."""
+    """True if a file is a partial volume, by its content."""
     if not path.is_file() or not hdf5.is_hdf5(path):
         return False
     try:

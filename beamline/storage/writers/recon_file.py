@@ -1,4 +1,4 @@
-"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written whole or not at all.
+"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written completely or not at all.
 
 Checkpoints hold a fit's state and what it was made from; each whole, in place of the one before.
 """
@@ -167,17 +167,17 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
         DataError: if the file is missing or is not such a file, or `at` names none of its volumes.
     """
     if not path.is_file():
-        raise DataError(f"{path} is not there.")
+        raise DataError(f"{path} does not exist.")
     with ExitStack() as stack:
         try:
             file = stack.enter_context(opened_whole(path))
             require_harmless(file)
             n = volumes_in_time(file)
             if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):
-                held = "one volume, not a series in time: leave out --at"
+                held = "one volume, not a time series: omit --at"
                 if n:
-                    held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)"
-                raise DataError(f"{path} holds {held}.")
+                    held = f"{n} volumes of a time series: choose one with --at 0 to {n - 1} (`beamline export`)"
+                raise DataError(f"{path} contains {held}.")
             record = _read_entry(file["entry"], at)
         except hdf5.ALTERED as error:
             raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
@@ -222,7 +222,7 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
 
 
 def _pitch(axis: NDArray[np.floating]) -> float | None:
-    """Distance from voxel to voxel; None where there is one voxel."""
+    """Distance from voxel to voxel; None if there is one voxel."""
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 
@@ -274,7 +274,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         DataError: there is none, the file is something else, or damaged.
     """
     if not path.is_file():
-        raise DataError(f"{path} is not there; name a checkpoint of recon --checkpoint.")
+        raise DataError(f"{path} does not exist; give a checkpoint that recon --checkpoint wrote.")
     try:
         with opened_whole(path) as file:
             require_harmless(file)
@@ -287,4 +287,4 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 int(file.attrs["steps"]),
             )
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:  # h5py's
-        raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint makes one.") from error
+        raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint writes one.") from error

@@ -1,4 +1,4 @@
-"""Rows of a scan file, one a frame, and the end of the file.
+"""Rows of a scan file, one per frame, and the final entries of the file.
 
 It tells how the scan ended, which triggers gave no frame and why, and has the frames as /exchange, the layout of De
 Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data",
@@ -50,7 +50,7 @@ class Rows:
     def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
         """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
 
-        A view that it replaces becomes an invalid frame, so that no program takes both.
+        A projection that it replaces becomes an invalid frame, so that no program takes both.
         """
         row = frame.index
         if row != self._first + len(self._said):
@@ -143,27 +143,30 @@ def add_exchange_view(file: h5py.File) -> None:
 
 
 def has_exchange_view(file: h5py.File) -> bool:
-    """Whether /exchange is complete."""
+    """True if /exchange is complete."""
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 
 def put_exchange_view(path: Path) -> None:
-    """Add the view to a closed scan file. No block that frames hang on is written.
+    """Add the /exchange view to a closed scan file. No block on which frames depend is written.
 
     Raises:
-        DataError: the disk does not take it, or has less than ROOM free.
+        DataError: the disk fails, or has less than ROOM free.
     """
     if (free := shutil.disk_usage(path.parent).free) < ROOM:
-        raise DataError(f"{path}: its disk has {size(free)} free, of {size(ROOM)} for the view. Nothing was changed.")
+        raise DataError(
+            f"{path}: its disk has {size(free)} free, and {size(ROOM)} are needed for the /exchange view. "
+            "Nothing was changed."
+        )
     try:
         with hdf5.changed(path, layout.LIBVER) as file:
             add_exchange_view(file)
     except hdf5.ALTERED as error:
-        raise DataError(f"{path} does not take the view ({hdf5.reason(error)}).") from error
+        raise DataError(f"{path} does not accept the /exchange view ({hdf5.reason(error)}).") from error
 
 
 def _rows(file: h5py.File) -> dict[str, I64]:
-    """Rows of each dataset of the view."""
+    """Rows of each dataset of the /exchange view."""
     table = frames_in(file)
     rows = {name: table.of_kind(kind) for kind, name in NAMES.items()}
     return {name: rows_of_kind for name, rows_of_kind in rows.items() if rows_of_kind.size}
@@ -171,7 +174,7 @@ def _rows(file: h5py.File) -> dict[str, I64]:
 
 STATUSES = ("complete", "stopped", "failed")
 RUNNING = "running"  # of a scan that goes on, or whose program died
-DIED = "The program that took the scan died."
+DIED = "The process that took the scan was killed."
 
 
 @dataclass(frozen=True)
@@ -179,10 +182,10 @@ class ScanEnding:
     """How a scan ended.
 
     Attributes:
-        status: "complete", "stopped" (by the operator, an alarm, or references that cannot be used), "failed", or
-            RUNNING where nothing was stated.
+        status: "complete", "stopped" (by the operator, an alarm, or darks or flats that cannot be used), "failed", or
+            RUNNING if nothing was stated.
         missing: triggers that gave no frame, counted over the whole scan from 0.
-        reason: why it did not take all its frames, in words; "" where it did, or where nothing says it.
+        reason: why it did not take all its frames, in words; "" if it did, or if it is not stated.
     """
 
     status: str = "complete"

@@ -1,3 +1,3 @@
-"""A motor record of EPICS as a stage."""
+"""An EPICS motor record as a rotation stage."""
 
 DRIVERS = {"epics": "EpicsStage"}

@@ -49,10 +49,14 @@ class EpicsSettings(StageFigures):
     pulse_width: ClassVar[None] = None
     active_high: ClassVar[bool] = True
     """No cable: only checks of trigger pulses ask for it."""
-    unit: str = setting("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
+    unit: str = setting(
+        "deg", "Unit of the record (EGU). A linear axis has mm; every key with deg in its name then means mm."
+    )
     search: Search = setting(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
-    tolerance: int = setting(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
-    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0)
+    tolerance: int = setting(
+        10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
+    )
+    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0)
 
     def limits(self) -> StageLimits:
         """See `StageSettings`."""
@@ -70,11 +74,14 @@ class EpicsSettings(StageFigures):
 HOMED = 0x4000 | 0x0080
 """MSTA: the reference was found, or it stands there."""
 FAULTS = {  # bit of MSTA: what it says, what to do
-    0x0200: ("the IOC lost its controller, or that reports a fault", "Look at the controller and at the IOC's shell"),
+    0x0200: (
+        "the IOC lost its controller, or the controller reports a fault",
+        "Check the controller, and read the messages in the IOC's shell",
+    ),
     0x1000: ("the IOC has no contact with its controller", "Check the controller's power and its cable to the IOC"),
-    0x0040: ("it slipped or stalled", "Find what blocks it before moving on"),
-    0x0004: ("it is at its upper limit switch", "Move away from the switch by hand or in the record's own screen"),
-    0x2000: ("it is at its lower limit switch", "Move away from the switch by hand or in the record's own screen"),
+    0x0040: ("it slipped or stalled", "Find what blocks it before you move it again"),
+    0x0004: ("it is at its upper limit switch", "Move it away from the switch by hand or in the record's own screen"),
+    0x2000: ("it is at its lower limit switch", "Move it away from the switch by hand or in the record's own screen"),
 }
 STILL = 1.0  # s without a change of RBV, after which a motor that says it is done, but is not at its target, stands
 CREEP = 10.0  # s that such a motor may still take to stand, at least
@@ -139,7 +146,7 @@ class EpicsStage(LineStage):
             if refused.value:
                 raise DeviceRefused(
                     self.name,
-                    f"the record refuses {self._travel.degrees(target)}: beyond its own limits (LVIO)",
+                    f"the record rejected {self._travel.degrees(target)}: beyond its own limits (LVIO)",
                     request=self._last,
                     advice="Compare HLM and LLM of the record with low_deg and high_deg",
                     state="Nothing has moved",
@@ -151,7 +158,7 @@ class EpicsStage(LineStage):
         if self._settings.search is Search.NONE:
             raise DeviceRefused(
                 self.name,
-                "it has no reference to search (search: none)",
+                "it has no reference to search for (search: none)",
                 advice="Set devices.stage.search to forward or reverse, or home it in the record's own screen",
                 state="Nothing has moved",
             )
@@ -176,7 +183,7 @@ class EpicsStage(LineStage):
 
     def wait(self, timeout: float) -> float:
         until_standing(self._clock, self.moving, bool, timeout)
-        status, target = self._status(), self._target  # read anew: RBV may have been read before DMOV became 1
+        status, target = self._status(), self._target  # read again: RBV may have been read before DMOV became 1
         arrived = target is None or self._is_at_target(status)
         if status.done and not (arrived or self._stops.came_since):
             # It says that it is done, and is not there: look whether it stands.
@@ -204,8 +211,8 @@ class EpicsStage(LineStage):
     def arm(self, train: TriggerTrain) -> None:
         raise DeviceRefused(
             self.name,
-            "a motor record gives no trigger pulses",
-            advice="Use scan.mode: step, or a stage whose controller gives pulses",
+            "a motor record cannot send trigger pulses",
+            advice="Use scan.mode: step, or a stage whose controller sends pulses",
             state="Nothing has moved and nothing was sent",
         )
 
@@ -248,12 +255,12 @@ class EpicsStage(LineStage):
         with contextlib.suppress(DeviceError):
             (disabled,) = self._read(".DISP")
             if disabled.value:
-                words.append("DISP is 1: the record takes no values")
+                words.append("DISP is 1: the record accepts no values")
         with contextlib.suppress(DeviceError):
             (wanted,) = self._read(".VAL")
             counts = round(float(wanted.value) * self.limits.counts_per_turn / 360)
             if self._target is not None and abs(counts - self._target) > self._settings.tolerance:
-                words.append(f"VAL is {wanted}: another client has sent it elsewhere, or it did not take the value")
+                words.append(f"VAL is {wanted}: another client sent it somewhere else, or it did not accept the value")
         return ", ".join(words)
 
     def _counts(self) -> int:
@@ -274,7 +281,7 @@ class EpicsStage(LineStage):
         """Values that the IOC vouches for."""
         values = self._channel.read(*suffixes)
         for suffix, value in zip(suffixes, values, strict=True):
-            refuse_invalid(self.name, self._channel.name + suffix, value, "Whether it moves is not known")
+            refuse_invalid(self.name, self._channel.name + suffix, value, "It is not known whether it is moving")
         return values
 
     def _standing(self, purpose: str) -> None:
@@ -289,7 +296,7 @@ class EpicsStage(LineStage):
             if field_value.label != wanted:
                 raise DeviceRefused(
                     self.name,
-                    f"{self._channel.name}{suffix} is {field_value}, so that the record would not move",
+                    f"{self._channel.name}{suffix} is {field_value}, so the record would not move",
                     expected=wanted,
                     advice="Set it in the record's own screen; somebody may have stopped this motor on purpose",
                     state="Nothing has moved",
@@ -301,8 +308,8 @@ class EpicsStage(LineStage):
             self.name,
             problem,
             request=self._last,
-            expected="to stand there without a fault",
-            advice=advice or "Find who or what stopped it before moving on",
+            expected="to be there without a fault",
+            advice=advice or "Find who or what stopped it before you move it again",
             state=f"It {verb} at {self._travel.degrees(counts)}, {counts} counts: {fault or 'no reason given'}",
         )
 
@@ -319,8 +326,8 @@ class EpicsStage(LineStage):
             wrong = f"its step (MRES) is {step.value:g} {settings.unit}, expected {1 / per_unit:g}"
             advice = "Set counts_per_turn to 360 / MRES"
         elif 0 < float(fastest.value) < greatest * (1 - 1e-9):
-            wrong = f"its greatest speed (VMAX) is {fastest.value:g}, below {greatest:g} {settings.unit}/s"
-            advice = "Set max_speed_deg_s to it, or less"
+            wrong = f"its maximum speed (VMAX) is {fastest.value:g}, below {greatest:g} {settings.unit}/s"
+            advice = "Set max_speed_deg_s to VMAX or less"
         if wrong:
             problem = f"the record {self._channel.name} does not fit: {wrong}"
             raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved")

@@ -1,3 +1,3 @@
-"""PI controllers that speak GCS 2.0 (C-863 class)."""
+"""PI controllers with the command language GCS 2.0 (C-863 class)."""
 
 DRIVERS = {"pi_gcs": "PiGcsStage"}

@@ -1,4 +1,5 @@
-"""One axis of a PI GCS 2.0 controller and its trigger line: its commands and queries. Counts here, degrees on the wire.
+"""One axis of a PI GCS 2.0 controller and its trigger line: commands and queries, converted between counts (here)
+and degrees (controller).
 
 Set commands are followed by ERR?, and important values are read back. Protocol: the C-863's manual (MS249E),
 cross-checked with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.
@@ -94,10 +95,10 @@ class PiGcsAxis:
 
     def moving(self) -> bool:
         form = r"(?:0[xX])?([0-9A-Fa-f]{1,8})"
-        return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the axes that move, as bits")[1], 16) >> self._bit & 1)
+        return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the moving axes, as bits")[1], 16) >> self._bit & 1)
 
     def searching(self) -> bool:
-        """Whether the axis moves, or is between two parts of a reference move."""
+        """True if the axis moves, or is between two parts of a reference move."""
         return self._line.ask(READY, "[\xb0\xb1]", "the byte B1 (ready) or B0")[0] == "\xb0" or self.moving()
 
     def counts(self) -> int:
@@ -181,10 +182,10 @@ class PiGcsAxis:
         """Which of the two reasons of error 5 it is."""
         verb = command.split()[0]
         if not self._line.flag("SVO?"):
-            why = "Find what switched it off, then close the driver and open it again: that switches it on"
+            why = "Find what switched the servo off, then close the driver and open it again: that switches it on"
             return self._refused(f"{verb} is not possible: the servo is off", why, command)
         if not self._line.flag("FRF?"):
-            why = "Search the reference (start_home) when nothing is in its way"
+            why = "Start a reference search (start_home) when nothing is in the way of the stage"
             return self._refused(f"{verb} is not possible: the axis has no reference yet", why, command)
         return self._refused(f"{verb} ended with {meaning(5)}", advice(5), command)
 
@@ -218,7 +219,7 @@ class PiGcsAxis:
         own = Fraction(numerator) / Fraction(denominator) * 360
         if own == 0 or (own / self._counts_per_turn).denominator != 1:
             raise self._refused(
-                f"it has {float(own):.10g} counts a turn, which is no multiple of the configured "
+                f"it has {float(own):.10g} counts per turn, which is not a multiple of the configured "
                 f"{self._counts_per_turn}",
                 "Correct counts_per_turn in the configuration, or the controller's parameters 0xE and 0xF",
             )

@@ -17,16 +17,16 @@ STOPPED = 10
 NOT_ALLOWED_TO_MOVE = 5
 UNKNOWN_COMMAND = 2
 
-CHECK_MODEL = "Check that the controller belongs to the C-863 class and knows this command"
+CHECK_MODEL = "Check that the controller belongs to the C-863 class and supports this command"
 CHECK_AXIS = "Check the axis in the configuration against what SAI? lists"
 CHECK_TRAVEL = "Compare the limits in the configuration with the controller's travel range (TMN?, TMX?)"
 CHECK_SPEED = "Compare max_speed and acceleration in the configuration with what the controller allows"
-HOME = "Search the reference first, and see that the servo is on"
-LET_GO = "Give the controller back from joystick, macro or another program"
-WAIT = "Wait until it stands, or stop it"
+HOME = "Search the reference first, and check that the servo is on"
+LET_GO = "Release the controller from joystick, macro or another program"
+WAIT = "Wait until it has stopped, or stop it"
 OBSTACLE = "Find what held the stage (collision, load, cable, limit switch), then close and open the driver again"
 LINE = "Check the cable and the baud rate"
-SERVICE = "Switch the controller off and on; if it stays, ask the vendor"
+SERVICE = "Switch the controller off and on; if the error persists, ask the vendor"
 
 REFUSALS = {
     1: ("parameter syntax error", CHECK_MODEL),
@@ -50,7 +50,10 @@ REFUSALS = {
     35: ("there is no digital input", CHECK_MODEL),
     36: ("there is no such digital output", "Check trigger_line in the configuration"),
     39: ("invalid controller number", "Connect a single controller, not a daisy chain"),
-    50: ("referencing was tried while it is disabled", "Enable reference moves on the controller (RON)"),
+    50: (
+        "a reference move was tried while reference moves are disabled",
+        "Enable reference moves on the controller (RON)",
+    ),
     51: ("the axis is under joystick control", LET_GO),
     53: ("a dynamic move is in progress", WAIT),
     54: ("unknown parameter", CHECK_MODEL),
@@ -73,9 +76,12 @@ REFUSALS = {
 MOTION = frozenset({45, 49, 333, 504, 505, 1024, 1025})
 """Events after which the axis may not be where it was sent: errors of the move in which they come."""
 EVENTS = {
-    STOPPED: ("stopped by command", "Find who stopped it before moving on"),
-    45: ("the reference move failed", "Check the reference switch, its cable and what is in the stage's way"),
-    49: ("the move to the limit switch failed", "Check the limit switches and what is in the stage's way"),
+    STOPPED: ("stopped by command", "Find who stopped it before you move it again"),
+    45: (
+        "the reference move failed",
+        "Check the reference switch and its cable, and remove what is in the way of the stage",
+    ),
+    49: ("the move to the limit switch failed", "Check the limit switches, and remove what is in the way of the stage"),
     76: ("its interface buffer overran", LINE),
     301: ("its send buffer overflowed", LINE),
     304: ("its receive buffer overflowed", LINE),
@@ -94,7 +100,7 @@ def meaning(code: int) -> str:
     """Meaning of an error code in words, with the number; "" for 0."""
     if code == 0:
         return ""
-    words, _ = (REFUSALS | EVENTS).get(code, ("an error that this driver has no words for", ""))
+    words, _ = (REFUSALS | EVENTS).get(code, ("an error that this driver does not know", ""))
     return f"error {code}, {words}"
 
 
@@ -181,7 +187,7 @@ class GcsLine:
                 reply=str(code),
                 expected="0, no error",
                 advice=advice(code),
-                state="That command did nothing" if refused and self.commanded else self._state(),
+                state="That command had no effect" if refused and self.commanded else self._state(),
             )
 
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
@@ -213,11 +219,11 @@ class GcsLine:
         """The error for a read-back that differs from the set value."""
         return DeviceError(
             self._name,
-            "a setting was not taken",
+            "it did not accept a setting",
             request=command,
             reply=reply,
             expected=wanted,
-            advice="Check that no other program or person drives this controller, and the cable",
+            advice="Check that no other program or person controls this controller, and check the cable",
             state=self._state(),
         )
 
@@ -230,4 +236,4 @@ class GcsLine:
         self._serial.close()
 
     def _state(self) -> str:
-        return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
+        return "An earlier move was started; the stage may be turning" if self.commanded else "Nothing has moved"

@@ -1,4 +1,4 @@
-"""Settings of a PI GCS 2.0 stage, which the controller takes as they are, in degrees, and its trigger trains.
+"""Settings of a PI GCS 2.0 stage, in degrees as the controller uses them, and its trigger pulse trains.
 
 Trains are those of mode 0 (PositionDistance). The controller gives a pulse at each step between the thresholds, if the
 stage entered through the start threshold. The stop threshold lies half an interval behind the last pulse, so that it
@@ -60,7 +60,7 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
-            f"this controller gives pulses only at whole multiples of {step} counts, and {train.start} is none"
+            f"this controller sends pulses only at integer multiples of {step} counts, and {train.start} is not one"
         )
     before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))
@@ -69,7 +69,7 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
 
 
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
-    """Whether the train must be disarmed for a move from `here` to `target` (counts).
+    """True if the train must be disarmed for a move from `here` to `target` (counts).
 
     Either it was emitted, and passing it would emit it again. Or it has begun, and the way back would give pulses.
     """
@@ -107,17 +107,23 @@ class PiGcsSettings(Wiring, StageFigures):
     """
 
     axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
-    serial: str | None = setting(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
-    trigger_line: int = setting(1, "Digital output that the trigger pulses come from.", gt=0)
-    reference: Reference = setting(Reference.SWITCH, "What the search for the reference goes to.")
+    serial: str | None = setting(
+        None,
+        "Its serial number, as in *IDN?; the driver stops with an error if another device answers. null: accept any.",
+    )
+    trigger_line: int = setting(1, "Digital output of the trigger pulses.", gt=0)
+    reference: Reference = setting(Reference.SWITCH, "Switch at which the search for the reference ends.")
     first_pulse: PiFirstPulse = setting(
         PiFirstPulse.AT_THRESHOLD,
-        "Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md).",
+        "Where the firmware puts the first pulse of a train. This is not documented; measure it once "
+        "(docs/hardware.md).",
     )
-    firmware_pulse: float = setting(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
-    tolerance: int = setting(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    firmware_pulse: float = setting(50e-6, "Pulse width of the firmware.", unit="s", gt=0)
+    tolerance: int = setting(
+        10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
+    )
     settle: float = setting(
-        1.0, "After a move, in which the controller may still bring the axis on target.", unit="s", ge=0
+        1.0, "Wait after a move, during which the controller may still settle on the target.", unit="s", ge=0
     )
 
     def __post_init__(self) -> None:

@@ -156,9 +156,9 @@ class PiGcsStage(LineStage):
             self.name,
             f"the axis was disturbed since its last move: {meaning(code)}",
             reply=str(code),
-            expected="an axis that stood still",
-            advice=f"{advice(code)}. What was measured since then may have been at another angle",
-            state=f"Nothing has moved by this; it stands at {self._travel.degrees(self._axis.counts())}",
+            expected="an axis at rest",
+            advice=f"{advice(code)}. Frames since then may have been taken at another angle",
+            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(self._axis.counts())}",
         )
 
     def _send_stop(self, hard: bool) -> str:
@@ -196,7 +196,9 @@ class PiGcsStage(LineStage):
             request=self._axis.last_move,
             reply=status.raw,
             expected=expected,
-            advice=advice(code) if code in EVENTS else "Find what stopped it (limit switch, person) before moving on",
-            state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts"
-            + ("" if status.homed else ", which are not those of the reference"),
+            advice=advice(code)
+            if code in EVENTS
+            else "Find what stopped it (limit switch, person) before you move it again",
+            state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts"
+            + ("" if status.homed else ", which do not count from the reference"),
         )

@@ -42,7 +42,7 @@ class PM16CLine:
         self._serial.send(command)
 
     def ask(self, request: str, form: str, meaning: str) -> re.Match[str]:
-        state = "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
+        state = "An earlier move was started; the stage may be turning" if self.commanded else "Nothing has moved"
         return self._serial.query(request, form, meaning, state)
 
     def set(self, command: str, query: str, value: int) -> None:
@@ -73,11 +73,11 @@ class PM16CLine:
         """The error for a read-back that is not what was set."""
         return DeviceError(
             self._name,
-            f"a setting was not taken ({self.complaint()})",
+            f"it did not accept a setting ({self.complaint()})",
             request=command,
             reply=reply,
             expected=wanted,
-            advice="Check that no other program or person drives this controller",
+            advice="Check that no other program or person controls this controller",
             state="Nothing has moved",
         )
 
@@ -94,7 +94,7 @@ class PM16CLine:
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
-ERRORS = {0x2: "a move was refused because its pulse chip was busy", 0x4: "a move to a wrong place was refused"}
+ERRORS = {0x2: "a move was rejected because its pulse chip was busy", 0x4: "a move to a wrong position was rejected"}
 """Error flags that tell of the motor; that of an unknown command is set by the empty line of every opening, too."""
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
@@ -111,7 +111,7 @@ class ChannelStatus:
 
     @property
     def stopped(self) -> bool:
-        """Whether the move was stopped."""
+        """True if the move was stopped."""
         return bool(STOPS & set(self.ending.split(", ")))
 
 
@@ -188,7 +188,7 @@ class PM16CChannel:
                 self._name,
                 f"{purpose} is not possible: the controller is in LOCAL",
                 reply=status.raw,
-                advice="Wait until all its motors stand and set REMOTE on the panel",
+                advice="Wait until all its motors have stopped, and set REMOTE on the panel",
                 state="Nothing has moved",
             )
         return status
@@ -272,11 +272,11 @@ class PM16CChannel:
         if number is not None and (int(number[1]), int(number[2])) < STATUS_SINCE:
             raise DeviceRefused(
                 self._name,
-                f"its firmware {number[1]}.{number[2]} does not tell the status of one channel (STSx?)",
+                f"its firmware {number[1]}.{number[2]} cannot report the status of one channel (STSx?)",
                 request="VER?",
                 reply=version,
                 expected="{}.{} or later".format(*STATUS_SINCE),
-                advice="Have the firmware updated by the vendor",
+                advice="Ask the vendor to update the firmware",
                 state="Nothing has moved",
             )
 
@@ -301,6 +301,6 @@ class PM16CChannel:
                 request=command,
                 reply=status.raw,
                 expected="a moving motor",
-                advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
-                state=f"The stage stands at {status.counts} counts",
+                advice="Check limit switches, the motor driver, and that the panel is in REMOTE",
+                state=f"The stage is at {status.counts} counts",
             )

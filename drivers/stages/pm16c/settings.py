@@ -28,7 +28,7 @@ class PulseWidths:
     def __post_init__(self) -> None:
         if self.chosen is not None and not self.allowed:
             raise ValueError(
-                f"the trigger output has no pulses of {self.chosen:g} s; it has {', '.join(f'{w:g}' for w in MODES)} s"
+                f"the trigger output has no pulses of {self.chosen:g} s; legal: {', '.join(f'{w:g}' for w in MODES)} s"
             )
 
     @property
@@ -111,12 +111,15 @@ class PM16CSettings(Wiring, StageFigures):
     channel: int = setting(0, ge=0, le=15)
     first_pulse: Pm16cFirstPulse = setting(
         Pm16cFirstPulse.AT_START,
-        "Where the firmware puts a train's first pulse: at its start point (from memory), or an interval behind it.",
+        "Where the firmware puts the first pulse of a train: at its start point (stated from memory, not "
+        "from the manual), or an interval after it.",
     )
     home: float | None = setting(
-        None, "Where its home switch is; null: it has none, and no search is made.", unit="deg"
+        None, "Angle of its home switch; null: it has none, and no search is made.", unit="deg"
     )
-    home_speed: float | None = setting(None, "For the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0)
+    home_speed: float | None = setting(
+        None, "Speed of the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -158,10 +161,10 @@ class PM16CSettings(Wiring, StageFigures):
         radians = 2 * math.pi / self.counts_per_turn
         if max(abs(self.low), abs(self.high)) > MAX_COUNT * radians:
             most = math.degrees(MAX_COUNT * radians)
-            raise ValueError(f"the controller counts to {MAX_COUNT}, which is {most:g} deg")
+            raise ValueError(f"the controller counts up to {MAX_COUNT}, which is {most:g} deg")
         if not 1 <= self.fastest <= MAX_SPEED:
             speed = math.degrees(self.max_speed)
-            raise ValueError(f"{speed:g} deg/s are {self.fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
+            raise ValueError(f"{speed:g} deg/s are {self.fastest} pulses/s, but the controller allows 1 to {MAX_SPEED}")
         acceleration = 1e6 / RATES[self.rate_code] * radians
         run_up = 1 if self.first_pulse is Pm16cFirstPulse.INTERVAL_AFTER else 0
         return self.limits_with(acceleration, self.widths.spacing, run_up=run_up)

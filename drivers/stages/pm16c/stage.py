@@ -69,9 +69,9 @@ class HomeSearch:
             self._name,
             f"the search for the home switch stopped short ({why})",
             reply=status.raw,
-            expected="to stand on the home switch",
+            expected="to be on the home switch",
             advice="Check the switch and its settings on the controller's panel, then search again",
-            state=f"It stands at {status.counts} counts, which are not those of the reference",
+            state=f"It is at {status.counts} counts, which do not count from the reference",
         )
 
 
@@ -118,7 +118,7 @@ class PM16CStage(LineStage):
             raise DeviceRefused(
                 self.name,
                 "it has no home switch",
-                advice="Where there is one, give its angle as `home_deg` in the configuration",
+                advice="If there is one, give its angle as `home_deg` in the configuration",
                 state="Nothing has moved",
             )
         search = HomeSearch(self._channel, self.name, self._home)
@@ -146,8 +146,8 @@ class PM16CStage(LineStage):
                 request=self._channel.last_move,
                 reply=status.raw,
                 expected=f"{self._travel.degrees(target)}, {target} counts",
-                advice="Find what stopped it (limit switch, interlock, stop button) before moving on",
-                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts",
+                advice="Find what stopped it (limit switch, interlock, stop button) before you move it again",
+                state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts",
             )
         return self.to_angle(status.counts)
 
@@ -185,7 +185,7 @@ class PM16CStage(LineStage):
     def digital_output(self, number: int) -> DigitalOutput:
         raise DeviceRefused(
             self.name,
-            f"the controller has no digital output {number} to set",
+            f"the controller has no digital output {number} that can be set",
             advice="Set shutter.kind: manual, or use the output of another controller",
             state="Nothing was sent",
         )

@@ -1,4 +1,5 @@
-"""One axis of a Zaber device in the device's own units: microsteps, native speeds, settings, flags, and its replies.
+"""One axis of a Zaber device in the device's own units (microsteps, native speeds), with its settings, flags and
+replies.
 
 Every command except a stop has its own message id and waits for its reply, which accepts or rejects it. Commands and
 replies are Zaber's ASCII protocol version 2, as the vendor's library zaber-motion sends and accepts it. Meanings of
@@ -29,37 +30,37 @@ class Meaning:
 
 
 FAULTS = {
-    "FF": Meaning("critical system error", "Switch the controller off and on; if it stays, ask the vendor"),
+    "FF": Meaning("critical system error", "Switch the controller off and on; if the error persists, ask the vendor"),
     "FN": Meaning("peripheral not supported", "Check which stage is plugged into the controller"),
     "FZ": Meaning("peripheral inactive", "Plug the stage in again and activate it"),
     "FH": Meaning("emergency stop of the hardware", "Release the emergency stop, then enable the driver"),
     "FV": Meaning("supply voltage out of range, driver off", "Check the power supply"),
     "FO": Meaning("driver disabled", "Find who disabled it, then `driver enable` with the vendor's software"),
     "FC": Meaning("inrush current too high", "Check the motor's cable and the power supply"),
-    "FM": Meaning("motor too hot", "Let it cool down; take a lower speed or load"),
+    "FM": Meaning("motor too hot", "Let it cool down; use a lower speed or load"),
     "FD": Meaning(
         "driver disabled", "Find the cause of an earlier fault, then `driver enable` with the vendor's software"
     ),
     "FQ": Meaning("encoder error, the position may be wrong", "Check the encoder's cable, then search the reference"),
     "FI": Meaning("encoder index error", "Search the reference again; check the encoder's cable"),
     "FA": Meaning("analogue encoder out of step", "Search the reference again; check the encoder's cable"),
-    "FR": Meaning("overdrive limit", "Take a lower acceleration or load"),
-    "FS": Meaning("stalled and stopped", "Find what blocks the stage; take a lower speed, acceleration or load"),
-    "FB": Meaning("stream bounds", "Find who runs a stream on this controller"),
-    "FP": Meaning("left its path", "Find who runs an interpolated move on this controller"),
+    "FR": Meaning("overdrive limit", "Use a lower acceleration or load"),
+    "FS": Meaning("stalled and stopped", "Find what blocks the stage; use a lower speed, acceleration or load"),
+    "FB": Meaning("stream bounds", "Find which program runs a stream on this controller"),
+    "FP": Meaning("left its path", "Find which program runs an interpolated move on this controller"),
     "FE": Meaning("limit error", "Find why the stage ran into a limit, then search the reference"),
-    "FT": Meaning("twisted too far", "Turn the cables back"),
+    "FT": Meaning("twisted too far", "Turn it back until the cables are straight"),
 }
 """Flags of a fault; the driver may be off."""
 ENDINGS = {
     "WL": Meaning(
-        "a limit switch came where none was expected", "Check travel limits and cables, search the reference"
+        "a limit switch came where none was expected", "Check travel limits and cables, then search the reference"
     ),
     "WV": Meaning("supply voltage out of range", "Check the power supply"),
     "WT": Meaning("controller hot", "Let it cool down"),
-    "WS": Meaning("stalled and recovered", "Take a lower speed, acceleration or load"),
-    "WM": Meaning("displaced while it stood", "Find what pushed the stage; search the reference"),
-    "NC": Meaning("moved by its knob", "Leave the knob alone while a scan runs"),
+    "WS": Meaning("stalled and recovered", "Use a lower speed, acceleration or load"),
+    "WM": Meaning("displaced while at rest", "Find what pushed the stage; search the reference"),
+    "NC": Meaning("moved by its knob", "Do not touch the knob during a scan"),
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
 """Flags that can explain why a move ended early, beside those of faults."""
@@ -71,22 +72,22 @@ LOST = frozenset({"FS", "FQ", "FI", "FA", "FE"})
 """Flags of faults after which the same holds."""
 UNREFERENCED = frozenset({"WR", "WH"})  # Flags of an axis that does not know its reference
 REASONS = {
-    "AGAIN": "it asks to repeat, again and again",
-    "AXISONLY": "this is asked of an axis only",
+    "AGAIN": "it repeatedly asks to repeat the request",
+    "AXISONLY": "only an axis can answer this",
     "BADAXIS": "there is no such axis",
     "BADCOMMAND": "it does not know this command or setting",
     "BADDATA": "a value is missing or out of its range",
     "BADMESSAGEID": "it cannot read the number of the message",
-    "DEVICEONLY": "this is asked of the device only",
+    "DEVICEONLY": "only the device as a whole can answer this",
     "DRIVERDISABLED": "its driver is disabled",
     "FULL": "its memory is full",
     "INACTIVE": "its peripheral is inactive",
     "NOACCESS": "the access level forbids it",
     "NOTSUPPORTED": "its peripheral is not supported",
     "PARKED": "it is parked",
-    "REMOTE": "it is under remote control by others",
-    "STATUSBUSY": "it does not do that while it moves",
-    "SYSTEMERROR": "it failed inside",
+    "REMOTE": "it is under remote control by another program",
+    "STATUSBUSY": "it cannot do that while it moves",
+    "SYSTEMERROR": "it had an internal failure",
 }
 
 
@@ -168,8 +169,8 @@ TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """Most digits of a position; a longer number is impossible for an axis and for a float."""
 CHECKSUM = "comm.checksum"
 BINARY = (
-    ". A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: switch it "
-    "with Zaber Launcher, or by the Binary command 124 (Convert To ASCII)"
+    ". A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: "
+    "switch it with Zaber Launcher, or with the Binary command 124 (Convert To ASCII)"
 )
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
@@ -293,16 +294,17 @@ class ZaberAxis:
         if not reply.accepted:
             raise DeviceRefused(
                 self._name,
-                f"it rejects this: {REASONS.get(reply.data, 'a reason that this driver does not know')} ({reply.data})",
+                f"it rejected this: {REASONS.get(reply.data, 'a reason that this driver does not know')} "
+                f"({reply.data})",
                 request=words,
                 reply=reply.raw,
-                advice="Check the configuration against the device, and that no other program drives it",
-                state="The move under way goes on" if reply.busy else "Nothing has moved by it",
+                advice="Check the configuration against the device, and that no other program controls it",
+                state="The current move continues" if reply.busy else "Nothing has moved by it",
             )
         return reply
 
     def _exchange(self, axis: int, words: str, form: str) -> Reply:
-        state = "A move was started before; the stage may be turning" if self._commanded else "Nothing has moved"
+        state = "An earlier move was started; the stage may be turning" if self._commanded else "Nothing has moved"
         identity = next(self._ids)
         request, meaning = encode(self._device, axis, identity, words), f"the reply to message {identity:02d}"
         return Reply.of(self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state))

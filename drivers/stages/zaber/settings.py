@@ -1,4 +1,4 @@
-"""Settings of a Zaber stage, their values in the controller, and a pulse train as its triggers.
+"""Settings of a Zaber stage, their values in the controller, and a pulse train programmed as triggers.
 
 One trigger fires once, at the right place, and enables a second that counts distance. The starter fires one step before
 the first pulse, the repeater then each step. So the stage may stand anywhere before the train. The time that firmware
@@ -38,27 +38,35 @@ class ZaberSettings(Wiring, StageFigures):
     device: int = setting(1, ge=1, le=99)
     axis: int = setting(1, ge=1, le=9)
     serial: str | None = setting(
-        None, "Its serial number (system.serial): another device is refused; null: any is taken."
+        None,
+        "Its serial number (system.serial); the driver stops with an error if another device answers. "
+        "null: accept any.",
     )
-    output: int = setting(1, "Digital output that the trigger pulses come from.", gt=0)
+    output: int = setting(1, "Digital output of the trigger pulses.", gt=0)
     toggle: bool = setting(
         False,
-        "Each fire toggles the output (firmware without `schedule`): every second one is a pulse, intervals are even.",
+        "true: each fire toggles the output (for firmware without `schedule`). Every second one is a "
+        "pulse, and intervals must be even.",
     )
-    speed_unit: float = setting(SPEED_UNIT, "Native speed per microstep/s; the vendor's convention, from memory.", gt=0)
-    measured: bool = setting(False, "Pulses by the encoder, not by the commanded position.")
+    speed_unit: float = setting(
+        SPEED_UNIT,
+        "Native speed per microstep/s; the vendor's convention (stated from memory, not from the manual).",
+        gt=0,
+    )
+    measured: bool = setting(False, "true: pulses follow the encoder, not the commanded position.")
     chained: bool = setting(
-        True, "An action may enable another trigger; false: arming turns the stage to one step before the first pulse."
+        True,
+        "true: an action may enable another trigger. false: arming turns the stage to one step before the first pulse.",
     )
-    fires_when_enabled: bool = setting(False, "A distance trigger fires where it is enabled, too.")
+    fires_when_enabled: bool = setting(False, "true: a distance trigger also fires where it is enabled.")
     starter: int = setting(1, gt=0)
     repeater: int = setting(2, "The numbers of the two triggers used.", gt=0)
-    shortest: float = setting(SHORTEST, "Between two fires at full speed.", unit="s", gt=0)
+    shortest: float = setting(SHORTEST, "Shortest time between two fires at full speed.", unit="s", gt=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fires_when_enabled and not self.chained:
-            raise ValueError("a trigger that fires when enabled needs another one to enable it: chained")
+            raise ValueError("a trigger that fires when it is enabled needs another one that enables it: chained")
         if self.starter == self.repeater:
             raise ValueError(f"starter and repeater must be two different triggers, got {self.starter} for both")
         if self.toggle and self.pulse_width is not None:
@@ -111,8 +119,8 @@ class ZaberSettings(Wiring, StageFigures):
         steepest = math.floor(self.acceleration * per_radian / 1e4 * (1 + 1e-9))
         if speed < 1 or steepest < 1:
             raise ValueError(
-                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² are "
-                f"native values of {speed} and {steepest}; the controller's gentlest are 1, "
+                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² "
+                f"are native values of {speed} and {steepest}; the controller's smallest are 1, "
                 f"{math.degrees(1e4 / per_radian):g} deg/s² for the latter"
             )
         return speed, steepest

@@ -1,4 +1,5 @@
-"""Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
+"""Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output at equal
+distances.
 
 Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
 those of `ZaberSettings`.
@@ -19,8 +20,8 @@ from drivers.stages.zaber.axis import INTERRUPTED, LOST, SLIPPED, WHOLE, ZaberAx
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (
-    "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
-    "room for one step before the first pulse"
+    "Firmware without `schedule` needs toggle. Firmware whose actions cannot enable triggers needs "
+    "chained: false, and room for one step before the first pulse"
 )
 
 
@@ -120,9 +121,9 @@ class ZaberStage(LineStage):
                 f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
                 request=self._axis.last_move,
                 reply=status.raw,
-                expected=f"to stand at {aim} without a fault",
-                advice="Find what stopped it before moving on" if fault is None else fault.advice,
-                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts: "
+                expected=f"to be at {aim} without a fault",
+                advice="Find what stopped it before you move it again" if fault is None else fault.advice,
+                state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts: "
                 + ("no reason given" if fault is None else fault.text),
             )
         self._searching = False
@@ -193,9 +194,9 @@ class ZaberStage(LineStage):
             self.name,
             f"the stage was disturbed since its last move: {fault.text}",
             reply=status.raw,
-            expected="a stage that stood still",
-            advice=f"{fault.advice}. What was measured since then may have been at another angle",
-            state=f"Nothing has moved by this; it stands at {self._travel.degrees(status.counts)}",
+            expected="a stage at rest",
+            advice=f"{fault.advice}. Frames since then may have been taken at another angle",
+            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(status.counts)}",
         )
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
@@ -234,7 +235,7 @@ class ZaberStage(LineStage):
     def _before_move(self, counts: int, target: int) -> None:
         """Keep a train correct before a move from `counts` against it, because distance counts both ways.
 
-        A train under way ends. A train before its first pulse is set up anew, or ends if the stage had to move for it.
+        A train under way ends. A train before its first pulse is set up again, or ends if the stage had to move for it.
         """
         train, settings = self._train, self._settings
         if train is None or train.interval * (target - counts) >= 0:

@@ -1,4 +1,4 @@
-"""StageConformance: laws for every stage, real or simulated: the suite that each stage's tests subclass."""
+"""StageConformance: conformance tests for every stage, real or simulated; the tests of a stage subclass them."""
 
 from __future__ import annotations
 

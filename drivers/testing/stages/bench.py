@@ -28,7 +28,7 @@ class Cable(Protocol):
     """The trigger cable, with a measurement of the true angle: a simulated line, or a counter card."""
 
     def next_after(self, time: float) -> EmittedPulse | None:
-        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
+        """The first pulse strictly later than `time`, even where that is still to come; None if there is none."""
 
     def angle_at(self, time: float) -> float:
         """The true angle in rad."""

@@ -1,4 +1,4 @@
-"""Every stage: identity, position, moves, stops, the search for the reference, closing."""
+"""Conformance tests of a stage: identity, position, moves, stops, the search for the reference, closing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Every stage: a train gives exactly its pulses at its angles, once, until it is disarmed, replaced or over."""
+"""Conformance tests of trigger trains: a train gives exactly its pulses at its angles, once, until it is disarmed,
+replaced or complete.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Cameras behind EPICS areaDetector: somebody else's scan recorded as one of ours, and ours served to others."""
+"""EPICS areaDetector: record the scan of another program, serve a scan of ours to other programs, drive a camera."""

@@ -1,8 +1,8 @@
 """Frames of areaDetector as values: an NTNDArray becomes pixels [row, col] with number, time, window and attributes.
 
-Compressed pixels (NDPluginCodec) are decoded by the filters of HDF5 that hdf5plugin brings: a frame is written as the
-one chunk of a dataset in memory, undecoded, and read back. areaDetector leaves out the headers with which filters of
-HDF5 begin their chunks: for bslz4 and lz4 they are put before the pixels (bitshuffle, Masui et al. 2015; the LZ4 filter
+Compressed pixels (NDPluginCodec) are decoded with the HDF5 filters that hdf5plugin brings. A frame is written,
+undecoded, as the only chunk of a dataset in memory, and read back. HDF5 filters begin their chunks with a header that
+areaDetector leaves out: for bslz4 and lz4 it is put before the pixels (bitshuffle, Masui et al. 2015; the LZ4 filter
 of the HDF Group).
 """
 
@@ -31,13 +31,13 @@ class FrameRefusedError(ValueError):
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the sensor that a frame shows, cumulative over the plugins it passed.
+    """The part of the sensor that a frame shows, after all plugins that it passed.
 
     Attributes:
         shape: rows and columns of the frame.
         offset: (row, col) of its first pixel, in unbinned pixels of the sensor.
-        binning: sensor pixels a pixel, by row and column.
-        reverse: whether rows and columns run the other way.
+        binning: number of sensor pixels in a pixel, along rows and columns.
+        reverse: whether rows and columns are mirrored.
     """
 
     shape: tuple[int, int]
@@ -48,14 +48,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrame:
-    """One NTNDArray; its pixels are decoded when they are asked for.
+    """One NTNDArray. Its pixels are decoded only by `counts`.
 
     Attributes:
         unique_id: the driver's number of the frame, usually from 1 at the start of an acquisition.
-        time: s since the Unix epoch, at which the driver had the frame, after readout.
+        time: s since the Unix epoch, when the driver received the frame, after readout.
         received: s since the Unix epoch, on this computer's clock.
         attributes: NDAttributes by name.
-        is_current: the value that the server had when it was connected: an old frame, unless its number is new.
+        is_current: the server had this frame already when we connected: an old frame, unless its number is new.
         codec: "" for raw pixels.
     """
 
@@ -71,24 +71,24 @@ class ArrayFrame:
 
     @property
     def kind(self) -> tuple[Window, np.dtype[Any]]:
-        """What does not change within a file."""
+        """Window and type, which do not change within a file."""
         return self.window, self.dtype
 
     @property
     def n_bytes(self) -> int:
-        """Of the message's pixels, as they are held in memory."""
+        """Size of the pixels as received, in bytes."""
         return self.payload.nbytes
 
     def counts(self) -> NDArray[np.uint16]:
-        """uint16 [row, col]. ValueError where a compressed frame is damaged."""
+        """The pixels, uint16 [row, col]. ValueError: a compressed frame is damaged."""
         if not self.codec:
             return self.payload.reshape(self.window.shape).astype(np.uint16, copy=False)
         return decoded(self.codec, self.payload, self.window.shape, self.dtype).astype(np.uint16, copy=False)
 
 
 def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayFrame | None:
-    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet. Its pixels are
-    those of the message.
+    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet. The pixels are
+    not copied.
 
     Raises:
         FrameRefusedError: colour, signed or real pixels, JPEG, or another codec or number of dimensions.
@@ -101,8 +101,8 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
     _refuse_colour(attributes, sizes)
     if codec and codec not in NAMES:
         raise FrameRefusedError(
-            f"its pixels are compressed by {codec}, which "
-            + ("does not keep counts" if codec == "jpeg" else "this program does not know")
+            f"its pixels are compressed with {codec}, which "
+            + ("changes the counts" if codec == "jpeg" else "this program cannot decode")
             + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
         )
     # A codec's parameters are an `any`: an int with pvDatabase's servers, None without a codec.
@@ -128,9 +128,10 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
 def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     mode = attributes.get("ColorMode", _MONO)
     if mode != _MONO or len(sizes) != 2:
-        what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"of {len(sizes)} dimensions"
+        what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (of a 3D array: a plugin before makes it)"
+            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (if the array is 3D, a plugin before makes "
+            "it so)"
         )
 
 
@@ -139,8 +140,8 @@ def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
         raise FrameRefusedError(f"its codec {codec} does not say the type of its pixels")
     if dtype not in COUNTS:
         raise FrameRefusedError(
-            f"its pixels are {dtype}, and counts are uint8 or uint16; set cam1:DataType (or the DataType of the last "
-            "plugin that computes, such as Proc1) to UInt16"
+            f"its pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
+            "plugin that changes pixels, such as Proc1) to UInt16"
         )
 
 
@@ -148,13 +149,13 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     n_bytes = dtype.itemsize * math.prod(shape)
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
-            f"it has {pixels.nbytes} bytes, and its dimensions say {shape[0]} x {shape[1]} {dtype}; expected as many, "
-            f"and {MOST_BYTES >> 20} MB at most"
+            f"it has {pixels.nbytes} bytes, which does not fit its dimensions, {shape[0]} x {shape[1]} {dtype}, or is "
+            f"more than {MOST_BYTES >> 20} MB"
         )
 
 
 def _window(dimension: Any) -> Window:
-    """dimension[0] is x, the fastest."""
+    """The window; dimension[0] is x, which varies fastest."""
     x, y = dimension
     return Window(
         (int(y.size), int(x.size)),
@@ -165,10 +166,10 @@ def _window(dimension: Any) -> Window:
 
 
 ELEMENTS = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8"}
-"""`codec.parameters` of NTNDArray: pvData's number of the pixels' type, for numpy."""
+"""`codec.parameters` of NTNDArray, pvData's number for the type of the pixels -> type of numpy."""
 _BLOCK = 8192  # bytes of a block of bitshuffle
-MOST_BYTES = 2**29  # of a frame: more than those of the largest sensors
-_MOST_RATIO = 256  # LZ4 makes 255 bytes of one at most
+MOST_BYTES = 2**29  # largest frame: more than the largest sensors have
+_MOST_RATIO = 256  # LZ4 expands one byte to 255 at most
 
 
 def _bslz4(payload: bytes, n_bytes: int, item: int) -> bytes:
@@ -186,21 +187,22 @@ NAMES = (*_CODECS,)
 
 
 def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The pixels [row, col] of a compressed frame, little-endian as nearly all IOCs are: the message does not say.
+    """The pixels [row, col] of a compressed frame. The message does not state the byte order: little-endian is assumed,
+    as in nearly all IOCs.
 
     Args:
         codec: one of NAMES.
 
     Raises:
-        ValueError: they cannot be decoded. What they cannot hold is found before memory is taken for it.
+        ValueError: they cannot be decoded. A wrong size is found before memory is allocated.
     """
     make_filter, with_header = _CODECS[codec]
     n_bytes = dtype.itemsize * shape[0] * shape[1]
     held = int.from_bytes(payload[4:8].tobytes(), "little") if codec == "blosc" else _MOST_RATIO * payload.nbytes
     if held < n_bytes:
-        raise ValueError(f"its {codec} pixels cannot be decoded (they are fewer than {shape[0]} x {shape[1]})")
+        raise ValueError(f"its {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
     chunk = payload.tobytes()
-    if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks of files as they are
+    if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks with their header
         chunk = with_header(chunk, n_bytes, dtype.itemsize)
     try:
         with h5py.File("frame", "w", driver="core", backing_store=False) as file:

@@ -1,6 +1,6 @@
-"""AreaDetectorCamera: a camera behind an EPICS areaDetector, set by its records, with frames by PVAccess.
+"""AreaDetectorCamera: a camera behind an EPICS areaDetector. Its records set it, and frames come over PVAccess.
 
-Its times are those at which its driver had a frame, less exposure and readout: they miss the pulse by milliseconds.
+The time of a frame is when the driver received it, minus exposure and readout: it misses the pulse by milliseconds.
 """
 
 from __future__ import annotations
@@ -19,45 +19,51 @@ from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
 from splatline_areadetector.camera_records import DRIVERS, LOOK_EVERY, DriverLabels, Records
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Item, Overflow, Queues, Refused
 
-_SETTLED = 0.2  # s for which no frame comes once a camera is stopped
+_SETTLED = 0.2  # s without a frame, after which a stopped camera counts as silent
 _LONGEST = 3600.0  # s, exposure
 _LEAST_RING = 2  # frames
 
 
 @dataclass(frozen=True)
 class AreaDetectorSettings:
-    """Of the IOC and its camera; what EPICS cannot tell is stated here."""
+    """Settings of the IOC and its camera, including what EPICS cannot tell."""
 
-    prefix: str = setting(..., "Of the IOC's records, by ca:// or pva://, such as ca://2bmSP2:.")
+    prefix: str = setting(..., "Prefix of the IOC's records, with ca:// or pva://, such as ca://2bmSP2:.")
     driver: Literal["spinnaker", "simdetector", "pco", "andor3", "hamamatsu", "eiger"] = setting(
-        ..., "Of areaDetector, which the labels of triggers are of."
+        ..., "Driver of areaDetector: it determines the labels of the trigger records."
     )
-    sensor: tuple[int, int] = setting(..., "Its rows and columns.")
-    readout: float = setting(..., "Of a full frame.", unit="s", gt=0, le=100)
-    electrons_per_count: float = setting(..., "By its data sheet.", gt=0, le=1e6)
-    image: str | None = setting(None, "pva://NAME of the frames; null: PREFIXPva1:Image.")
+    sensor: tuple[int, int] = setting(..., "Rows and columns of the sensor.")
+    readout: float = setting(..., "Read-out time of a full frame.", unit="s", gt=0, le=100)
+    electrons_per_count: float = setting(..., "Electrons for each count, from the data sheet.", gt=0, le=1e6)
+    image: str | None = setting(None, "Where the frames come from, pva://NAME; null: PREFIXPva1:Image.")
     line: str = setting("Line0", "The camera's input for trigger pulses (spinnaker).")
-    min_period: float = setting(0.0, "Between triggers, at least.", unit="s", ge=0, le=100)
+    min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
     dead: float = setting(
-        0.0, "Between exposures; readout_s where it does not expose meanwhile.", unit="s", ge=0, le=100
+        0.0,
+        "Dead time between two exposures; readout_s if the camera cannot expose during readout.",
+        unit="s",
+        ge=0,
+        le=100,
     )
-    row_period: float = setting(0.0, "From row to row of a rolling shutter; 0: global.", unit="s", ge=0, le=1)
-    bits: int = setting(16, "Of a count.", ge=8, le=16)
-    offset: float = setting(0.0, "Counts without light.", ge=0, le=65535)
-    ring: int = setting(2_000, "Memory for frames that wait.", unit="mb", ge=1, le=1_000_000)
-    timeout: float = setting(5.0, "For an answer of the IOC.", unit="s", gt=0, le=100)
+    row_period: float = setting(
+        0.0, "Time from one row to the next of a rolling shutter; 0: global shutter.", unit="s", ge=0, le=1
+    )
+    bits: int = setting(16, "Bits of a pixel.", ge=8, le=16)
+    offset: float = setting(0.0, "Counts without beam.", ge=0, le=65535)
+    ring: int = setting(2_000, "Memory for frames that wait for the disk.", unit="mb", ge=1, le=1_000_000)
+    timeout: float = setting(5.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=100)
 
 
 class AreaDetectorCamera:
     """Implements drivers.base.protocols.Camera. See `AreaDetectorSettings`.
 
-    Framestamps are the numbers that its driver gives frames, from 0 at arm: a lost frame leaves a gap. Where the camera
-    counts them (spinnaker, hamamatsu), the loss of the very first one shows in the frames that are missing at the end.
-    One thread takes frames; another may call `disarm` or `close`, which end its wait.
+    Framestamps are the frame numbers of the driver, from 0 at arm: a lost frame leaves a gap. If the camera counts them
+    (spinnaker, hamamatsu), a loss of the very first frame shows at the end, because a frame is missing there. One
+    thread takes frames; another may call `disarm` or `close`, which end the wait for a frame.
 
     Raises:
-        DeviceTimeout, DeviceError: the IOC does not answer, or its image cannot be taken.
-        DeviceRefused: its sensor is another one than configured, or a plugin shows the image in part.
+        DeviceTimeout, DeviceError: the IOC does not answer, or its image cannot be stored.
+        DeviceRefused: the sensor is not the configured one, or a plugin shows only part of the image.
     """
 
     Settings = AreaDetectorSettings
@@ -79,7 +85,7 @@ class AreaDetectorCamera:
             self._stream = FrameStream(image, Queues(ring_megabytes=1e-6 * settings.ring), within=settings.timeout)
         except FrameRefusedError as error:
             self._records.close()
-            raise DeviceError(self.name, f"its image cannot be taken: {error}", state="Nothing was set") from error
+            raise DeviceError(self.name, f"its image cannot be stored: {error}", state="Nothing was set") from error
         except BaseException:
             self._records.close()
             raise
@@ -88,7 +94,7 @@ class AreaDetectorCamera:
 
     @staticmethod
     def timing_of(settings: AreaDetectorSettings, wanted: CameraSettings) -> CameraTiming:
-        """The timing by the configuration. Raises ValueError for what it would refuse."""
+        """The timing from the configuration. Raises ValueError for settings that are not possible."""
         rows, cols = settings.sensor
         if not 0 < wanted.exposure <= _LONGEST:
             raise ValueError(f"an exposure of {wanted.exposure:g} s is not possible; expected up to {_LONGEST:g} s")
@@ -96,9 +102,9 @@ class AreaDetectorCamera:
             raise ValueError(f"readout {wanted.readout!r} is unknown; legal: standard")
         row0, col0, height, width = wanted.roi or (0, 0, rows, cols)
         if row0 + height > rows or col0 + width > cols:
-            raise ValueError(f"roi {list(wanted.roi or ())} reaches beyond the sensor of {rows} x {cols} pixels")
+            raise ValueError(f"roi {list(wanted.roi or ())} is larger than the sensor of {rows} x {cols} pixels")
         if height % wanted.binning or width % wanted.binning:
-            raise ValueError(f"{height} x {width} pixels are not divided by binning {wanted.binning}")
+            raise ValueError(f"{height} x {width} pixels cannot be divided by binning {wanted.binning}")
         shape = height // wanted.binning, width // wanted.binning
         period = max(settings.min_period, wanted.exposure + settings.dead)
         return CameraTiming(shape, period, settings.readout, settings.row_period, settings.bits)
@@ -109,14 +115,14 @@ class AreaDetectorCamera:
         return self.timing_of(self._own, self._settings)
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Set the records and read them back; the exposure may differ by the camera's rounding.
+        """Set the records and read them back. The camera may round the exposure.
 
         Raises:
-            DeviceRefused: it cannot, or is armed; the earlier settings stay.
+            DeviceRefused: the settings are not possible, or the camera is armed; the earlier settings stay.
         """
         self._require_open()
         if self._armed:
-            raise DeviceRefused(self.name, "it is armed and cannot be configured", advice="disarm() it first")
+            raise DeviceRefused(self.name, "it cannot be configured while it is armed", advice="disarm() it first")
         try:
             self.timing_of(self._own, settings)
         except ValueError as error:
@@ -133,7 +139,7 @@ class AreaDetectorCamera:
         """Wait for triggers; framestamps start at 0.
 
         Raises:
-            DeviceRefused: it is armed already, or n_frames < 1.
+            DeviceRefused: the camera is armed already, or n_frames < 1.
         """
         self._require_open()
         if self._armed:
@@ -152,7 +158,7 @@ class AreaDetectorCamera:
         rows, cols = self.timing.shape
         with self._changed:
             self._ring.clear()
-            # Half of the memory is for those that come and those that are written: else the newest would find no room.
+            # Half of the memory is kept for arriving frames and for frames being written, so that the newest has room.
             self._ring_size = max(_LEAST_RING, self._own.ring // 2 // (2 * rows * cols))
             self._lost = self._overrun = 0
             self._problem, self._origin = None, 1 if labels.counted else None
@@ -165,25 +171,25 @@ class AreaDetectorCamera:
             raise
 
     def software_trigger(self) -> None:
-        """Expose one frame. Raises DeviceRefused: it is not armed, or for other triggers."""
+        """Expose one frame. Raises DeviceRefused: not armed, or configured for another trigger."""
         if not self._armed or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "armed" if self._armed else "not armed"
-            problem = f"it accepts no software trigger ({armed}, trigger {self._settings.trigger})"
+            problem = f"it cannot take a software trigger now ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         if self._labels.fire:
             self._records.write(f"cam1:{self._labels.fire}", 1)
         else:
-            self._records.await_value("cam1:Acquire", 0)  # of the frame before
+            self._records.await_value("cam1:Acquire", 0)  # the acquisition of the frame before
             self._records.write("cam1:Acquire", 1)
 
     def next_frame(self, timeout: float) -> CameraFrame:
         """The oldest frame not yet taken.
 
         Raises:
-            DeviceTimeout: none came within `timeout` s.
+            DeviceTimeout: no frame came within `timeout` s.
             DeviceRefused: not armed, or disarmed while waiting.
-            DeviceError: the ring was overrun (later frames can still be taken), frames are of another size or kind than
-                set, or the IOC has gone.
+            DeviceError: the ring buffer overflowed (later frames can still be taken), frames have another size or type
+                than was set, or the IOC has gone.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._ring or self._lost or self._problem or not self._armed, timeout)
@@ -201,13 +207,13 @@ class AreaDetectorCamera:
             if problem is not None:
                 raise problem
         raise DeviceTimeout(
-            self.name, f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})",
+            self.name, f"no frame came within {timeout:g} s (trigger: {self._settings.trigger})",
             advice="Check that triggers arrive, that cam1:ArrayCallbacks and Pva1:EnableCallbacks are Enable, and that "
             "Pva1:MinCallbackTime is 0", state="It is still armed",
         )  # fmt: skip
 
     def disarm(self) -> None:
-        """Stop it and forget frames that were not taken; legal in every state."""
+        """Stop the camera and drop frames that were not taken; allowed in every state."""
         if self._closed:
             return
         with self._changed:
@@ -218,7 +224,7 @@ class AreaDetectorCamera:
             self._records.set("cam1:Acquire", 0)
 
     def describe(self) -> dict[str, str | int | float]:
-        """Identity and settings, and the frames that were lost in our ring in the current or last run."""
+        """Identity and settings, and the number of frames lost in our ring buffer in the current or last run."""
         self._require_open()
         return {
             "model": str(self._records.read("cam1:Model_RBV")) or "areaDetector",
@@ -236,7 +242,7 @@ class AreaDetectorCamera:
         }
 
     def close(self) -> None:
-        """Stop it and close all connections. A second time does nothing."""
+        """Stop the camera and close all connections. A second call does nothing."""
         if self._closed:
             return
         try:
@@ -256,18 +262,18 @@ class AreaDetectorCamera:
         if (rows, cols) != tuple(self._own.sensor):
             raise DeviceRefused(
                 self.name,
-                f"its sensor has {rows} x {cols} pixels, and devices.camera.sensor is {list(self._own.sensor)}",
+                f"its sensor has {rows} x {cols} pixels, but devices.camera.sensor is {list(self._own.sensor)}",
                 advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
             )  # fmt: skip
 
     def _applied(self, wanted: CameraSettings) -> CameraSettings:
-        """Write the settings; with the exposure that the camera accepted."""
+        """Write the settings. Returns them with the exposure that the camera accepted."""
         records, labels = self._records, self._labels
         records.set("cam1:Acquire", 0)
         row0, col0, height, width = wanted.roi or (0, 0, *self._own.sensor)
         n = wanted.binning
         across = n if labels.binned_region else 1
-        for record in ("MinX", "MinY"):  # a larger region fits only from the corner
+        for record in ("MinX", "MinY"):  # first to the corner, or a larger region would not fit
             records.write(f"cam1:{record}", 0)
         binnings = {"A3Binning": labels.binning.format(n)} if labels.binning else {"BinX": n, "BinY": n}
         region = {"SizeX": width // across, "SizeY": height // across, "MinX": col0 // across, "MinY": row0 // across}
@@ -282,7 +288,7 @@ class AreaDetectorCamera:
         return accepted
 
     def _await_silence(self) -> None:
-        """Let frames of an earlier run pass by, which the network may still hold."""
+        """Drop frames of an earlier run that may still arrive from the network."""
         silent, seen = self._clock.now(), self._stream_items
         while self._clock.now() - silent < _SETTLED:
             self._clock.sleep(LOOK_EVERY)
@@ -308,14 +314,14 @@ class AreaDetectorCamera:
                 self._lost += 1
                 self._overrun += 1
             case Refused(_, why):
-                self._fail(f"its frames cannot be taken: {why}")
+                self._fail(f"its frames cannot be stored: {why}")
             case Died(code):
                 self._fail(
-                    f"the process that receives its frames has ended ({code}), and another one is started",
+                    f"the process that receives its frames has ended (exit code {code}); another one is being started",
                     state="Frames taken before are good",
                 )
             case Disconnected():
-                advice = "Look whether it runs; it goes on when it is back"
+                advice = "Check whether it runs; the camera continues when the IOC is back"
                 self._fail("its IOC has gone", advice, "Frames taken before are good")
             case ArrayFrame(is_current=False):
                 self._take_frame(item)
@@ -329,8 +335,9 @@ class AreaDetectorCamera:
         shape = self.timing_of(self._own, self._settings).shape
         if item.window.shape != shape:
             self._fail(
-                f"its frames are {item.window.shape[0]} x {item.window.shape[1]} pixels, and {shape[0]} x {shape[1]} "
-                "were set", "Look which plugin Pva1:NDArrayPort names: one that bins or crops may stand before it",
+                f"its frames have {item.window.shape[0]} x {item.window.shape[1]} pixels, but {shape[0]} x {shape[1]} "
+                "were "
+                "set", "Check Pva1:NDArrayPort: it may name a plugin that bins or crops",
             )  # fmt: skip
             return
         if self._origin is None:

@@ -1,7 +1,9 @@
-"""Records of an IOC that the camera driver sets, and what drivers of areaDetector are told for each source of triggers.
+"""Records of an IOC that the camera driver sets, and the labels that areaDetector's drivers need for each trigger
+source.
 
-Labels, never indices: a driver's choices change with its camera. Sources: the templates of ADSpinnaker and ADGenICam,
-ADSimDetector, ADPcoWin, ADAndor3 and ADHamamatsuDCAM, eigerBase.template of ADEiger, and what tomoscan (APS) writes.
+Labels are written, never indices, because the choices of a driver change with its camera. Sources: the templates of
+ADSpinnaker and ADGenICam, ADSimDetector, ADPcoWin, ADAndor3 and ADHamamatsuDCAM, eigerBase.template of ADEiger, and
+what tomoscan (APS) writes.
 """
 
 from __future__ import annotations
@@ -25,16 +27,15 @@ _SINGLE = {**_MODES, TriggerSource.SOFTWARE: "Single"}
 
 @dataclass(frozen=True)
 class DriverLabels:
-    """What a driver is told.
+    """The records and labels that a driver needs.
 
     Attributes:
-        triggers: for each source that it has; {line}: as configured.
-        fire: the record that exposes a frame by software; "": each is an acquisition of one frame.
-        modes: ImageMode for each source; None: it has no such record.
-        counted: frames are numbered from 1 by ArrayCounter, which is set to 0 before; else by the camera, from its
-            first.
-        train: the record that takes the number of external triggers, each of one image; "": it needs none.
-        binning: a label of A3Binning, in place of BinX and BinY.
+        triggers: records to write for each trigger source; {line}: as configured.
+        fire: the record that triggers a frame by software; "": each frame is an acquisition of one frame.
+        modes: ImageMode for each trigger source; None: the driver has no such record.
+        counted: ArrayCounter numbers frames from 1, after it was set to 0; else the camera numbers them from its first.
+        train: the record for the number of external triggers, each of one image; "": not needed.
+        binning: label of A3Binning, in place of BinX and BinY.
         binned_region: SizeX and SizeY are in binned pixels.
     """
 
@@ -50,7 +51,7 @@ class DriverLabels:
 def _labelled(
     record: str, internal: str, external: str, software: str, **all_of: str
 ) -> Mapping[TriggerSource, Writes]:
-    """A record with a label for each source, and others that are the same for all."""
+    """A record with a label for each trigger source, and other records that are the same for all sources."""
     labels = {TriggerSource.INTERNAL: internal, TriggerSource.EXTERNAL: external, TriggerSource.SOFTWARE: software}
     return {source: {record: label, **all_of} for source, label in labels.items()}
 
@@ -80,9 +81,9 @@ DRIVERS: Mapping[str, DriverLabels] = {
         modes=None, train="NumTriggers",
     ),
 }  # fmt: skip
-"""By the name that a configuration gives the driver."""
+"""The drivers, by their names in a configuration."""
 
-LOOK_EVERY = 0.02  # s, for a readback
+LOOK_EVERY = 0.02  # s between two reads of a readback
 
 
 class Records:
@@ -100,17 +101,17 @@ class Records:
         self._channel(record).write("", value)
 
     def set(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Write a value, and wait for its readback; a number may differ by this share. The readback."""
+        """Write a value, and wait for its readback; a number may differ by this fraction. Returns the readback."""
         self.write(record, value)
         return self.await_value(record, value, within)
 
     def await_value(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Wait until the readback is this value. Raises DeviceRefused if it does not come to be."""
+        """Wait until the readback has this value. Raises DeviceRefused if it does not get it."""
         deadline = self._clock.now() + self._timeout
         while not _is_near(shown := self.read(f"{record}_RBV"), value, within):
             if self._clock.now() > deadline:
                 raise DeviceRefused(
-                    self._name, f"{record} did not take {value!r}", request=f"{self._prefix}{record} = {value}",
+                    self._name, f"{record} did not accept {value!r}", request=f"{self._prefix}{record} = {value}",
                     reply=f"{record}_RBV is {shown!r}", state="Other settings may have changed",
                     advice="Try it in the camera's control screen, and check `driver`",
                 )  # fmt: skip
@@ -136,4 +137,4 @@ def _is_near(shown: float | str, value: float | str, within: float) -> bool:
 _SWITCHED: dict[float | str, tuple[str, ...]] = {
     0: ("No", "Disable", "Off", "Done"), 1: ("Yes", "Enable", "On", "Acquire", "Acquiring"),
 }  # fmt: skip
-"""Labels of switches, which are written as 0 or 1."""
+"""Labels of switches that are written as 0 or 1."""

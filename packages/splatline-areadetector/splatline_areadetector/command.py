@@ -1,4 +1,4 @@
-"""`beamline ride`: records somebody else's scan, from its image of areaDetector, as a scan of ours."""
+"""`beamline ride`: records the scan of another program, from the image of its areaDetector, as a scan file."""
 
 from __future__ import annotations
 
@@ -35,16 +35,22 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 @click.command()
 @click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
 @click.option("--example", is_flag=True, is_eager=True, expose_value=False, callback=_print_example,
-              help="Print a configuration to edit.")  # fmt: skip
+              help="Print a configuration to edit, then exit.")  # fmt: skip
 @set_option
 @click.option("--check", "only_check", is_flag=True,
-              help="Show what the IOC says, and whether two seconds of frames arrive whole.")  # fmt: skip
-@click.option("--darks", metavar="FILE", help="Darks, where the scan takes none: a scan, HDF5 (FILE::DATASET), TIFF.")
-@click.option("--flats", metavar="FILE", help="Flats, likewise.")
-@click.option("--page", is_flag=True, help="Show the runs in the browser, at one address.")
-@click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
+              help="Record nothing; show what the IOC says, and whether 2 s of frames arrive complete.")  # fmt: skip
 @click.option(
-    "--repeat", is_flag=True, help="After a scan, also one that lacks frames, wait for the next one, until Ctrl-C."
+    "--darks", metavar="FILE", help="Darks for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
+)
+@click.option(
+    "--flats", metavar="FILE", help="Flats for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
+)
+@click.option("--page", is_flag=True, help="Show the runs in the browser, all at one address.")
+@click.option("--no-live", is_flag=True, help="Do not reconstruct during the scan.")
+@click.option(
+    "--repeat",
+    is_flag=True,
+    help="Record one scan after the other until Ctrl-C, even if frames are missing in some.",
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
               help="Folder for the folders of runs. Default: storage.folder of CONFIG.")  # fmt: skip
@@ -58,13 +64,16 @@ def ride(
     as_json: bool,
     **more: object,
 ) -> None:
-    """Record the next scan of another program from its image of areaDetector over PVAccess, as CONFIG says.
+    """Record the next scan of another program: store the frames that an areaDetector sends over PVAccess.
 
-    Frames go into a run of ours, with the monitor, the page and a live volume, while tomoscan, bluesky or whatever
-    else acquires. No process variable is written, and nothing is slowed down. The first Ctrl-C ends the file in order.
+    CONFIG says where frames and angles come from. tomoscan, bluesky or another program runs the scan; this command
+    stores its frames in a run folder, with the monitor, the page and a live volume. It writes no process variable and
+    does not slow the scan down. The first Ctrl-C closes the file properly.
 
-    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server, 4 stopped, 5
-    frames are missing (which, and whose loss it was, is said), 7 alarms of the monitor.
+    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server answers,
+    4 stopped, 5 frames are missing (a message says which, and who lost them), 7 alarms of the monitor.
+
+    Example: beamline ride my.yaml --page
     """
     from beamline.config.load import load_as
     from splatline_areadetector.config import RideConfig
@@ -85,7 +94,10 @@ def ride(
         if results and not as_json:
             click.echo("\n".join(_lines(result) for result in results))
     if alarmed := sum(result.alarmed_frames for result in results):
-        raise AlarmError(f"The scan is complete, but {alarmed} frames have an alarm of the monitor.")
+        raise AlarmError(
+            f"The scan is complete, but {count(alarmed, 'frame')} {'has' if alarmed == 1 else 'have'} an alarm of the "
+            "monitor."
+        )
 
 
 def _ride(
@@ -99,7 +111,7 @@ def _ride(
     repeat: bool,
     output: Path | None,
 ) -> None:
-    """Record the next scan, or with `repeat` one after the other; those that are whole come into `results`."""
+    """Record the next scan, or with `repeat` one scan after the other. Complete scans are added to `results`."""
     from beamline.scan.live_process import Standby
     from splatline_areadetector.ridden import Ride
     from splatline_areadetector.ride import NoScanError, opened, ride_scan
@@ -110,7 +122,7 @@ def _ride(
         terminal = held.enter_context(Terminal(sys.stderr))
         sinks: list[Sink] = [terminal, *others]
         runs = output or Path(config.storage.folder)
-        if page:  # of all its scans, at one address
+        if page:  # one address for all scans
             runs.mkdir(parents=True, exist_ok=True)
             tell = held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
 
@@ -145,16 +157,16 @@ def _ride(
 def _raise_worst(
     ended: BeamlineError | str, n_whole: int, lacking: Sequence[LedgerError], say: Callable[[str], None]
 ) -> None:
-    """Say how many scans were recorded one after the other, and raise what was worst.
+    """Print how many scans were recorded one after the other, and raise the worst error.
 
     Args:
-        ended: why the last one did; "": it was waited for.
+        ended: why the last scan ended; "": no scan was running.
     """
     n = n_whole + len(lacking)
     told = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")
-    told = f"Recorded: {told}, of which {len(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} frames."
+    told = f"Recorded: {told}; in {len(lacking)} of them frames are missing."
     if lacking:
-        raise LedgerError(" ".join(filter(None, (str(ended), told, "The last such:", str(lacking[-1])))), [])
+        raise LedgerError(" ".join(filter(None, (str(ended), told, "The last of these:", str(lacking[-1])))), [])
     if isinstance(ended, BeamlineError):
         raise type(ended)(f"{ended} {told}") from ended
     say(told)

@@ -1,4 +1,4 @@
-"""Configuration of `beamline ride`: where the frames come from, and what gives each its angle and kind."""
+"""Configuration of `beamline ride`: where the frames, their angles and their kinds come from."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from splatline_areadetector.stream import Queues, image_problem
 from splatline_areadetector.variables import url_problem
 
 KINDS = "HDF5FrameLocation"
-"""The attribute by which the file plugin of APS sorts frames: tomoscan sets it."""
+"""NDAttribute with the kind of a frame: tomoscan sets it, and the file plugin at APS sorts frames by it."""
 
 
 Prefix = Annotated[str, Setting("pva:// or ca:// and a prefix of process variables", problem=url_problem)]
 
 
 def _from(kind: str) -> Any:
-    """A section whose key `from` is this word."""
+    """A section of the configuration whose key `from` has this value."""
     return section_of(f"{kind.title()}Base", Section, {"from": (Literal[kind], ...)})
 
 
 class TomoscanAngles(_from("tomoscan")):  # type: ignore[misc]
-    """Of a scan by tomoscan: start, step, counts and the kind of each frame by its process variables."""
+    """A scan run by tomoscan: its process variables give start, step, numbers of frames and the kind of each frame."""
 
     prefix: Prefix
 
 
 class PlanAngles(_from("plan")):  # type: ignore[misc]
-    """Equal steps from the first projection."""
+    """A scan with equal steps, counted from the first projection."""
 
     views: Views
     start_deg: Degrees = 0.0
@@ -53,56 +53,68 @@ class PlanAngles(_from("plan")):  # type: ignore[misc]
 
 
 class AttributeAngles(_from("attribute")):  # type: ignore[misc]
-    """Of a step scan: an attribute of each frame, the position of the stage while it stands."""
+    """A step scan: each frame has an attribute with its angle, the position of the standing stage."""
 
     views: Views
     name: str = setting("SampleRotary", "Name of the NDAttribute, in degrees.", min_length=1)
 
 
 class PandaAngles(_from("panda")):  # type: ignore[misc]
-    """Of a fly scan by a PandABox: its file, followed while it is written; row n is trigger n."""
+    """A fly scan with a PandABox: angles come from its file, read while it is written. Row n belongs to trigger n."""
 
     views: Views
     file: str = setting(doc="The HDF5 file of the PandABox, written in SWMR mode.", min_length=1)
     dataset: str = setting("/INENC1.VAL.Value", "The position captured at each trigger.", min_length=1)
-    deg_per_unit: float = setting(1.0, "Degrees of a unit of it.", ge=-1e6, le=1e6)
-    offset_deg: Degrees = 0.0
+    deg_per_unit: float = setting(1.0, "Degrees for each unit of this dataset.", ge=-1e6, le=1e6)
+    offset_deg: float = setting(
+        0.0, "Degrees that are added to each position.", ge=-1e9, le=1e9
+    )  # of absolute encoders
 
 
 Angles = Annotated[TomoscanAngles | PlanAngles | AttributeAngles | PandaAngles, Field(discriminator="from")]
 
 
 class RideSection(Section):
-    """The scan that is ridden."""
+    """The scan of the other program: where its frames and angles come from."""
 
-    image: Annotated[str, Setting(problem=image_problem)] = setting(doc="The image over PVAccess.")
+    image: Annotated[str, Setting(problem=image_problem)] = setting(doc="Process variable of the image, over PVAccess.")
     angles: Angles
     kinds: str | None = setting(
         None,
-        f"NDAttribute that tells darks, flats and projections ({KINDS}); null: tomoscan's status, or all are "
-        "projections.",
+        f"NDAttribute that says whether a frame is a dark, a flat or a projection ({KINDS}); null: tomoscan's status "
+        "says it, without tomoscan the order of darks, projections and flats.",
         min_length=1,
     )
-    darks: Fields = setting(Fields(count=0), "Expected beside the views where tomoscan does not tell; without kinds by "
-                            "their order.")  # fmt: skip
+    darks: Fields = setting(
+        Fields(count=0),
+        "Darks of the scan, unless tomoscan says how many; without `kinds` they are recognised by their order.",
+    )
     flats: Fields = Fields(count=0)
-    camera: Prefix | None = setting(None, "Of the camera's variables, such as ca://2bmSP2:cam1:; null: not asked.")
+    camera: Prefix | None = setting(
+        None, "Prefix of the camera's variables, such as ca://2bmSP2:cam1:; null: not used."
+    )
     source: str | None = setting(
-        None, "Port of areaDetector from which frames are taken as they are, such as ROI1; null: the camera's.",
+        None, "Port of areaDetector whose frames are stored as they are, such as ROI1; null: the camera's own frames.",
         min_length=1,
     )  # fmt: skip
     first_id: int | None = setting(
-        None, "uniqueId of the first projection; null: that of the first one that comes.", ge=0
+        None, "uniqueId of the first projection; null: that of the first projection that arrives.", ge=0
     )
     exposure_s: Seconds | None = setting(
-        None, "null: the attribute AcquireTime of each frame, else what tomoscan or the camera says."
+        None, "null: the attribute AcquireTime of each frame; without it the value of tomoscan or of the camera."
     )
-    period_s: Seconds | None = setting(None, "Between frames, about, for the queue; null: 100 a second at most.")
-    bits: int | None = setting(None, "Of a count, for saturation; null: those of the pixels' type.", ge=1, le=16)
-    queue_s: float = setting(1.0, "Frames that the server holds for us, in seconds.", gt=0, le=60)
-    queue_mb: float = setting(512.0, "The same in MB of the IOC's memory, at most.", gt=0, le=65_536)
-    ring_mb: float = setting(2048.0, "Frames that wait in our memory for the disk, at most.", gt=0, le=1e6)
-    silence_s: Seconds = setting(60.0, "Without a frame, after which it is said why, as far as the IOC tells.")
+    period_s: Seconds | None = setting(
+        None, "Approximate time between frames, for the size of the queue; null: 100 frames a second."
+    )
+    bits: int | None = setting(
+        None, "Bits of a pixel, for the saturation value; null: those of the pixel type.", ge=1, le=16
+    )
+    queue_s: float = setting(1.0, "Frames that the server buffers for this program, in seconds.", gt=0, le=60)
+    queue_mb: float = setting(512.0, "Most memory of the IOC for this buffer, in MB.", gt=0, le=65_536)
+    ring_mb: float = setting(
+        2048.0, "Most memory of this program for frames that wait for the disk, in MB.", gt=0, le=1e6
+    )
+    silence_s: Seconds = setting(60.0, "After this time without a frame a message says why, as far as the IOC tells.")
 
     @property
     def queues(self) -> Queues:
@@ -110,13 +122,13 @@ class RideSection(Section):
 
 
 class _Devices(Section):
-    """No device is ours."""
+    """The devices of a scan configuration: none, because the other program controls them."""
 
     beam_monitor: NoBeamMonitor = NoBeamMonitor()
 
 
 class _Scan(Section):
-    """What an own scan asks of its plan, and a ridden one does not."""
+    """The plan settings of a scan configuration, switched off: the other program has the plan."""
 
     decide: Literal["off"] = "off"
     target: TargetSection = TargetSection()
@@ -124,7 +136,7 @@ class _Scan(Section):
 
 
 class RideConfig(Section):
-    """A whole configuration file of `beamline ride`; the sections beside `ride` are those of a scan."""
+    """A whole configuration file of `beamline ride`. All sections except `ride` are those of a scan configuration."""
 
     sample: SampleSection
     ride: RideSection
@@ -136,7 +148,7 @@ class RideConfig(Section):
 
     @property
     def as_scan(self) -> Config:
-        """This configuration for what takes one of a scan: its sections have the names and types of those."""
+        """This configuration, for functions that take a scan configuration: sections have the same names and types."""
         return cast(Config, self)
 
     @property
@@ -155,44 +167,48 @@ class RideConfig(Section):
     def _steps_turn(self) -> Self:
         angles = self.ride.angles
         if isinstance(angles, PlanAngles) and angles.views > 1 and not math.fabs(angles.step_deg) > 0:
-            raise ValueError(f"ride.angles.step_deg is {angles.step_deg:g}: {angles.views} views need a step")
+            raise ValueError(
+                f"ride.angles.step_deg is {angles.step_deg:g}: {angles.views} views need a step that is not 0"
+            )
         if self.monitor.retake:
-            raise ValueError("monitor.retake: a ride cannot have views taken again, as the scan is another program's")
+            raise ValueError(
+                "monitor.retake: `beamline ride` cannot take projections again, because another program runs the scan"
+            )
         return self
 
 
 EXAMPLE = """\
-# A ride on the scan of another program (docs/areadetector.md). No process variable is written.
-# beamline ride FILE --check   shows what the IOC says, and whether two seconds of frames arrive whole.
+# Recording the scan of another program (docs/areadetector.md). beamline ride writes no process variable.
+# beamline ride FILE --check   shows what the IOC says, and whether two seconds of frames arrive complete.
 # Units are in the names: s, deg, mm, um, keV. null means "not known" or "the default".
 
 sample: {name: tooth, description: "", diameter_mm: null}
 
 ride:
   image: "pva://2bmSP2:Pva1:Image"      # PvName of NDPluginPva or NDPluginPvxs
-  # from: tomoscan   prefix                             start, step, kinds and counts by its process variables
+  # from: tomoscan   prefix                             its process variables: start, step, kinds and numbers of frames
   #       plan       views, start_deg, step_deg         equal steps from the first projection
-  #       attribute  views, name                        of a step scan: an NDAttribute in degrees
-  #       panda      views, file, dataset, deg_per_unit, offset_deg   a PandABox's HDF5 file (SWMR)
+  #       attribute  views, name                        step scans: an NDAttribute in degrees
+  #       panda      views, file, dataset, deg_per_unit, offset_deg   the HDF5 file of a PandABox (SWMR)
   angles: {from: tomoscan, prefix: "ca://2bmb:TomoScan:"}
-  kinds: null                           # NDAttribute that tells darks and flats (HDF5FrameLocation); null: tomoscan's
-                                        # status, or all are projections (darks and flats by --darks, --flats)
-  camera: "ca://2bmSP2:cam1:"           # for its port, exposure and counters; null: not asked
-  source: null                          # port taken as it is, such as ROI1; null: the camera's own frames
-  first_id: null                        # uniqueId of the first projection; null: the first one that comes
-  exposure_s: null                      # null: by attribute AcquireTime, tomoscan or the camera
-  period_s: null                        # between frames, about, for the queue; null: 100 a second at most
-  bits: null                            # of a count; null: those of the pixels' type
-  queue_s: 1                            # frames that the server holds for us,
-  queue_mb: 512                         #   and of its memory at most
-  ring_mb: 2048                         # frames that wait in our memory for the disk
-  silence_s: 60                         # without a frame, after which it is said why
+  kinds: null                           # NDAttribute with the kind of a frame (HDF5FrameLocation); null: tomoscan's
+                                        # status, or the order (give darks and flats of files by --darks, --flats)
+  camera: "ca://2bmSP2:cam1:"           # for the camera's port, exposure and counters; null: not used
+  source: null                          # port whose frames are stored as they are, such as ROI1; null: the camera's
+  first_id: null                        # uniqueId of the first projection; null: that of the first that arrives
+  exposure_s: null                      # null: from the attribute AcquireTime, tomoscan or the camera
+  period_s: null                        # approximate time between frames, for the queue; null: 100 frames a second
+  bits: null                            # of a pixel, for saturation; null: those of the pixel type
+  queue_s: 1                            # frames that the server buffers for this program,
+  queue_mb: 512                         #   and the most memory for them there
+  ring_mb: 2048                         # most memory here for frames that wait for the disk
+  silence_s: 60                         # after this time without a frame a message says why
 
 optics:
   pixel_size_um: 0.65                   # of an unbinned pixel at the sample
   energy_kev: null
   distance_mm: null
-  axis_col: null                        # column of the rotation axis; null: it is searched
+  axis_col: null                        # column of the rotation axis; null: it is searched for
 
 storage: {folder: runs}
 recon: {live: true, method: r2, axis: auto}

@@ -1,5 +1,5 @@
-"""Counters: what the IOC's plugin and camera tell of a stream: whose loss a frame was, why none comes, and what makes
-it unfit, each in a sentence that says what to change."""
+"""Counters of the IOC's plugin and camera. They tell who lost a frame, why no frame comes, and why frames cannot be
+stored. Each message says what to change."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ PLUGIN = ("NDArrayPort_RBV", "EnableCallbacks_RBV", "MinCallbackTime_RBV", "Drop
           "QueueFree")  # fmt: skip
 CAMERA = ("PortName_RBV", "Acquire_RBV", "DetectorState_RBV", "ArrayCallbacks_RBV", "NumImagesCounter_RBV",
           "ArrayCounter_RBV", "AcquireTime_RBV", "AcquirePeriod_RBV", "BinX_RBV", "BinY_RBV")  # fmt: skip
-_LONG = 0.3  # s without the processor that may fill the server's queue
+_LONG = 0.3  # s; if this process gets no processor time for longer, the server's queue may fill up
 OURS = "this program"
-_SETTLES = 0.2  # s in which the camera's counter comes here
-_REST, _LEAST, _SLOW = 5, 0.5, 10.0  # periods, s without a count that are a pause; s, of a camera that is slow
+_SETTLES = 0.2  # s until the camera's counter has arrived here
+_REST, _LEAST, _SLOW = 5, 0.5, 10.0  # a pause of the counter: periods, and s at least; s, period of a slow camera
 _SKIPPED = "Nothing was recorded."
 _PLUGINS = ("OVER", "ROI", "PROC", "TRANS", "CC", "STATS", "FFT", "CB", "CODEC", "SCATTER", "GATHER", "ATTR")
-"""Beginnings of the usual port names of plugins: what they give out may be no camera's frame."""
-_SAFE = ("CB", "CODEC", "STATS", "ATTR")  # pixels pass through these as they are
+"""How the port names of plugins usually begin: their output may differ from the camera's frame."""
+_SAFE = ("CB", "CODEC", "STATS", "ATTR")  # these plugins do not change pixels
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Numbers that did not come.
+    """A gap in the numbers of the frames.
 
     Attributes:
-        ids: of the frames.
-        before, after: IOC's times of the frames around it.
-        still: s in which this process stood still meanwhile.
+        ids: numbers of the missing frames.
+        before, after: IOC's times of the frames around the gap.
+        still: s during which this process stalled in the gap.
     """
 
     ids: range
@@ -49,8 +49,8 @@ class Counters:
     """The counters of the PVA plugin and of the camera, as far as the IOC has them.
 
     Args:
-        image: pva://PREFIX:Pva1:Image, whose prefix the plugin's variables have.
-        camera: prefix of the camera's; None: it is not asked.
+        image: pva://PREFIX:Pva1:Image; the plugin's variables have the same prefix.
+        camera: prefix of the camera's variables; None: they are not used.
     """
 
     def __init__(self, image: str, camera: str | None) -> None:
@@ -61,8 +61,8 @@ class Counters:
             self.close = opened.pop_all().close
 
     def counted(self, first: float, second: float | None) -> int | None:
-        """See `Witness`. The counter comes here somewhat after the frame that it counts. Only its rise says something:
-        a camera may have run free before."""
+        """See `Witness`. The counter arrives somewhat later than the frame that it counts. Only its rise is used,
+        because the camera may have been in free run before."""
         if self.camera is None:
             return None
         time.sleep(_SETTLES)
@@ -78,7 +78,7 @@ class Counters:
         return rises[0] > 0 or rises[1] > n
 
     def blame(self, gap: Gap) -> str:
-        """Whose loss it was, as a sentence's end."""
+        """Who lost the frames, as the end of a sentence."""
         margin = (gap.after - gap.before) / (len(gap.ids) + 1) / 2
         begin, end = gap.before + margin, gap.after + margin
         dropped = self.plugin.histories["DroppedArrays_RBV"].rise(begin, end)
@@ -86,25 +86,27 @@ class Counters:
         if dropped:
             return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
         if counted is None:
-            return "before they came here: no counter of the IOC tells where"
+            return "before they arrived here (no counter of the IOC says where)"
         if counted > len(gap.ids):
-            return "between the plugin, which sent them, and here: the network, or the server's queue for us"
-        return f"before the plugin {self.plugin.prefix}: by the camera or its driver"
+            return "after the plugin had sent them: in the network, or in the server's queue for us (ride.queue_s)"
+        return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
 
 
 def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Counters) -> list[str]:
     """A sentence for each cause of lost frames.
 
     Args:
-        overflowed: numbers of frames for which the receiver had no room.
+        overflowed: numbers of frames for which the receiver had no memory left.
     """
     causes: dict[str, list[int]] = {}
     for gap in gaps:
         for i in gap.ids:
             if i in overflowed:
-                cause = f"by {OURS}, whose memory for waiting frames was full: the disk is too slow (ride.ring_mb)"
+                cause = (
+                    f"by {OURS}: its memory for waiting frames was full, because the disk is too slow (ride.ring_mb)"
+                )
             elif gap.still > _LONG:
-                cause = f"by {OURS}, which stood still for {gap.still:.1f} s (ride.queue_s)"
+                cause = f"by {OURS}, which stalled for {gap.still:.1f} s (ride.queue_s)"
             else:
                 cause = counters.blame(gap)
             causes.setdefault(cause, []).append(i)
@@ -115,11 +117,11 @@ def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Coun
 
 
 class Silence:
-    """Says why no frame comes, each time that none has come for so many s.
+    """Says why no frame comes, each time that none has come for `seconds`.
 
     Args:
-        say: takes the sentence.
-        outcome: what was recorded, as a sentence, for the error.
+        say: prints the sentence.
+        outcome: returns a sentence on what was recorded, for the error.
     """
 
     def __init__(
@@ -139,23 +141,23 @@ class Silence:
         return time.monotonic() - self._since
 
     def look(self) -> None:
-        """Say why, where no frame has come for `seconds`. InstrumentError: the server does not answer."""
+        """Say why no frame has come, if none has for `seconds`. InstrumentError: the server does not answer."""
         if self.lasted < self._seconds:
             return
         self.frame_came()
         silent = f"o frame for {self._seconds:g} s"
         if not self._stream.answers():
             raise InstrumentError(f"{self._stream.name}: n{silent}, and its server does not answer. {self._outcome()}")
-        self._say(f"N{silent}, the server answers: {silence_told(self._counters)}.")
+        self._say(f"N{silent}, although the server answers: {silence_told(self._counters)}.")
 
 
 def silence_told(counters: Counters) -> str:
-    """Why no frames may come, as far as the IOC tells, as a sentence's end."""
+    """The likely reason for no frames, as far as the IOC tells, as the end of a sentence."""
     plugin, camera = counters.plugin, counters.camera
     if plugin.text("EnableCallbacks_RBV") == "Disable":
         return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
     if camera is None:
-        return "the camera waits for triggers, or does not acquire (ride.camera would tell)"
+        return "the camera waits for triggers, or does not acquire (set ride.camera to find out)"
     if camera.text("ArrayCallbacks_RBV") == "Disable":
         return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
     state = camera.text("DetectorState_RBV")
@@ -165,16 +167,17 @@ def silence_told(counters: Counters) -> str:
 
 
 def refuse_mistakes(config: RideConfig, counters: Counters, frame: ArrayFrame | None) -> None:
-    """Raise ConfigError if frames are skipped, or are not the camera's own and the configuration does not want them.
+    """Raise ConfigError if frames are skipped, or are not the camera's own frames and the configuration does not ask
+    for that.
 
     Args:
-        frame: of the stream; None: it has none yet.
+        frame: a frame of the stream; None: there is none yet.
     """
     plugin, seconds = counters.plugin.prefix, counters.plugin.number("MinCallbackTime_RBV")
     if seconds:
         raise ConfigError(
-            f"{plugin}MinCallbackTime is {seconds:g} s: frames that come sooner are skipped without a word. Set it to "
-            f"0. {_SKIPPED}"
+            f"Set {plugin}MinCallbackTime to 0: it is {seconds:g} s, and the plugin skips frames that come sooner "
+            f"without an error. {_SKIPPED}"
         )
     _refuse_port(config.ride.source, counters)
     if frame is not None:
@@ -188,15 +191,17 @@ def _refuse_port(wanted: str | None, counters: Counters) -> None:
         return
     if wanted is not None:
         raise ConfigError(
-            f"{counters.plugin.prefix}NDArrayPort is {port}, and ride.source {wanted}: set one of them. {_SKIPPED}"
+            f"{counters.plugin.prefix}NDArrayPort is {port}, but ride.source is {wanted}: change one of them. "
+            f"{_SKIPPED}"
         )
     is_plugin = port.upper().startswith(_PLUGINS)
     if port.upper().startswith(_SAFE) or not (camera or is_plugin):
         return
-    what = "overlays may be in the pixels" if port.upper().startswith("OVER") else "pixels may be others"
+    what = "overlays may be in the pixels" if port.upper().startswith("OVER") else "the plugin may change the pixels"
     raise ConfigError(
-        f"{counters.plugin.prefix} shows {port}, not the camera{f' {camera}' if camera else ''}: {what}. Set "
-        f"{counters.plugin.prefix}NDArrayPort to {camera or 'its port'}, or ride.source: {port}. {_SKIPPED}"
+        f"{counters.plugin.prefix} sends the frames of {port}, not those of the "
+        f"camera{f' {camera}' if camera else ''}: {what}. Set {counters.plugin.prefix}NDArrayPort to "
+        f"{camera or 'the port of the camera'}, or, if you want these frames, set ride.source: {port}. {_SKIPPED}"
     )
 
 
@@ -204,14 +209,14 @@ def _refuse_binned(config: RideConfig, frame: ArrayFrame, counters: Counters) ->
     down, across = frame.window.binning
     if down != across:
         raise ConfigError(
-            f"Pixels are binned {across} across and {down} down: a volume needs square ones. Set the camera's BinX and "
-            f"BinY alike. {_SKIPPED}"
+            f"Set the camera's BinX and BinY to the same value: pixels are binned {across} horizontally and {down} "
+            f"vertically, and a volume needs square pixels. {_SKIPPED}"
         )
     camera = counters.camera
     by_camera = None if camera is None else camera.number("BinX_RBV")
     if across > 1 and by_camera != across and config.ride.source is None:
         who = "a plugin before" if camera is not None else "the camera or a plugin"
         raise ConfigError(
-            f"Frames are binned {across} x {across} by {who} {config.ride.image}: take them before it "
-            f"(NDArrayPort of the Pva plugin), or, if they are meant, set ride.source to that port. {_SKIPPED}"
+            f"Frames are binned {across} x {across} by {who} {config.ride.image}. Take the frames before this plugin "
+            f"(NDArrayPort of the Pva plugin), or, if you want binned frames, set ride.source to that port. {_SKIPPED}"
         )

@@ -1,4 +1,4 @@
-"""Guides: what tells the plan of a ridden scan and its frames' kinds and angles: tomoscan, numbers, a PandABox."""
+"""Guides: where plan, kinds and angles of another program's scan come from: tomoscan, frame numbers, a PandABox."""
 
 from __future__ import annotations
 
@@ -37,39 +37,42 @@ _WORDS = {
     "dark": FrameKind.DARK, "flat": FrameKind.FLAT, "white": FrameKind.FLAT,
 }  # fmt: skip
 EXPOSURE = "AcquireTime"
-"""Attribute with the exposure of a frame, s."""
+"""Attribute with the exposure time of a frame, s."""
 _VIEWS = FrameKind.PROJECTION
 _BEFORE, _AFTER = (Place.START, Place.BOTH), (Place.END, Place.BOTH)
 _POLL = 0.1  # s between two looks at a file that grows
-MOST, MOST_DEGREES = 1_000_000, 1e6  # frames of a kind, and degrees, as a configuration may have
-_FEW, _NEAR = 3, 0.02  # rows that tell a step, and how near that of a half or whole turn in radians must be
-SKEW = 0.5  # s by which the clocks of two IOCs may differ and still count as set alike
+MOST, MOST_DEGREES = 1_000_000, 1e6  # largest number of frames of a kind, and of degrees, as in a configuration
+_FEW, _NEAR = 3, 0.02  # fewest rows for a step; relative tolerance for steps that add up to 180° or 360° in radians
+SKEW = 0.5  # s: if the clocks of two IOCs differ by less, they count as equal
 
 
 class Guide(Protocol):
-    """Tells what a scan plans, and of each frame its kind and angle. It only reads."""
+    """Knows the plan of a scan, and the kind and angle of each frame. It only reads."""
 
     def plan(self) -> RidePlan:
-        """The plan as it stands now. ConfigError where it cannot be."""
+        """The present plan. ConfigError: there is no possible plan."""
 
     def phase(self, frame: ArrayFrame) -> Phase:
         """What the scan did while the frame was taken."""
 
+    unknown_angle: str
+    """Why `angle` is NaN, as a part of a sentence."""
+
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
-        """Radians of a projection; NaN: nothing tells it."""
+        """Angle of a projection in radians; NaN: not known."""
 
     def ended(self, seconds: float) -> bool:
         """Whether the scan had ended by this time of its IOC."""
 
     @property
     def status(self) -> str:
-        """What the scan is doing, in words; "" where nothing tells."""
+        """What the scan is doing, in words; "" if that is not known."""
 
     def close(self) -> None: ...
 
 
 class _Kinds:
-    """The kinds of frames by an attribute; without one, by the planned order."""
+    """The kinds of frames from an attribute; without an attribute, from the planned order."""
 
     def __init__(self, name: str | None) -> None:
         self._name, self._is_told = name, False
@@ -80,7 +83,7 @@ class _Kinds:
         if self._name not in frame.attributes and not self._is_told:
             raise ConfigError(_lacking("kinds", self._name, frame))
         word = frame.attributes.get(self._name)
-        if word is None or not str(word).strip():  # of a variable that is not connected for a while
+        if word is None or not str(word).strip():  # while its variable is not connected
             return NOT_TOLD
         self._is_told = True
         return Phase(0, kind_of(word))
@@ -88,26 +91,25 @@ class _Kinds:
 
 def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
     return (
-        f"ride.{key} is {name}, an attribute that the frames do not have; they have "
-        f"{', '.join(frame.attributes) or 'none'}. Add it to the camera's NDAttributesFile, or change ride.{key}. "
-        "What came before, if anything, is in the file."
+        f"The frames have no attribute {name} (ride.{key}); they have {', '.join(frame.attributes) or 'none'}. Add it "
+        f"to the camera's NDAttributesFile, or change ride.{key}. Frames that came before, if any, are in the file."
     )
 
 
 def seconds_of(told: Any) -> float | None:
-    """s that an attribute or a variable tells; None where it is no time."""
+    """The time in s that an attribute or a variable holds; None if it holds no time."""
     return float(told) if isinstance(told, int | float) and 0 < told <= MOST else None
 
 
 def kind_of(word: Any) -> FrameKind | None:
-    """The kind that an attribute names: a path of Data Exchange, or a word such as FlatField; None: no kind."""
+    """The kind that an attribute names: a path of Data Exchange, or a word such as FlatField; None: neither."""
     return _WORDS.get(str(word).strip().rstrip("/").rpartition("/")[2].lower())
 
 
 class _ByNumbers:
-    """A scan whose plan stands in the configuration."""
+    """A scan whose plan is in the configuration."""
 
-    status, told_by = "", "plan"
+    status, told_by, unknown_angle = "", "plan", "the angle is not known"
 
     def __init__(self, ride: RideSection, angles: NDArray[np.float64]) -> None:
         self._ride, self._angles = ride, angles
@@ -140,7 +142,7 @@ class _ByNumbers:
 
 
 class PlanGuide(_ByNumbers):
-    """Equal steps from the first projection."""
+    """A scan with equal steps, counted from the first projection."""
 
     def __init__(self, ride: RideSection, angles: PlanAngles) -> None:
         steps = np.arange(angles.views, dtype=np.float64)
@@ -148,13 +150,14 @@ class PlanGuide(_ByNumbers):
 
 
 class AttributeGuide(_ByNumbers):
-    """The angle of each frame of a step scan by an attribute."""
+    """A step scan whose frames have an attribute with the angle."""
 
     told_by = "attribute"
 
     def __init__(self, ride: RideSection, angles: AttributeAngles) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._name, self._seen = angles.name, False
+        self.unknown_angle = f"the attribute {angles.name} with the angle is missing, or is not an angle in degrees"
 
     def phase(self, frame: ArrayFrame) -> Phase:
         self._seen = self._seen or self._name in frame.attributes
@@ -171,18 +174,18 @@ class AttributeGuide(_ByNumbers):
 
 
 def _angle(degrees: float) -> float:
-    """Radians; NaN of what is no position of a stage."""
+    """Radians; NaN if the value cannot be the position of a stage."""
     return math.radians(degrees) if abs(degrees) <= MOST_DEGREES else math.nan
 
 
 class PandaGuide(_ByNumbers):
-    """The angle of each frame of a fly scan by a PandABox's file: row n is trigger n.
+    """A fly scan whose angles are in the file of a PandABox: row n belongs to trigger n.
 
     Args:
-        wait: s for a row that the file does not have yet.
+        wait: s to wait for a row that the file does not have yet.
 
     Raises:
-        ConfigError: the file is there, and its rows are no angles in degrees, one a view at most.
+        ConfigError: the file exists, but its rows are not angles in degrees, at most one for each projection.
     """
 
     told_by = "panda"
@@ -190,25 +193,24 @@ class PandaGuide(_ByNumbers):
     def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 2.0) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._settings, self._wait, self._path = angles, wait, Path(angles.file)
-        self._rows, self._waited_at = np.empty(0), -1  # rows at which it was waited for another one in vain
+        self._rows, self._waited_at = np.empty(0), -1  # number of rows after which no other row came in time
         if (problem := self._look()) and self._path.exists():
             raise ConfigError(f"{problem}. Nothing was started.")
 
     @property
     def status(self) -> str:  # type: ignore[override]
-        """What the file has, by which an operator sees whether it is that of this scan."""
+        """The number of rows with the first and the last angle: the operator sees whether the file is that of this
+        scan."""
         if not self._rows.size:
-            return f"{self._path} {'has no rows' if self._path.exists() else 'is not there'} yet"
+            return f"{self._path} {'has no rows' if self._path.exists() else 'does not exist'} yet"
         ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
-        return (
-            f"{self._path} has {count(self._rows.size, 'row')}, {ends}, which are this scan's unless it is written anew"
-        )
+        return f"{self._path} has {count(self._rows.size, 'row')}, {ends}: those of this scan, unless it is rewritten"
 
     def plan(self) -> RidePlan:
         self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait
         while (problem := self._look()) and time.monotonic() < deadline:
             time.sleep(_POLL)
-        begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None  # else it may come after the references
+        begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None  # else it may come after darks and flats
         if problem and (begins or self._path.exists()):
             raise ConfigError(f"{problem}. Nothing was recorded.")
         return super().plan()
@@ -220,7 +222,7 @@ class PandaGuide(_ByNumbers):
             if trigger >= (n := self._rows.size) and (n == self._waited_at or time.monotonic() > deadline):
                 self._waited_at = n
                 if problem and not n:
-                    raise DataError(f"{problem}: no projection has an angle. What came before is in the file.")
+                    raise DataError(f"No projection has an angle: {problem}. Frames that came before are in the file.")
                 return math.nan
             if trigger >= n:
                 time.sleep(_POLL)
@@ -230,10 +232,10 @@ class PandaGuide(_ByNumbers):
         return _angle(self._settings.offset_deg + self._settings.deg_per_unit * float(self._rows[row]))
 
     def _look(self) -> str:
-        """Read the rows that the file has now. What is wrong with it, without a full stop; "" if nothing is."""
+        """Read the present rows of the file. Returns what is wrong with it, without a full stop; "" if nothing is."""
         name, views = self._settings.dataset, self._settings.views
         if not self._path.exists():
-            return f"{self._path} (ride.angles.file) is not there"
+            return f"{self._path} (ride.angles.file) does not exist"
         try:
             with closing(open_hdf5(self._path)) as file, readable(self._path):
                 rows = file.get(name)
@@ -245,42 +247,52 @@ class PandaGuide(_ByNumbers):
             return str(error).removesuffix(".")
         if n > views and not problem:
             problem = (
-                f"has {n} rows, and ride.angles.views is {views}: move the file of another scan away, or set views"
+                f"has {n} rows, but ride.angles.views is {views}: if the file belongs to another scan, move it away, "
+                "otherwise correct views"
             )
         return problem and f"{self._path}: {name} {problem}"
 
 
 def _panda_problem(rows: Any) -> str:
-    """Why what a file has by a name cannot be the positions at triggers, as a sentence's end; "" if it can."""
+    """Why a dataset cannot hold the positions at the triggers, as the end of a sentence; "" if it can."""
     if not isinstance(rows, h5py.Dataset):
-        what = "is not there" if rows is None else "is a group"
+        what = "does not exist" if rows is None else "is a group"
     elif rows.dtype.kind not in "iuf":
         what = f"holds {'text' if rows.dtype.kind in 'SO' else rows.dtype}, not numbers"
     elif rows.ndim != 1:
-        what = f"has the shape {rows.shape}, not a number a trigger"
+        what = f"has the shape {rows.shape}, not one number for each trigger"
     else:
         return ""
     return f"{what}; set ride.angles.dataset to the positions, such as {PandaAngles.model_fields['dataset'].default}"
 
 
 def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
-    """Why rows are no degrees, as a sentence's end; "" if they can be, or the configuration says what their unit is."""
+    """Why rows are not degrees, as the end of a sentence; "" if they can be, or if the configuration states their
+    unit."""
     known = rows[np.isfinite(rows)]
+    degrees = settings.offset_deg + settings.deg_per_unit * known
+    if known.size and (np.abs(degrees) > MOST_DEGREES).all():
+        return (
+            f"has positions from {known.min():.7g} to {known.max():.7g}, which is more than {MOST_DEGREES:g} degrees "
+            "from zero; set ride.angles.deg_per_unit if they are encoder counts, and ride.angles.offset_deg to bring "
+            "the first angle near zero"
+        )
     if rows.size < _FEW or "deg_per_unit" in settings.model_fields_set:
         return ""
     step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))
     if not step:
         whole = rows.size == settings.views
-        return f"has {known.size} positions in {rows.size} rows, and they do not change" if whole else ""
+        return f"has {known.size} positions in {rows.size} rows, but they do not change" if whole else ""
     spans = step * np.array([[settings.views], [settings.views - 1]])
     if (np.abs(spans / (math.pi * np.array([1, 2])) - 1) < _NEAR).any():
         return (
-            f"has steps of {step:.4g}, as of radians; set ride.angles.deg_per_unit to {math.degrees(1):.7g} (or to 1)"
+            f"has steps of {step:.4g}, which look like radians; set ride.angles.deg_per_unit to {math.degrees(1):.7g} "
+            "(or, if they are degrees, to 1)"
         )
     if step > 180 or (spans[0] > 400 and not (known % 1).any()):
         return (
-            f"has steps of {step:.6g}, as of encoder counts; set ride.angles.deg_per_unit to 360 / counts per turn "
-            "(or, if they are degrees, to 1)"
+            f"has steps of {step:.6g}, which look like encoder counts; set ride.angles.deg_per_unit to 360 / counts "
+            "per turn (or, if they are degrees, to 1)"
         )
     return ""
 
@@ -293,25 +305,27 @@ _TOMOSCAN = (
 _KINDS = {"dark": FrameKind.DARK, "flat": FrameKind.FLAT, "proj": FrameKind.PROJECTION}
 _COLLECTING = "collecting "
 _PREPARING = ("programming", "taxi", "moving", "homing", "setting")
-"""Beginnings of what ScanStatus says between two blocks, or within one; all else ends it."""
+"""How ScanStatus begins between two blocks, or within a block; any other status ends the block."""
 
 
 class TomoscanGuide:
-    """A scan by tomoscan: its status tells kinds, its numbers the plan. ScanStatus changes before a block's first
-    frame and after its last, so that a frame's kind is that of its time.
+    """A scan run by tomoscan: its status gives the kinds, its numbers the plan. ScanStatus changes before the first and
+    after the last frame of a block, so the time of a frame gives its kind.
 
     Args:
-        now: for tests.
+        now: clock, for tests.
 
     Raises:
         DeviceTimeout: tomoscan does not answer.
     """
 
+    unknown_angle = "tomoscan's plan has no angle for this frame"
+
     def __init__(self, ride: RideSection, angles: TomoscanAngles, now: Callable[[], float] = time.time) -> None:
         self._ride, self._prefix = ride, angles.prefix
         self._kinds = None if ride.kinds is None else _Kinds(ride.kinds)
         self._variables = Variables(angles.prefix, _TOMOSCAN, _NEEDED, now)
-        self._delay = math.inf  # of frames
+        self._delay, self._longest = math.inf, -math.inf  # s, shortest and longest delay of a frame
         self._angles = np.empty(0)
 
     @property
@@ -326,9 +340,9 @@ class TomoscanGuide:
         numbers = numbers and all(0 <= n <= MOST for n in (darks, flats, views))
         if not numbers or views < 1 or (views > 1 and step == 0.0):
             raise ConfigError(
-                f"{self._prefix}NumAngles is {views:g}, RotationStep {step:g}: no angles follow from them, with "
-                f"RotationStart {start:g}, NumDarkFields {darks:g} and NumFlatFields {flats:g}. Set them in tomoscan "
-                "before its scan begins. Nothing was recorded."
+                f"tomoscan's numbers give no angles: {self._prefix}NumAngles is {views:g}, RotationStep {step:g}, "
+                f"RotationStart {start:g}, NumDarkFields {darks:g}, NumFlatFields {flats:g}. Set them in tomoscan "
+                "before the scan begins. Nothing was recorded."
             )
         self._angles = np.radians(start + step * np.arange(int(views), dtype=np.float64))
         counts = {
@@ -350,7 +364,8 @@ class TomoscanGuide:
 
     def phase(self, frame: ArrayFrame) -> Phase:
         if not frame.is_current:
-            self._delay = min(self._delay, frame.received - frame.time)
+            delay = frame.received - frame.time
+            self._delay, self._longest = min(self._delay, delay), max(self._longest, delay)
         serial, kind = self._collecting(frame.time)
         if kind is None or self._kinds is None:
             return Phase(serial, kind)
@@ -358,7 +373,7 @@ class TomoscanGuide:
         return Phase(serial, kind if told == NOT_TOLD else told.kind)
 
     def _collecting(self, seconds: float) -> tuple[int, FrameKind | None]:
-        """The number of the status that said what is collected at this time of the camera's IOC, and of what kind."""
+        """The number of the status message that was valid at this time of the camera's IOC, and the kind it names."""
         statuses = [str(each).strip().lower() for each in self._at(self._variables.histories["ScanStatus"], seconds)]
         for i in range(len(statuses), 0, -1):
             if statuses[i - 1].startswith(_COLLECTING):
@@ -369,15 +384,17 @@ class TomoscanGuide:
         return 0, None
 
     def _agreed(self, kind: FrameKind | None, seconds: float) -> FrameKind | None:
-        """The kind, unless FrameType contradicts it: it does between two blocks, and in a stream while darks are
-        taken again."""
+        """The kind, unless FrameType contradicts it. It does so between two blocks, and while darks are taken again
+        during streaming."""
         types = self._at(self._variables.histories["FrameType"], seconds)
         return kind if not types or kind_of(types[-1]) in (kind, None) else None
 
     def _at(self, history: History, seconds: float) -> list[Any]:
-        """The values until a time of the camera's IOC, whose clock may be another than tomoscan's."""
+        """The values until a time of the camera's IOC. Its clock may differ from tomoscan's. The clocks count as
+        different only if they differ by more than the delays of frames do. On a busy computer delays differ a lot, and
+        the few values come late, too."""
         skew = 0.0 if history.delay is None or math.isinf(self._delay) else self._delay - history.delay
-        return [*history.until(seconds + (skew if abs(skew) > SKEW else 0.0))]
+        return [*history.until(seconds + (skew if abs(skew) > SKEW + self._longest - self._delay else 0.0))]
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         return float(self._angles[trigger]) if trigger < self._angles.size else math.nan
@@ -392,7 +409,7 @@ class TomoscanGuide:
 
 
 def guide_of(ride: RideSection) -> Guide:
-    """The guide that the configuration names, connected."""
+    """The guide that the configuration asks for, connected."""
     match ride.angles:
         case TomoscanAngles():
             return TomoscanGuide(ride, ride.angles)

@@ -1,4 +1,4 @@
-"""Looks: what the IOC says of a stream, and whether some seconds of its frames arrive whole, before a ride."""
+"""`beamline ride --check`: what the IOC says, and whether two seconds of frames arrive complete."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ SECONDS = 2.0
 
 
 def check(config: RideConfig) -> list[str]:
-    """Lines on the stream of a configuration. Raises ConfigError or DeviceError for what a ride would refuse."""
+    """Lines about the image of a configuration. Raises the ConfigError or DeviceError that `beamline ride` would
+    raise."""
     with ExitStack() as held:
         stream, guide, counters = opened(config, held)
         frames, refused = _taken(stream)
         rows = {
             "image": stream.name,
             "frames": _size(frames[-1] if frames else stream.first),
-            "port": counters.plugin.text("NDArrayPort_RBV") or "not told: no variables of the plugin answer",
+            "port": counters.plugin.text("NDArrayPort_RBV") or "not known: no variables of the plugin answer",
             "queue": f"{stream.queue} frames in the server",
             "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_told(counters)}",
             "refused": refused,
@@ -57,13 +58,13 @@ def _size(frame: ArrayFrame | None) -> str:
 
 def _arrival(frames: list[ArrayFrame]) -> str:
     if len(frames) < 2:
-        return f"{len(frames)} frame in {SECONDS:g} s" if frames else ""
+        return f"1 frame in {SECONDS:g} s" if frames else ""
     ids = [frame.unique_id for frame in frames]
     seconds = frames[-1].received - frames[0].received
     rate = (len(frames) - 1) / seconds if seconds > 0 else 0.0
     missing = sorted({*range(ids[0], ids[-1] + 1)} - {*ids})
     whole = f"numbers {spans(missing)} are missing" if missing else "none missing"
-    again = f", {len(ids) - len({*ids})} came twice" if len({*ids}) < len(ids) else ""
+    again = f", {len(ids) - len({*ids})} arrived twice" if len({*ids}) < len(ids) else ""
     return (
         f"{rate:.1f} frames/s, {size(int(rate * frames[-1].n_bytes))}/s, numbers {ids[0]} to {ids[-1]}: {whole}{again}"
     )
@@ -71,4 +72,4 @@ def _arrival(frames: list[ArrayFrame]) -> str:
 
 def _dropped(counters: Counters) -> str:
     dropped = counters.plugin.number("DroppedArrays_RBV")
-    return "" if dropped is None else f"{dropped:.0f} arrays by the plugin since its counter was reset"
+    return "" if dropped is None else f"{dropped:.0f} arrays, by the plugin, since its counter was reset"

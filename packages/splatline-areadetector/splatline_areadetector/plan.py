@@ -1,4 +1,4 @@
-"""RidePlan: what is known of the scan of another program when its first frame comes, as a plan that can be recorded."""
+"""RidePlan: the plan of another program's scan, as far as it is known at the first frame, in the form of our plans."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
-_USUAL_PERIOD = 0.1  # s, of frames whose period nobody tells: for the time left alone
+_USUAL_PERIOD = 0.1  # s, if the period is not known; used for the remaining time only
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class RidePlan:
 
     Attributes:
         blocks: in the order of acquisition.
-        angles: float64 [view] radians; NaN where only the frames tell.
-        exposures: s by kind; of views where a kind has none.
+        angles: float64 [view] radians; NaN if only the frames tell them.
+        exposures: s by kind; a kind that is not listed has that of projections.
         period: s between frames; None: not known.
-        told_by: what says so, for the record.
+        told_by: where the plan comes from, for the record.
     """
 
     blocks: tuple[PlannedBlock, ...]
@@ -65,7 +65,7 @@ class RidePlan:
 
 
 def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: int) -> Timeline:
-    """The plan in the terms of a scan of ours; nothing moves, so that it breaks no limit."""
+    """The plan as the timeline of a scan of ours. Nothing moves, so it breaks no limit."""
     period = plan.period or _USUAL_PERIOD
     blocks = tuple(
         Block(
@@ -81,9 +81,9 @@ def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: 
     n_frames = sum(block.n for block in blocks)
     frame_bytes = 2 * math.prod(shape)
     total = n_frames * (frame_bytes + 4 * math.prod(preview_shape(shape, preview_bin)))
-    remarks = ["the scan is another program's: it is neither paused nor repeated, and no device is operated"]
+    remarks = ["another program runs the scan: beamline ride pauses and repeats nothing, and moves no device"]
     if total > free:
-        remarks.append(f"the scan needs {size(total)}, the disk has {size(free)} free: free some while it runs")
+        remarks.append(f"make room on the disk while the scan runs: it needs {size(total)}, and {size(free)} are free")
     return Timeline(blocks, n_frames * period, frame_bytes, total, 0, 0.0, 0.0, 0.0, (), tuple(remarks), _plan_of(plan))
 
 
@@ -101,7 +101,7 @@ def _plan_of(plan: RidePlan) -> ScanPlan:
 
 
 def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) -> ReadyScan:
-    """The ridden scan ready to be recorded, by its plan and its first frame."""
+    """The scan of the other program, ready to be recorded, from its plan and its first frame."""
     shape, binning = first.window.shape, first.window.binning
     bits = config.ride.bits or 8 * first.dtype.itemsize
     timing = CameraTiming(shape, plan.period or 0.0, 0.0, 0.0, bits)

@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from splatline_areadetector.publish_servers import ImageServer
 
 _PREFIX = re.compile(r"[\w.\-:]{0,39}[\w.\-]:")
-_IDLE = 0.005  # s between two looks at the file
-_CLIENTS_EVERY = 1.0  # s
+_IDLE = 0.005  # s between two reads of the file
+_CLIENTS_EVERY = 1.0  # s between two counts of dropped frames
 
 
 def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
     if not _PREFIX.fullmatch(value):
         raise click.BadParameter(
-            f"{value!r} is no prefix of EPICS; expected letters, digits, _ . - and a colon at the end, as in 2bma:SPL:."
+            f"{value!r} is not a prefix of EPICS; expected letters, digits, _ . - and a colon at the end, such as "
+            "2bma:SPL:."
         )
     return value
 
@@ -36,19 +37,26 @@ def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option("--prefix", default="splatline:", show_default=True, callback=_prefix,
               help="Prefix of the names of the process variables.")  # fmt: skip
 @click.option(
-    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
+    "--bind",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Network address on which clients may connect; 0.0.0.0: any.",
 )
 @click.option("--port", default=None, type=click.IntRange(0, 65535),
-              help="TCP port of the image; by default that of EPICS, or any free one.")  # fmt: skip
+              help="TCP port of the image. Default: that of EPICS or, if it is taken, any free one.")  # fmt: skip
 @click.option("--files", default=None, type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="FOLDER",
-              help="Write files that clients ask for, below this folder alone.")  # fmt: skip
+              help="Let clients have frames written to files below this folder. Default: no files.")  # fmt: skip
 def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | None) -> None:
-    """Publish the frames of the newest run of the folder RUNS (default ./runs) as an EPICS areaDetector does.
+    """Show a running scan to programs that expect an EPICS areaDetector, such as viewers and bluesky.
 
-    It only reads the run's files, so that it cannot slow a scan down. No client starts, stops or changes the scan.
-    With --files everybody who reaches the address may have frames written below that folder.
+    Publishes the frames of the newest run in the folder RUNS (default ./runs). The command only reads the files of the
+    run, so it cannot slow a scan down, and no client can start, stop or change the scan. With --files, everybody who
+    reaches the address can have frames written below that folder.
 
-    Exit code: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be listened at.
+    Exit codes: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be used.
+
+    Example: beamline publish runs --prefix 2bma:SPL: --bind 0.0.0.0
     """
     from splatline_areadetector.publish_detector import PublishedDetector, records
     from splatline_areadetector.publish_frames import RunFrames
@@ -60,8 +68,8 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
         put = RecordServer(prefix, records(name), bind, detector.asked).put
         with closing(detector), closing(RunFrames(runs, say)) as frames, suppress(KeyboardInterrupt):
             click.echo(
-                f"{name} at {bind}:{image.port}, {prefix}cam1: and {prefix}HDF1: beside it. Ctrl-C ends this, not the "
-                "scan."
+                f"Publishing {name} at {bind}:{image.port}, with {prefix}cam1: and {prefix}HDF1:. Ctrl-C ends the "
+                "publishing, not the scan."
             )
             _follow(frames, image, detector, put)
 
@@ -69,7 +77,7 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
 def _follow(
     frames: RunFrames, image: ImageServer, detector: PublishedDetector, put: Callable[[str, int], None]
 ) -> NoReturn:
-    """Publish frames as they come, for ever."""
+    """Publish frames as they come, until Ctrl-C."""
     run, counted, missed = None, time.monotonic(), 0
     while True:
         frame = frames.next()

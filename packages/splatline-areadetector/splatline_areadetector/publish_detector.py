@@ -1,7 +1,7 @@
-"""PublishedDetector: what clients see of the scan's camera (cam1:) and ask of the file plugin (HDF1:).
+"""PublishedDetector: the scan's camera (cam1:) and a file plugin (HDF1:), as clients see them.
 
-Neither starts, stops or changes anything of the scan. `Acquire` counts the frames of the scan that come from now on,
-and `Capture` has those written into a file of the client's.
+Neither starts, stops or changes the scan. `Acquire` counts the frames of the scan that come from then on, and `Capture`
+writes these frames into a file for the client.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _NO_YES, _SWITCH = ("No", "Yes"), ("Disable", "Enable")
 _TEMPLATE = re.compile(r"%s%s(_%\d?(\.\d)?d)?\.(h5|hdf5|hdf|nxs)")
 _WRITE_OK, _WRITE_ERROR = 0, 1
 BUSY = ("cam1:Acquire", "HDF1:Capture")
-"""Records that stay set until something has ended."""
+"""Records that stay set until the work has ended."""
 
 
 class Sides(IntEnum):
-    """Which records a value has: NAME to write to, NAME_RBV to read, or both."""
+    """The records of a value: NAME to write to, NAME_RBV to read, or both."""
 
     BOTH = 0
     SETPOINT = 1
@@ -48,10 +48,10 @@ class Record:
     """A value that clients see.
 
     Attributes:
-        name: after the prefix, without _RBV.
-        labels: of a choice, whose value is an index.
-        fixed: what clients write is taken and changes nothing; the readback stays.
-        length: of a long text; 0: a text of 39 characters.
+        name: the part after the prefix, without _RBV.
+        labels: labels of a choice; its value is an index.
+        fixed: clients may write to it, but that changes nothing, and the readback stays.
+        length: length of a long text; 0: a text of 39 characters.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Record:
 
 
 def _of_arrays(plugin: str, *, is_camera: bool) -> tuple[Record, ...]:
-    """Records of NDArrayBase, which camera and plugins have."""
+    """Records of NDArrayBase, for camera and plugins."""
     sizes = ("ArraySizeX", "ArraySizeY", "ArraySizeZ", "ArraySize0", "ArraySize1", "ArraySize2", "UniqueId")
     texts = {"PortName": plugin.removesuffix(":"), "ADCoreVersion": "3.14.0", "DriverVersion": "1.0"}
     return (
@@ -147,9 +147,9 @@ class PublishedDetector:
     """Camera and file plugin as clients see them. Calls may come from any thread.
 
     Args:
-        put: shows a value in the record of this name; of a setpoint without its handler.
+        put: shows a value in the record of this name, without calling the handler of a setpoint.
         files: folder below which clients may have files written; None: nowhere.
-        say: takes a sentence for whoever runs the server.
+        say: prints a sentence for whoever runs the server.
     """
 
     def __init__(self, put: Callable[[str, Value], None], files: Path | None, say: Callable[[str], None]) -> None:
@@ -169,7 +169,7 @@ class PublishedDetector:
             if name in self._fixed:
                 if name == "cam1:AcquireTime" and self._exposure and not np.isclose(float(value), self._exposure):
                     self._say_once(
-                        f"A client asked for an exposure of {value:g} s; the scan has its own, {self._exposure:g} s."
+                        f"A client asked for an exposure of {value:g} s. The scan keeps its own, {self._exposure:g} s."
                     )
                 return
             self._set[name] = value
@@ -196,7 +196,7 @@ class PublishedDetector:
                 self._put(f"cam1:{name}_RBV", n)
 
     def take(self, frame: PublishedFrame) -> None:
-        """A frame has come, and was published."""
+        """A frame was published."""
         with self._lock:
             if frame.exposure != self._exposure:
                 self._exposure = frame.exposure
@@ -277,7 +277,7 @@ class PublishedDetector:
         self._end_capture()
         self._put("HDF1:WriteStatus_RBV", _WRITE_ERROR)
         self._put("HDF1:WriteMessage_RBV", user_message(error)[:255])
-        self._say(f"A client's file is not written: {user_message(error)}")
+        self._say(f"The file that a client asked for is not written: {user_message(error)}")
 
     def _flush(self, value: Value) -> None:
         if value and self._file is not None:
@@ -297,17 +297,18 @@ class PublishedDetector:
         return self._files is not None and path.is_absolute() and path.resolve().is_relative_to(self._files)
 
     def _asked_path(self) -> Path:
-        """The file that the client's path, name and template give. Raises DataError."""
+        """The file named by the client's path, name and template. Raises DataError."""
         folder, name = str(self._set["HDF1:FilePath"]), str(self._set["HDF1:FileName"])
         template = str(self._set["HDF1:FileTemplate"])
         if self._files is None:
             raise DataError(
-                f"{folder}{name}: this server writes no files; start it with --files FOLDER for those of clients."
+                f"Start `beamline publish` with --files FOLDER, so that it may write {folder}{name}: it writes no "
+                "files now."
             )
         if not self._allowed(Path(folder)):
-            raise DataError(f"{folder} is not below {self._files}, the folder of --files.")
+            raise DataError(f"{folder} is not below the folder of --files, {self._files}.")
         if not _TEMPLATE.fullmatch(template) or not name or Path(name).name != name:
-            raise DataError(f"{name!r} with the template {template!r} is no name of a file; expected %s%s.h5.")
+            raise DataError(f"{name!r} with the template {template!r} does not give a file name; expected %s%s.h5.")
         parts = (folder, name, int(self._set["HDF1:FileNumber"]))
         return Path(template % parts[: template.count("%")])
 

@@ -1,4 +1,4 @@
-"""FrameFile: the HDF5 file of areaDetector's plugin NDFileHDF5, which others can read while it grows (SWMR)."""
+"""FrameFile: an HDF5 file as areaDetector's plugin NDFileHDF5 writes it. It can be read while it grows (SWMR)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from beamline.core.errors import DataError
 from splatline_areadetector.publish_frames import PublishedFrame
 
 ATTRIBUTES = {
-    "Angle": ("DOUBLE", "f8", "deg, of the stage at the trigger"),
+    "Angle": ("DOUBLE", "f8", "stage angle at the trigger in degrees"),
     "Kind": ("STRING", "S40", "projection, flat, dark, alignment, offset_view or invalid"),
     "HDF5FrameLocation": ("STRING", "S40", "where tomoscan stores frames of this kind"),
-    "AcquireTime": ("DOUBLE", "f8", "s, exposure"),
+    "AcquireTime": ("DOUBLE", "f8", "exposure time in s"),
 }
 """NDAttributes of a frame: their type for EPICS and in the file, and their meaning."""
 XML = (
@@ -27,12 +27,12 @@ XML = (
     )
     + "</Attributes>"
 )
-"""The same as a client reads it from `NDAttributesFile`."""
+"""The attributes as a client reads them from `NDAttributesFile`."""
 _NUMBERS = {
     "NDArrayUniqueId": "i4", "NDArrayTimeStamp": "f8", "NDArrayEpicsTSSec": "u4", "NDArrayEpicsTSnSec": "u4",
 }  # fmt: skip
 _EPICS_EPOCH = 631152000  # s, 1990-01-01 after 1970-01-01
-_ATTRIBUTES_PER_CHUNK = 16384  # as areaDetector does; clients of bluesky are told so
+_ATTRIBUTES_PER_CHUNK = 16384  # as in areaDetector; bluesky's documents state it
 _FLUSH_EVERY = 1.0  # s
 
 
@@ -48,7 +48,7 @@ class FrameFile:
         try:
             self._file = h5py.File(path, "x", libver=("v110", "v110"))
         except OSError as error:
-            why = "it exists, and nothing is overwritten" if path.exists() else f"{error}"
+            why = "it exists already, and this program overwrites nothing" if path.exists() else f"{error}"
             raise DataError(f"{path} cannot be made: {why}.") from error
         self._data = self._file.create_dataset(
             "/entry/instrument/detector/data", (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape)
@@ -70,12 +70,12 @@ class FrameFile:
         self._file.swmr_mode = True
 
     def append(self, frame: PublishedFrame) -> None:
-        """Write the next frame. Raises DataError for other pixels than before, or a disk that does not take it."""
+        """Write the next frame. Raises DataError if its size or type differs, or if the disk does not take it."""
         shape, dtype = self._data.shape[1:], self._data.dtype
         if frame.counts.shape != shape or frame.counts.dtype != dtype:
             raise DataError(
-                f"frames are {frame.counts.dtype} {frame.counts.shape} now, and {self.path} holds {dtype} {shape}: "
-                "capture them in another file"
+                f"Capture these frames in another file: they are {frame.counts.dtype} {frame.counts.shape}, and "
+                f"{self.path} holds {dtype} {shape}"
             )
         seconds = int(frame.time)
         values = {
@@ -91,7 +91,7 @@ class FrameFile:
             if time.monotonic() - self._flushed >= _FLUSH_EVERY:
                 self.flush()
         except (OSError, RuntimeError) as error:
-            raise DataError(f"{self.path} did not take frame {self.frames + 1}: {error}") from error
+            raise DataError(f"frame {self.frames + 1} could not be written to {self.path}: {error}") from error
 
     def flush(self) -> None:
         """Let readers see all frames so far."""

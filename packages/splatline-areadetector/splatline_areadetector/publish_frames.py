@@ -1,6 +1,6 @@
 """RunFrames: the frames of the newest run of a folder, each once and in order, as they come into its scan file.
 
-They are read from the file, which is written in any case. So no frame of the scan ever waits for whoever looks at them.
+They are read from the scan file, so the scan never waits for a client.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from beamline.scan.runs import newest
 from beamline.storage.hdf5 import look_again, open_hdf5, readable
 from drivers.base.frame import FrameKind
 
-LOOK_EVERY = 0.5  # s, for a run that began
-_SPREAD = 0.7  # of the mean time between frames: how far apart those that came together are sent
-_WINDOW = 2.0  # s over which that mean is taken
-_LONGEST, _AT_FIRST = 0.25, 0.02  # s that a frame waits after the one before, and while the mean is not known
+LOOK_EVERY = 0.5  # s between two looks for a new run
+_SPREAD = 0.7  # frames that came together are sent this fraction of the mean time between frames apart
+_WINDOW = 2.0  # s over which the mean is computed
+_LONGEST, _AT_FIRST = 0.25, 0.02  # s: longest time between two frames sent, and this time while the mean is not known
 
 # Paths of docs/file_layout.md.
 _DATA, _KIND = "/entry/instrument/detector/data", "/entry/frame_log/kind"
@@ -45,12 +45,12 @@ LOCATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """A frame of a scan, as control systems see it.
+    """A frame of a scan, as it is published.
 
     Attributes:
         counts: [row, col].
-        unique_id: its row in the scan file, counted from 1; a run begins anew at 1.
-        angle: deg, of the stage at the trigger, as the scan file has it; NaN: unknown.
+        unique_id: row in the scan file, from 1; each run begins again at 1.
+        angle: stage angle at the trigger in degrees, from the scan file; NaN: unknown.
         time: s since the Unix epoch, at the trigger.
         exposure: s.
     """
@@ -75,7 +75,7 @@ class PublishedFrame:
 
 
 class Pace:
-    """Spreads frames that came into the file together, as the queue of a client holds four of them by default."""
+    """Spreads frames that came into the file together, because the queue of a client usually holds only four."""
 
     def __init__(self) -> None:
         self._came, self._sent = deque[tuple[float, int]](), -math.inf  # times and frames
@@ -87,7 +87,7 @@ class Pace:
             self._came.popleft()
 
     def wait(self, now: float) -> float:
-        """s for which the next frame is still to wait."""
+        """s for which the next frame must still wait."""
         n = sum(n for _, n in self._came) - self._came[0][1] if self._came else 0
         apart = _SPREAD * (now - self._came[0][0]) / n if n else _AT_FIRST
         return max(0.0, self._sent + min(apart, _LONGEST) - now)
@@ -100,16 +100,16 @@ class Pace:
 class RunFrames:
     """The frames of the newest run of a folder, from now on, and of each run that begins later.
 
-    Of the run that is there at the start, the newest frame comes first. Calls come from one thread.
+    If a run exists at the start, its newest frame comes first. Call it from one thread only.
 
     Args:
-        say: takes a sentence about a file that cannot be read.
+        say: prints a sentence about a file that cannot be read.
         now: a clock, s.
 
     Attributes:
         run: folder of the (part of the) run whose frames come; None: there is none yet.
         shape: rows and columns of its frames; (0, 0) before.
-        dtype: of their pixels.
+        dtype: type of the pixels.
     """
 
     def __init__(self, runs: Path, say: Callable[[str], None], now: Callable[[], float] = time.monotonic) -> None:
@@ -117,7 +117,7 @@ class RunFrames:
         self.run: Path | None = None
         self.shape, self.dtype = (0, 0), np.dtype(np.uint16)
         self._file: Any = None
-        self._columns: list[Any] = []  # stay open: HDF5 refreshes wrongly what is open twice
+        self._columns: list[Any] = []  # stay open: HDF5 refreshes a dataset wrongly if it is open twice
         self._counter: Any = None
         self._pace, self._looked = Pace(), -math.inf
         self._next = self._committed = 0
@@ -127,11 +127,11 @@ class RunFrames:
 
     @property
     def waiting(self) -> int:
-        """Frames in the file that have not come yet."""
+        """Number of frames in the file that `next` has not returned yet."""
         return self._committed - self._next
 
     def next(self) -> PublishedFrame | None:
-        """The next frame that is due; None: there is none yet."""
+        """The next frame that is due; None: none is due yet."""
         now = self._now()
         if now - self._looked >= LOOK_EVERY and not self.waiting:
             self._look()
@@ -146,7 +146,7 @@ class RunFrames:
                     return None
                 frame = self._read(self._next)
         except DataError as error:
-            self._say(f"No more frames of this run are published: {error}")
+            self._say(f"Publishing of this run has ended: {error}")
             self.close()
             return None
         self._next += 1
@@ -164,7 +164,7 @@ class RunFrames:
     def _look(self) -> None:
         """Open the file of the newest run, if it is another one."""
         self._looked = self._now()
-        with suppress(ConfigError, DataError):  # no run, or a file that is just being made
+        with suppress(ConfigError, DataError):  # no run, or a file that is just being created
             run = parts_of(newest(self._runs))[-1]
             if run == self.run:
                 return

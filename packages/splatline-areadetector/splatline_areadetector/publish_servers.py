@@ -1,5 +1,5 @@
-"""Servers of EPICS: frames as areaDetector's NDPluginPva publishes them (NTNDArray), with how many each client missed,
-and the records of a published detector, by Channel Access and PVAccess, in a soft IOC (softioc)."""
+"""EPICS servers. One publishes frames as areaDetector's NDPluginPva does (NTNDArray), and counts the frames that each
+client missed. The other serves the records of a published detector over Channel Access and PVAccess (softioc)."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from splatline_areadetector.publish_detector import BUSY, Record, Sides, Value
 from splatline_areadetector.publish_frames import PublishedFrame
 
 _CLIENT = re.compile(r"(?P<client>\S+) +(?P<pv>\S+) TX=(?P<sent>\d+) RX=\d+ +\S+ ioid=\d+ MONITOR")
-_OVERHEAD = 380  # bytes of an update beside its pixels, about: time, alarm, attributes
+_OVERHEAD = 380  # approximate bytes of an update besides its pixels: time, alarm, attributes
 
 
 @dataclass(frozen=True)
 class ClientCount:
-    """Frames that a client of the image was sent, and those that it missed, as its queue was full; both about right:
-    they come from the bytes on its line."""
+    """Frames that were sent to a client of the image, and frames that it missed because its queue was full. Both are
+    approximate, because they are computed from the bytes sent."""
 
     sent: int
     missed: int
 
 
 class ImageServer:
-    """Serves one image by PVAccess until it is closed. A client that is slow, or stands still, loses frames; nobody
-    waits for it.
+    """Serves one image over PVAccess until it is closed. A client that is slow or stalls loses frames; nobody waits for
+    it.
 
     Args:
-        name: of the process variable.
-        address: to listen at.
-        port: TCP port; None: EPICS_PVAS_SERVER_PORT, else 5075, and any other one where that is taken.
+        name: name of the process variable.
+        address: network address for clients.
+        port: TCP port; None: EPICS_PVAS_SERVER_PORT, else 5075, and any other one if that is taken.
 
     Raises:
         ConfigError: p4p is not installed.
-        DataError: the address or the port cannot be listened at.
+        DataError: the address or the port cannot be used.
     """
 
     def __init__(self, name: str, address: str, port: int | None) -> None:
@@ -49,8 +49,8 @@ class ImageServer:
             from p4p.server.thread import SharedPV
         except ImportError as error:
             raise ConfigError(
-                f'Publishing needs p4p, which cannot be loaded here ({error}): pip install "splatline[epics]". Nothing '
-                "was started."
+                f'Install p4p: pip install "splatline[epics]". Publishing needs it, and it cannot be loaded ({error}). '
+                "Nothing was started."
             ) from error
         self.name, self._type = name, NTNDArray()
         self._image = SharedPV(initial=self._type.type())
@@ -59,16 +59,18 @@ class ImageServer:
         try:
             self._server = Server(providers=[self._provider], conf=_configured(address, port), useenv=False)
         except RuntimeError as error:
-            raise DataError(f"{address} cannot be listened at: {error}. Nothing was started.") from error
+            raise DataError(
+                f"Clients cannot connect to the address {address}: {error}. Nothing was started."
+            ) from error
         self.port = int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
         if port not in (None, 0, self.port):
             self._server.stop()
             raise DataError(
-                f"Port {port} of {address} is taken by another program. Give another --port, or none: clients find the "
-                "image by its name. Nothing was started."
+                f"Another program uses port {port} of {address}. Give another --port, or leave it out: clients find "
+                "the image by its name. Nothing was started."
             )
         self._posted, self._frame_bytes = 0, 0
-        self._clients: dict[str, tuple[int, int]] = {}  # frames posted before it came, bytes it was sent by then
+        self._clients: dict[str, tuple[int, int]] = {}  # frames posted before the client came, bytes sent to it by then
 
     def post(self, frame: PublishedFrame) -> None:
         """Send a frame to all clients, and return at once."""
@@ -77,13 +79,13 @@ class ImageServer:
         value["dataTimeStamp"] = {
             "secondsPastEpoch": math.floor(frame.time), "nanoseconds": int(1e9 * (frame.time % 1)),
         }  # fmt: skip
-        if self._frame_bytes not in (0, frame.counts.nbytes):  # another run: bytes do not tell frames any more
+        if self._frame_bytes not in (0, frame.counts.nbytes):  # another run: bytes no longer give frames
             self._clients.clear()
         self._image.post(value)
         self._posted, self._frame_bytes = self._posted + 1, frame.counts.nbytes
 
     def clients(self) -> Mapping[str, ClientCount]:
-        """Frames sent to and missed by each client that is connected now, since the first call that saw it."""
+        """Frames sent to each connected client and missed by it, since the first call that saw the client."""
         counts = dict[str, ClientCount]()
         for match in _CLIENT.finditer(self._server.tostr(5)):
             if match["pv"] != self.name or not self._frame_bytes:
@@ -100,7 +102,7 @@ class ImageServer:
 
 
 def _configured(address: str, port: int | None) -> dict[str, str]:
-    """The environment of EPICS with this address and port in place of its own, to which p4p would add them."""
+    """The environment of EPICS with its address and port replaced, because p4p would add ours to them."""
     conf = {name: value for name, value in os.environ.items() if name.startswith("EPICS_PVA")}
     for name in ("EPICS_PVAS_INTF_ADDR_LIST", "EPICS_PVA_INTF_ADDR_LIST"):
         conf.pop(name, None)
@@ -109,12 +111,12 @@ def _configured(address: str, port: int | None) -> dict[str, str]:
 
 
 class RecordServer:
-    """Serves records until the process ends: EPICS has one IOC a process, which cannot be stopped alone.
+    """Serves records until the process ends. EPICS has one IOC for each process, which cannot be stopped on its own.
 
     Args:
-        prefix: before each name, with its colon.
-        address: to listen at.
-        asked: takes the name and the value of what a client has written, in another thread.
+        prefix: prefix of each name, with its colon.
+        address: network address for clients.
+        asked: called in another thread with the name and the value that a client has written.
 
     Raises:
         ConfigError: softioc is not installed.
@@ -129,7 +131,7 @@ class RecordServer:
             from softioc import asyncio_dispatcher, builder, softioc
         except ImportError as error:
             raise ConfigError(
-                f"Publishing needs softioc, which cannot be loaded here ({error}): pip install softioc. Nothing was "
+                f"Install softioc for publishing: pip install softioc. It cannot be loaded ({error}). Nothing was "
                 "started."
             ) from error
         self._records: dict[str, Any] = {}
@@ -142,7 +144,7 @@ class RecordServer:
                 self._add(builder, record, record.name, partial(asked, record.name))
                 self._setpoints.add(record.name)
         builder.LoadDatabase()
-        softioc.eltc(0)  # EPICS's own lines at the start
+        softioc.eltc(0)  # so that EPICS prints nothing at the start
         softioc.iocInit(asyncio_dispatcher.AsyncioDispatcher())
 
     def put(self, name: str, value: Value) -> None:
@@ -159,15 +161,15 @@ class RecordServer:
         if record.length:
             facts["length"] = record.length
         if handler is not None:
-            # A put that waits is answered when the readback shows it. Not so where it would wait for frames: softioc
-            # has no record of the type busy, and a stop would queue behind it.
+            # A put with completion is answered when the readback shows the value, except for records that wait for
+            # frames: softioc has no record of the type busy, and a stop would queue behind such a put.
             facts |= {"on_update": handler, "always_update": True, "blocking": record.name not in BUSY}
         make = getattr(builder, f"{kind}{'In' if handler is None else 'Out'}")
         self._records[name] = make(name, *arguments, **facts)
 
 
 def _kind_of(record: Record) -> tuple[str, tuple[str, ...]]:
-    """The builder of softioc for a record, without In or Out, and its labels."""
+    """The name of softioc's builder for a record, without In or Out, and the labels."""
     if record.labels:
         return ("bool" if len(record.labels) == 2 else "mbb"), record.labels
     if isinstance(record.initial, str):

@@ -1,8 +1,8 @@
-"""The receiver: a process of its own that takes an image's updates over PVAccess at once, whatever holds the ride up.
+"""The receiver: a process of its own that takes each frame over PVAccess at once, even while `beamline ride` is busy.
 
-HDF5 keeps Python's lock while it writes, so that a thread of the ride would come too late for frames. What the ride has
-not taken yet waits here. Each item is a line of JSON on stdout, and the pixels of a frame follow it. The process ends
-with its stdin.
+HDF5 keeps Python's lock while it writes, so a thread of `beamline ride` would be too late for frames. Frames that
+`beamline ride` has not taken yet wait here. Each item is a line of JSON on stdout, followed by the pixels of a frame.
+The process ends when its stdin is closed.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from numpy.typing import NDArray
 
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
 
-_TICK, _STILL = 0.1, 0.4  # s between two looks at the clock, and beyond it, at which this process stood still
+_TICK, _STILL = 0.1, 0.4  # s between two looks at the clock; if it takes so many s more, the process has stalled
 
 
 class Subscribed:
-    """Process variables over PVAccess until `close`: one thread takes their updates, in the order in which they come.
+    """Subscriptions to process variables over PVAccess, until `close`. One thread takes the updates in their order.
 
-    p4p's own subscriptions fall silent for ever where their first update comes before `monitor` has returned, as
-    happens on a busy computer, and where a callback raises.
+    p4p's own subscriptions fall silent for ever in two cases: if the first update comes before `monitor` has returned,
+    as happens on a busy computer, and if a callback raises.
 
     Args:
-        takers: by the variable's name, what takes each of its updates (p4p's values, not unwrapped) and its exceptions
-            (the server has gone). One that raises misses that update.
-        request: pvRequest; None: p4p's.
+        takers: functions by the name of the variable. Each gets the updates (p4p's values, not unwrapped) and the
+            exceptions (the server has gone). A function that raises misses that update.
+        request: pvRequest; None: that of p4p.
 
     Raises:
         ImportError: p4p is not installed.
@@ -45,7 +45,7 @@ class Subscribed:
         from p4p.client.raw import Context
 
         self._wake, self._over = threading.Event(), False
-        self._context = Context("pva", useenv=True, nt=False)  # its unwrapping fails at a compressed frame
+        self._context = Context("pva", useenv=True, nt=False)  # unwrapping fails at a compressed frame
         self._subscriptions = [
             (self._context.monitor(name, lambda *ignored: self._wake.set(), request), take)
             for name, take in takers.items()
@@ -54,7 +54,7 @@ class Subscribed:
         self._thread.start()
 
     def close(self) -> None:
-        """End them; no update is taken afterwards."""
+        """End the subscriptions; no update is taken afterwards."""
         self._over = True
         self._wake.set()
         self._thread.join()
@@ -73,20 +73,21 @@ class Subscribed:
 
 
 class Receiver:
-    """Takes the updates of an image; one thread does, and another one passes them on.
+    """Takes the updates of an image in one thread; another thread passes them on.
 
     Args:
-        room: bytes of frames that may wait. A single frame may always wait, however large.
+        room: most bytes of waiting frames. A single frame may always wait, however large.
     """
 
     def __init__(self, room: int, now: Callable[[], float] = time.time) -> None:
         self._room, self._now = room, now
         self._items = queue.SimpleQueue[tuple[list[Any], NDArray[Any] | None]]()
         self._taken = self._passed = 0  # bytes of frames
-        self._fresh, self._ready = True, False  # the next one is what the server had before
+        self._fresh, self._ready = True, False  # fresh: the next frame is the one that the server had before
 
     def take(self, value: Any) -> None:
-        """Take an update, or p4p's word that the server has gone. It never raises: the next one may be sound."""
+        """Take an update, or p4p's exception that the server has gone. It never raises, because the next update may be
+        good."""
         received = self._now()
         if isinstance(value, Exception):
             if not self._fresh:  # every subscription begins disconnected
@@ -107,7 +108,7 @@ class Receiver:
             self.put("ready")
 
     def put(self, *facts: Any, payload: NDArray[Any] | None = None) -> None:
-        """Queue an item, and a frame's pixels."""
+        """Queue an item, with the pixels of a frame."""
         self._items.put(([*facts], payload))
 
     def _take_frame(self, frame: ArrayFrame) -> None:
@@ -127,7 +128,7 @@ class Receiver:
         """Write the next item; waits for one.
 
         Args:
-            stream: without a buffer: Python's (3.11) loses bytes where the process is stopped while it waits to write.
+            stream: without a buffer, because that of Python 3.11 loses bytes if the process is stopped while writing.
         """
         facts, payload = self._items.get()
         parts: list[Any] = [json.dumps(facts, default=str, allow_nan=True).encode() + b"\n"]
@@ -141,7 +142,7 @@ class Receiver:
 
 
 def frame_of(stream: IO[bytes], facts: dict[str, Any]) -> ArrayFrame:
-    """The frame of which a receiver has written these facts, with its pixels, which follow in the stream."""
+    """The frame with these facts, as a receiver wrote them; its pixels follow in the stream."""
     dtype, n_pixels = facts["payload"]
     payload = np.empty(n_pixels, dtype)
     if stream.readinto(payload.data.cast("B")) < payload.nbytes:  # type: ignore[attr-defined]
@@ -164,7 +165,7 @@ def main(name: str, n_frames: str, room: str) -> None:
     """Receive an image until stdin ends.
 
     Args:
-        n_frames: that the server is asked to hold.
+        n_frames: length of the server's queue to ask for.
         room: see `Receiver`.
     """
     receiver = Receiver(int(room))
@@ -180,7 +181,7 @@ def main(name: str, n_frames: str, room: str) -> None:
     while os.read(0, 1024):
         pass
     subscribed.close()
-    os._exit(0)  # the thread that writes may wait for a ride that has died
+    os._exit(0)  # the writing thread may wait for a process that has died
 
 
 if __name__ == "__main__":

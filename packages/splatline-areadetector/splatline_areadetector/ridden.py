@@ -1,4 +1,7 @@
-"""RiddenFrames: the frames of one epoch of somebody else's scan, in the order of our file, each with kind and angle."""
+"""RiddenFrames: the frames of another program's scan, in the order of our file, each with kind and angle.
+
+An epoch is a part of the scan in which the frame numbers do not restart; each epoch is a file.
+"""
 
 from __future__ import annotations
 
@@ -28,23 +31,23 @@ from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import Basis, Decision, NewEpoch, Outside, Place, Seen, Sorter, Unknown
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
-SLICE = 0.25  # s: the longest wait for a frame between two looks at the stop request
-SECOND = 1.0  # s without a frame, after which those that wait for others have their places without them
+SLICE = 0.25  # s: longest wait for a frame before the stop request is checked again
+SECOND = 1.0  # s without a frame, after which waiting frames no longer wait for earlier numbers
 _STATES = {FrameKind.DARK: State.DARKS, FrameKind.FLAT: State.FLATS, FrameKind.PROJECTION: State.ACQUIRING}
 
 Images = Mapping[FrameKind, NDArray[Any]]
-"""Darks and flats [frame, row, col] from files, where the scan takes none."""
+"""Darks and flats [frame, row, col] from files, for a scan that takes none."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ride:
-    """What a ride goes by, connected.
+    """Everything that `beamline ride` uses, connected.
 
     Attributes:
-        counters: of plugin and camera.
-        given: darks and flats from files, which come first, where the scan takes none.
-        runs: the folder in which each run gets its own.
-        say: takes what is said while there is no run.
+        counters: those of the plugin and the camera.
+        given: darks and flats from files, for a scan that takes none; they are stored first.
+        runs: the folder for the folders of runs.
+        say: prints messages while there is no run.
     """
 
     config: RideConfig
@@ -58,17 +61,17 @@ class Ride:
 
 
 class EpochEndedError(LedgerError):
-    """The file has ended before the scan, as its frames' numbers began anew or their size changed."""
+    """The file was closed before the end of the scan, because frame numbers restarted or the frame size changed."""
 
 
 def outside_sentence(guide: Guide) -> str:
-    """What is said of frames of no scan."""
+    """The message about frames outside of a scan."""
     status = f" ({guide.status})" if guide.status else ""
-    return f"Frames of no scan come{status}: they are not stored."
+    return f"Frames that arrive outside of a scan{status} are not stored."
 
 
 class RiddenFrames:
-    """A `FrameSource`: takes frames from the stream until the scan is complete, its numbers begin anew, or a stop."""
+    """A `FrameSource`: takes frames from the stream until the scan is complete, numbers restart, or a stop comes."""
 
     recovered, unsafe = 0, False
 
@@ -85,14 +88,14 @@ class RiddenFrames:
         self._last: ArrayFrame | None = None  # that has a place
         self._arrived: ArrayFrame | None = None  # the last one
         self._unplaced: dict[str, list[int]] = {}
-        self._unused: dict[str, list[int]] = {}  # numbers of frames that came all the same, by what is wrong with them
+        self._unused: dict[str, list[int]] = {}  # numbers of frames that arrived and cannot be used, by reason
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._told_of_outside = False
         self._told_pause = self._epoch = ""
         self._row = self._views = 0
         self._silence = Silence(
             ride.stream, ride.counters, ride.config.ride.silence_s, self._warn,
-            lambda: f"What came before is in the file.{self._told(ended=False)}",
+            lambda: f"Frames that came before are in the file.{self._told(ended=False)}",
         )  # fmt: skip
 
     @property
@@ -102,10 +105,10 @@ class RiddenFrames:
         return [given + first + trigger for i, first in firsts for trigger in self._sorter.missing(i)]
 
     def frames(self) -> Generator[Frame, None, None]:
-        """See `FrameSource`. LedgerError names the frames that are missing, and whose loss they are."""
+        """See `FrameSource`. LedgerError names the missing frames, and who lost them."""
         yield from self._from_files()
         yield from self._from_stream()
-        if not self._sorter.complete:  # else what is held is the next scan's
+        if not self._sorter.complete:  # otherwise the held frames belong to the next scan
             yield from self._stored(self._sorter.decided(0))
         for seen in reversed(self._sorter.held):
             self._stream.put_back(seen.frame)
@@ -125,7 +128,7 @@ class RiddenFrames:
         while not (self._sorter.complete or self._stop.aborting):
             self._refuse_pause()
             item = self._stream.next(SLICE)
-            if self._stop.stopping:  # what was on its way is still stored
+            if self._stop.stopping:  # frames on their way are still stored
                 stored_until = stored_until or time.time() + SLICE
                 if item is None or (isinstance(item, ArrayFrame) and item.received > stored_until):
                     return
@@ -138,9 +141,9 @@ class RiddenFrames:
                     self._silence.look()
                 case Disconnected():
                     self._gone = True
-                    self._warn(f"{self._stream.name}: its server has gone. The ride waits for it.")
+                    self._warn(f"{self._stream.name}: its server has gone. Waiting until it is back.")
                 case Died(code):
-                    self._warn(f"The process that receives frames has ended ({code}): another one is started.")
+                    self._warn(f"The process that receives frames has ended (exit code {code}); starting another one.")
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     yield from self._stored(self._sorter.decided(1))
@@ -148,12 +151,12 @@ class RiddenFrames:
                         self._gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
                     raise DataError(
-                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. What came before is in "
-                        "the file."
+                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. Frames that came before "
+                        "are in the file."
                     )
                 case ArrayFrame():
                     if item.is_current and self._arrived is not None and item.time <= self._arrived.time:
-                        continue  # the server still had it when it was connected
+                        continue  # an old frame that the server still had
                     self._silence.frame_came()
                     self._arrived, seen = item, seen_of(item, self._guide, gone=self._gone)
                     self._gone = False
@@ -162,7 +165,7 @@ class RiddenFrames:
                         return
 
     def _stored(self, decided: Iterable[tuple[Seen, Decision]]) -> Iterator[Frame]:
-        """The frames of the file, until it ends."""
+        """The frames that go into the file, until it is closed."""
         for seen, decision in decided:
             if (frame := self._placed(seen, decision)) is not None:
                 yield frame
@@ -174,11 +177,11 @@ class RiddenFrames:
         self._sink(Warned(sentence))
 
     def _placed(self, seen: Seen, place: Decision) -> Frame | None:
-        """The frame of the file; None: it belongs to no scan, cannot be read, or to the next file."""
+        """The frame for the file; None: it belongs to no scan, cannot be decoded, or belongs to the next file."""
         frame: ArrayFrame = seen.frame
         if isinstance(place, NewEpoch):
             self._epoch = place.why or self._other_size(frame)
-            self._warn(f"{self._epoch}: the file ends, another begins.")
+            self._warn(f"Closing this file and beginning another, because {self._epoch}.")
             for each in (*reversed(self._sorter.held), seen):
                 self._stream.put_back(each.frame)
             self._sorter.held.clear()
@@ -216,18 +219,18 @@ class RiddenFrames:
     def _cannot_use(self, frame: ArrayFrame, why: str) -> None:
         if why not in self._unused:
             self._warn(
-                f"Frame {frame.unique_id}: {why}. It counts as missing; of others like it this is said at the end."
+                f"Frame {frame.unique_id} counts as missing: {why}. Further frames of this kind are listed at the end."
             )
         self._unused.setdefault(why, []).append(frame.unique_id)
 
     def _unknown(self, frame: ArrayFrame, place: Unknown) -> Frame | None:
-        """A frame without a place, kept as an invalid row if it has the size of the others. It is said once of each
-        cause, and at the end of all."""
-        kept = "kept as an invalid row" if place.fits else "not stored"
+        """A frame that cannot be assigned, stored as an invalid row if it has the size of the others. The first frame
+        of each cause gives a message, and all are listed at the end."""
+        kept = "stored as an invalid row" if place.fits else "not stored"
         frames = self._unplaced.setdefault(f"{place.why} ({kept})", [])
         frames.append(frame.unique_id)
         if len(frames) == 1:
-            self._warn(f"Frame {frame.unique_id} is {kept}: {place.why}.")
+            self._warn(f"Frame {frame.unique_id} is {kept}, because {place.why}.")
         if not place.fits or (counts := self._counts(frame)) is None:
             return None
         self._in_block += bool(self._in_block)
@@ -241,13 +244,13 @@ class RiddenFrames:
         self._gaps.append(Gap(ids, before.time, after.time, still))
 
     def _other_size(self, frame: ArrayFrame) -> str:
-        """Why the file ends at a frame of another size or type."""
+        """Why the file is closed: a frame of another size or type."""
         assert self._last is not None
         (before, dtype), (after, other) = self._last.kind, frame.kind
         return (
-            f"frames are {after.shape[0]} x {after.shape[1]} {other} from number {frame.unique_id} on, after "
+            f"frames from number {frame.unique_id} on are {after.shape[0]} x {after.shape[1]} {other}, before "
             f"{before.shape[0]} x {before.shape[1]} {dtype}"
-            + ("" if (before.shape, dtype) != (after.shape, other) else ", of another part of the sensor")
+            + ("" if (before.shape, dtype) != (after.shape, other) else ", and show another part of the sensor")
         )
 
     def _frame(self, frame: ArrayFrame, counts: NDArray[np.uint16], place: Place) -> Frame:
@@ -257,7 +260,7 @@ class RiddenFrames:
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._cannot_use(frame, "nothing tells its angle, so that it is kept as an invalid row")
+                self._cannot_use(frame, f"{self._guide.unknown_angle}, so such a frame is stored as an invalid row")
             else:
                 self._views += 1
         seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)
@@ -277,7 +280,7 @@ class RiddenFrames:
         if not self._in_block:
             return
         planned = self._block < len(self._plan.blocks)
-        is_over = planned and (is_last or self._sorter.is_over(self._block))  # else it goes on after others
+        is_over = planned and (is_last or self._sorter.is_over(self._block))  # else it continues after others
         missing = self._sorter.missing(self._block) if is_over else []
         n = self._plan.blocks[self._block].n if planned else self._in_block
         first, lost = self._row - self._in_block, len(missing)
@@ -287,15 +290,15 @@ class RiddenFrames:
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
         if reason and reason != self._told_pause:
-            self._warn(f"The scan is another program's, and goes on: it should pause, as {reason}.")
+            self._warn(f"The scan should pause ({reason}), but another program runs it, and it continues.")
         self._told_pause = reason
         self._measurement.pause.resume()
 
     def _told(self, *, ended: bool) -> str:
-        """Sentences on what is missing and whose loss it was, each after a space.
+        """Sentences on the missing frames and on who lost them, each after a space.
 
         Args:
-            ended: whether the scan ended by itself: no stop, no new epoch.
+            ended: whether the scan ended by itself, without a stop and without a new epoch.
         """
         words = []
         for i, block in enumerate(self._plan.blocks):
@@ -309,62 +312,69 @@ class RiddenFrames:
                 words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{at}.")
         words.append(self._first_or_last(ended))
         for why, ids in self._unused.items():
-            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) but could not be used: {why}.")
+            words.append(f"{count(len(ids), 'frame')} arrived ({spans(ids)}) but could not be used: {why}.")
         if self._unused and self._guide.status:
             words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
-            words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
+            words.append(
+                f"{count(self._sorter.repeats, 'frame')} arrived twice and "
+                f"{'was' if self._sorter.repeats == 1 else 'were'} stored once."
+            )
         for why, ids in self._unplaced.items():
-            frames = "Frame {} has" if len(ids) == 1 else "Frames {} have"
-            words.append(f"{frames.format(spans(sorted(ids)))} no place: {why}.")
+            frames = "Frame {}" if len(ids) == 1 else "Frames {}"
+            words.append(f"{frames.format(spans(sorted(ids)))} could not be assigned: {why}.")
         return "".join(f" {sentence}" for sentence in words if sentence)
 
     def _first_or_last(self, ended: bool) -> str:
-        """A sentence on frames that are missing at the end: "" where the number of the first one is known, or where a
-        stop while frames came, of a ride that waited for the first one, tells why.
+        """A sentence on frames that are missing at the end. "" if the number of the first projection is known, or if
+        the recording began before the scan and was stopped while frames came, because that explains the missing frames.
 
-        No view shows it: the same turn of all angles gives the same views of a turned sample.
+        The projections cannot show it: if all angles are rotated, they fit a rotated sample.
         """
         angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
         if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        off = f"all angles are those of {n} later"
+        off = f"all angles are those of projections {n} later"
         if n < angles.size and not np.isnan(angles).any():
-            off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° more"
+            off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
         has_angles = self._plan.told_by == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
             off = "" if has_angles else f", and {off}"
-            off = f"frames next to those of another kind have the wrong kind{off}. ride.kinds"
+            off = f"frames next to those of another kind have the wrong kind{off}. Set ride.kinds"
         elif has_angles:
             return ""
         else:
-            off = f"{off}, by which the volume is turned, and nothing else. ride.camera"
+            off = f"{off}, which rotates the volume and changes nothing else. Set ride.camera"
         return (
-            "As nothing tells the number of the first one, it may be the first "
-            f"{'that is' if n == 1 else f'{n} that are'} missing: then {off} or ride.first_id tells it."
+            f"The number of the first projection is not known, so the missing {'frame' if n == 1 else f'{n} frames'} "
+            f"may be the first: then {off} or ride.first_id to avoid this."
         )
 
     def _raise_outcome(self) -> None:
         since = math.inf if self._arrived is None else time.time() - self._arrived.received
-        ended = not (self._epoch or (self._stop.stopping and since < SECOND))  # a later stop cut nothing off
+        ended = not (
+            self._epoch or (self._stop.stopping and since < SECOND)
+        )  # a stop after the last frame changed nothing
         told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")
         if self._stop.stopping and not self._sorter.complete:
             raise ScanStopped(
-                f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The file is complete as "
-                f"far as it goes.{told}"
+                f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The file can be used as "
+                f"it is.{told}"
             )
         if self._epoch:
-            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{self._others}", self.missing)
+            raise EpochEndedError(
+                f"{told.strip()} The file was closed there, because {self._epoch}.{self._others}", self.missing
+            )
         if self.missing:
             raise LedgerError(f"{told.strip()}{self._others}", self.missing)
 
     @property
     def _others(self) -> str:
         if not self._views:
-            return f" The file has {count(self._row, 'frame')}, and no projection with an angle."
+            return f" The file has {count(self._row, 'frame')}, but no projection with an angle."
         by = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
         return f" Every other frame is in the file with the angle of its number{by}."
 
@@ -373,7 +383,7 @@ def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:
     """What is known of a frame.
 
     Args:
-        gone: the server had gone since the frame before.
+        gone: the server was gone since the frame before.
     """
     return Seen(
         frame.unique_id, guide.phase(frame), frame.time, frame.kind, frame.payload, gone or frame.is_current, frame

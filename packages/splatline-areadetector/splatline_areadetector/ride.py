@@ -1,4 +1,4 @@
-"""Ride: waits for somebody else's scan, records it as one of ours, and begins another file where its numbers do."""
+"""Waits for the scan of another program and records it. If its frame numbers restart, another file begins."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from splatline_areadetector.stream import FrameStream, Refused
 
 
 class NoScanError(ScanAborted):
-    """A stop while a scan was waited for."""
+    """Stopped while waiting for a scan."""
 
 
 def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> RunResult:
-    """Record the next scan of the stream: in a run, or in one for each epoch of its frames' numbers.
+    """Record the next scan of the stream in a run. If its frame numbers restart, each part is a run of its own.
 
     Args:
-        live: warms up while a scan is waited for, and makes its live volume; None: there is none.
+        live: loads its code while waiting for a scan, then makes the live volume; None: no live volume.
 
     Raises:
         ConfigError: the frames cannot be stored, or no angles follow for them; nothing was recorded.
@@ -65,7 +65,7 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
         try:
             result = record_scan(config, ready, source_of, ride.runs, sinks, ride.stop, live=live)
         except EpochEndedError as error:
-            lost, first_id = error, None  # numbers of another epoch
+            lost, first_id = error, None  # the numbers have restarted
             continue
         if lost is not None:
             raise lost
@@ -73,10 +73,10 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
 
 
 def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) -> tuple[ArrayFrame, Seen | None]:
-    """The first frame of a scan, which the stream still has, and the one before it; those before it are dropped.
+    """The first frame of a scan, which stays in the stream, and the frame before it. Earlier frames are dropped.
 
     Args:
-        began_within_scan: a file has ended within the scan.
+        began_within_scan: a file of this scan has been closed already.
 
     Raises:
         NoScanError: a stop was requested.
@@ -94,7 +94,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) 
     while not ride.stop.stopping:
         item = stream.next(SLICE)
         if isinstance(item, Refused):
-            raise ConfigError(f"Frames of {stream.name} cannot be stored: {item.why}. Nothing was recorded.")
+            raise ConfigError(f"The frames of {stream.name} cannot be stored: {item.why}. Nothing was recorded.")
         if not isinstance(item, ArrayFrame):
             silence.look()
             continue
@@ -115,7 +115,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) 
 
 
 def _begins(seen: Seen, ride: Ride, first_id: int | None) -> bool:
-    """Whether it is a frame of the scan."""
+    """Whether this frame belongs to the scan."""
     if seen.phase == BY_ORDER:
         return first_id is None or seen.number >= first_id - n_before_views(ride.guide.plan().blocks)
     kind = seen.phase.kind
@@ -123,43 +123,44 @@ def _begins(seen: Seen, ride: Ride, first_id: int | None) -> bool:
 
 
 def _is_alone(first: ArrayFrame, ride: Ride) -> bool:
-    """Whether the next frames are of another size. ConfigError: their numbers are the same, and their pixels differ."""
+    """Whether the next frames have another size. ConfigError: they have the same number but other pixels."""
     ahead = [each for each in ride.stream.ahead(2, SECOND) if isinstance(each, ArrayFrame)]
     if ahead and ahead[0].unique_id == first.unique_id and not np.array_equal(ahead[0].payload, first.payload):
         raise ConfigError(f"{not_set(first.unique_id)}. Nothing was recorded.")
     if len(ahead) < 2 or first.kind == ahead[0].kind or ahead[0].kind != ahead[1].kind:
         return False
-    ride.say(f"Frame {first.unique_id} is of another size than those after it: it is not stored.")
+    ride.say(f"Frame {first.unique_id} is not stored, because it has another size than the frames after it.")
     return True
 
 
 def _shown(ride: Ride) -> str:
-    """The end of the sentence on a stream, by the frame that its server has. It says so where only the scan's own first
-    frame can tell the exposure."""
+    """The end of the sentence about a stream, from the frame that its server has. It warns if only the first frame of
+    the scan can tell the exposure time."""
     if (first := ride.stream.first) is None:
         return "."
     untold = not isinstance(ride.config.ride.angles, TomoscanAngles) and _exposure(ride, None, first) is None
     return f" ({first.window.shape[0]} x {first.window.shape[1]} {first.dtype})." + (
-        f" Nothing tells the exposure yet: its frames must have the attribute {EXPOSURE}, else set ride.exposure_s."
+        " The exposure time is not known yet: set ride.exposure_s, unless the frames will have the attribute "
+        f"{EXPOSURE}."
         if untold
         else ""
     )
 
 
 def _exposure(ride: Ride, planned: float | None, first: ArrayFrame) -> float | None:
-    """s of a view, by the first that tells: configuration, plan, frame, camera; None: nothing does."""
+    """Exposure time of a projection in s, from the first of these that has it: configuration, plan, frame, camera."""
     camera, by_frame = ride.counters.camera, seconds_of(first.attributes.get(EXPOSURE))
     by_camera = None if camera is None else seconds_of(camera.number("AcquireTime_RBV"))
     return ride.config.ride.exposure_s or seconds_of(planned) or by_frame or by_camera
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
-    """The plan with an exposure of its views."""
+    """The plan, completed by the exposure time of the projections."""
     seconds = _exposure(ride, plan.exposures.get(FrameKind.PROJECTION), first)
     if seconds is None:
         raise ConfigError(
-            f"Nothing tells the exposure: the frames have no attribute {EXPOSURE}, and ride.camera names no camera. "
-            "Set ride.exposure_s. Nothing was recorded."
+            f"Set ride.exposure_s: the exposure time is not known, because the frames have no attribute {EXPOSURE}, "
+            "and ride.camera names no camera. Nothing was recorded."
         )
     camera = ride.counters.camera
     period = plan.period or (None if camera is None else seconds_of(camera.number("AcquirePeriod_RBV")))
@@ -171,15 +172,16 @@ def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePl
     for kind, images in given.items():
         if images.shape[1:] != shape:
             raise ConfigError(
-                f"--{kind.name.lower()}s has frames of {images.shape[1]} x {images.shape[2]} pixels, the camera of "
-                f"{shape[0]} x {shape[1]}: give those of this region and binning. Nothing was recorded."
+                f"The frames of --{kind.name.lower()}s have {images.shape[1]} x {images.shape[2]} pixels, those of the "
+                f"camera {shape[0]} x {shape[1]}: give frames with the camera's region and binning. Nothing was "
+                "recorded."
             )
     blocks = tuple(PlannedBlock(kind, len(images)) for kind, images in given.items())
     return replace(plan, blocks=(*blocks, *plan.blocks))
 
 
 def load_given(darks: str | None, flats: str | None) -> Images:
-    """Darks and flats of files, rounded to counts. Raises ConfigError for what cannot be counts of a camera."""
+    """Darks and flats from files, rounded to counts. Raises ConfigError if they cannot be counts of a camera."""
     given = {}
     for kind, name in ((FrameKind.DARK, darks), (FrameKind.FLAT, flats)):
         if name is None:
@@ -188,21 +190,21 @@ def load_given(darks: str | None, flats: str | None) -> Images:
             images = load_images(name, kind)
         except BeamlineError as error:
             raise ConfigError(f"--{kind.name.lower()}s: {error}") from error
-        counts = np.rint(images)  # means of others' frames are real numbers
+        counts = np.rint(images)  # averaged frames of other programs are real numbers
         if not (images.size and counts.min() >= 0 and counts.max() <= np.iinfo(np.uint16).max):
             raise ConfigError(
-                f"--{kind.name.lower()}s {name} has no counts: they are numbers from 0 to 65535. Nothing was recorded."
+                f"--{kind.name.lower()}s {name} must hold counts, numbers from 0 to 65535. Nothing was recorded."
             )
         given[kind] = counts.astype(np.uint16)
     return given
 
 
 def opened(config: RideConfig, held: ExitStack) -> tuple[FrameStream, Guide, Counters]:
-    """The stream, the guide and the counters of a ride, closed with `held`.
+    """The stream, the guide and the counters that `beamline ride` uses; `held` closes them.
 
     Raises:
         DeviceTimeout: a server does not answer.
-        ConfigError: a name is wrong, or the image is unfit, as by its port.
+        ConfigError: a name is wrong, or the image cannot be recorded, for example because of its port.
     """
     settings = config.ride
     stream = held.enter_context(FrameStream(settings.image, settings.queues, settings.period_s))

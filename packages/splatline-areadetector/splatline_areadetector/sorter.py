@@ -1,14 +1,15 @@
-"""Sorter: which dark, flat or projection each frame is, from all that is known of it, and what that rests on.
+"""Sorter: finds which dark, flat or projection each frame is, and how sure that is.
 
-Known are a frame's number, size, kind, pixels and time, the counts of the plan's blocks, and the camera's own counter.
-A frame's trigger is its number less that of the first frame of its block. The number is believed as far as it goes:
+It knows the number, size, kind, pixels and time of a frame, the planned length of each block, and the camera's own
+counter. The trigger of a frame is its number minus that of the first frame of its block. Four properties of the numbers
+are handled:
 
 - Neighbours may be exchanged: a frame whose number is ahead waits until some more have come.
-- A counter of 16 or 32 bits begins again at its end, and the count goes on.
-- A plugin that averages n frames passes on each nth number.
-- Numbers may begin anew with each acquisition: after a whole block the next one begins. Within a block the file ends.
+- A counter of 16 or 32 bits restarts at its end: the count continues.
+- A plugin that averages n frames passes on every nth number.
+- Numbers may restart with each acquisition: after a complete block the next block begins, within a block the file ends.
 
-It is arithmetic on values: no file, no server, no clock.
+It computes with values only: no file, no server, no clock.
 """
 
 from __future__ import annotations
@@ -30,18 +31,18 @@ from drivers.base.frame import FrameKind
 from splatline_areadetector.plan import PlannedBlock
 
 VIEW = FrameKind.PROJECTION
-WINDOW = 4  # frames that come before one with a lower number, at most
-_NEAR = 100  # numbers from the end of a counter's range within which it may begin again
+WINDOW = 4  # at most so many frames may come before a frame with a lower number
+_NEAR = 100  # a counter may restart so many numbers before or after the end of its range
 _RANGES = ((0, 2**16 - 1), (0, 2**31 - 1), (-(2**31), 2**31 - 1))
-_RUNNING = 3  # periods between two frames of the same acquisition, at most
+_RUNNING = 3  # longest time between two frames of the same acquisition, in periods
 
 
 @dataclass(frozen=True)
 class Phase:
-    """What a scan does while a frame is taken.
+    """What the scan does while a frame is taken.
 
     Attributes:
-        serial: another one is another block of darks or flats, even of the same kind.
+        serial: differs between two blocks of darks or flats, even of the same kind.
         kind: None: the frame belongs to no scan.
     """
 
@@ -50,9 +51,9 @@ class Phase:
 
 
 NO_SCAN, BY_ORDER, NOT_TOLD = (Phase(serial, None) for serial in (0, -1, -2))
-"""A frame of no scan; one whose kind follows from the order of the plan's blocks; one whose kind nothing tells."""
+"""A frame outside of a scan; a frame whose kind follows from the order of the blocks; a frame of unknown kind."""
 UNPLANNED = 2**31
-"""Frames at most of a block that the plan does not have: darks and flats that come all the same."""
+"""Largest length of a block that is not planned: darks and flats that come nevertheless."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +61,12 @@ class Seen:
     """What is known of a frame.
 
     Attributes:
-        time: s, by the IOC.
-        size: whatever all frames of a file have in common.
-        pixels: compared with those of a frame of the same number.
-        reconnected: the server had gone since the frame before, or came with this one when it was asked.
-        frame: goes with it.
-        count_restarts: how often the numbers had begun anew; the sorter sets it.
+        time: s, on the clock of the IOC.
+        size: a value that is the same for all frames of a file.
+        pixels: compared with those of a frame with the same number.
+        reconnected: the server was gone since the frame before, or had this frame already when we connected.
+        frame: the frame itself, which the sorter passes on.
+        count_restarts: how often the numbers have restarted; the sorter sets it.
     """
 
     number: int
@@ -78,19 +79,19 @@ class Seen:
     count_restarts: int = 0
 
     def repeats(self, other: Seen, *, is_last: bool) -> bool:
-        """Whether it is the same frame as one of its number, sent once more: at once, or later with the same time."""
+        """Whether it is the other frame of the same number, sent again: at once, or later with the same time."""
         is_same = self.phase == other.phase and (is_last or self.time == other.time)
         return is_same and np.array_equal(self.pixels, other.pixels)
 
 
 class Basis(Enum):
-    """What the number of a block's first frame rests on, as a sentence's end."""
+    """How the number of a block's first frame was found, as the end of a sentence."""
 
-    GIVEN = "as ride.first_id says"
-    NUMBERS = "as its number follows that of the frame before the block"
-    COUNTER = "as the camera's own count says"
-    WAITED = "the first that came"
-    UNKNOWN = "the first that came, although others may have come before it"
+    GIVEN = "the one that ride.first_id states"
+    NUMBERS = "the one whose number follows that of the frame before the block"
+    COUNTER = "the one that the camera's own count shows"
+    WAITED = "the first that arrived"
+    UNKNOWN = "the first that arrived, although others may have come before it"
 
     @property
     def is_sure(self) -> bool:
@@ -98,28 +99,28 @@ class Basis(Enum):
 
 
 class Witness(Protocol):
-    """What the IOC's own counters say."""
+    """The IOC's own counters."""
 
     def counted(self, first: float, second: float | None) -> int | None:
-        """Frames of the acquisition that the camera had counted with its frame of this time; None: not known.
+        """The camera's count in this acquisition, including its frame of this time; None: not known.
 
         Args:
             second: time of the next frame; None: not known.
         """
 
     def were_lost(self, begin: float, end: float, n: int) -> bool:
-        """Whether the plugin tells that more than n frames passed in this time."""
+        """Whether more than n frames passed the plugin in this time, or the plugin dropped some."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A frame's place in the plan.
+    """Where a frame belongs in the plan.
 
     Attributes:
         trigger: within its block.
-        skipped: triggers lost just before.
-        basis: what the number of the block's first frame rests on.
-        note: a sentence on what had to be assumed; "": nothing.
+        skipped: triggers lost just before this frame.
+        basis: how the number of the block's first frame was found.
+        note: a message on what had to be assumed; "": nothing.
     """
 
     block: int
@@ -132,8 +133,13 @@ class Place:
 
 @dataclass(frozen=True)
 class Outside:
-    """A frame that is not stored: of no scan, beyond its block's plan, or seen before; `lost`: numbers of the frames at
-    the block's end that did not come, of its first frame beyond where the count did not begin anew in between."""
+    """A frame that is not stored: outside of a scan, beyond the planned end of its block, or seen before.
+
+    Attributes:
+        lost: numbers that are missing at the end of the block, given with the first frame beyond the end, if the
+            numbers
+            did not restart in between.
+    """
 
     repeated: bool = False
     lost: range = range(0)
@@ -141,7 +147,8 @@ class Outside:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A frame of the scan that has no place; `why`: a sentence's end. `fits`: whether it has the size of the others."""
+    """A frame of the scan that cannot be assigned. `why`: the end of a sentence. `fits`: it has the size of the
+    others."""
 
     why: str
     fits: bool = True
@@ -149,7 +156,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class NewEpoch:
-    """The file ends before this frame; `why`: a sentence without a full stop."""
+    """The file is closed before this frame. `why`: a sentence without a full stop."""
 
     why: str
 
@@ -159,7 +166,7 @@ Decision = Place | Outside | Unknown | NewEpoch
 
 @dataclass
 class _Taken:
-    """A block and the triggers that came; `first_frame_of_other_kind`: the one after its last frame."""
+    """A block and the triggers that came. `first_frame_of_other_kind`: the first one after the block's last frame."""
 
     kind: FrameKind
     n: int
@@ -177,12 +184,12 @@ class _Taken:
 
     @property
     def end(self) -> int:
-        """Number of the first frame beyond the plan."""
+        """Number of the first frame beyond the planned end."""
         return self.first + self.n * self.step
 
     @property
     def n_left(self) -> int:
-        """Frames after the last one."""
+        """Number of frames still expected."""
         return (self.end - self.last) // self.step - 1
 
     @property
@@ -191,15 +198,15 @@ class _Taken:
 
 
 def not_set(number: int) -> str:
-    """A sentence on numbers that stay the same."""
+    """The message about numbers that stay the same."""
     return (
-        f"uniqueId is not set: it stays at {number} while the pixels change, and a ride knows a frame by it. Have the "
-        "server set uniqueId of its NTNDArray to the count of frames"
+        f"uniqueId stays at {number} while the pixels change. Have the server set uniqueId of its NTNDArray to the "
+        "count of frames, because beamline ride identifies frames by it"
     )
 
 
 def n_before_views(blocks: Sequence[PlannedBlock]) -> int:
-    """Frames that are planned before the projections."""
+    """Number of frames that are planned before the projections."""
     return sum(block.n for block in blocks[: [*(block.kind for block in blocks), VIEW].index(VIEW)])
 
 
@@ -207,15 +214,15 @@ class Sorter:
     """Assigns frames to the plan's blocks.
 
     Args:
-        blocks: planned.
-        first_id: number of the first projection; None: it follows from what is known.
+        blocks: the planned blocks.
+        first_id: number of the first projection; None: the sorter finds it.
         witness: counters of the IOC; None: it has none.
-        before: the last frame before the first one.
-        began_within_scan: the scan may have begun before: its numbers began anew within it.
+        before: the frame before the first one.
+        began_within_scan: the scan may have begun earlier, because the numbers have restarted within it.
 
     Attributes:
-        repeats: frames that came twice.
-        held: frames that wait for others, in the order of their numbers.
+        repeats: number of frames that came twice.
+        held: frames that wait for earlier numbers, in the order of their numbers.
     """
 
     def __init__(
@@ -224,10 +231,12 @@ class Sorter:
     ) -> None:  # fmt: skip
         self._planned, self._first_id, self._witness = tuple(blocks), first_id, witness
         self._began_within_scan = began_within_scan
-        self._taken: dict[int, _Taken] = {}  # by the number of the planned block; extra ones follow
-        self._now, self._serial, self._step = -1, 0, 0  # a step of 0 is not known yet
-        self._raw = None if before is None else before.number  # the last number as it came
-        self._last_wrap = self._wrapped = 0  # by how much a counter went back at the end of its range: last, in all
+        self._taken: dict[int, _Taken] = {}  # by the number of the planned block; unplanned blocks follow
+        self._now, self._serial, self._step = -1, 0, 0  # step 0: not known yet
+        self._raw = None if before is None else before.number  # the last number as received
+        self._last_wrap = self._wrapped = (
+            0  # by how much the counter went back at the end of its range: last time, in total
+        )
         self._last = self._known = before
         self._recent = deque[Seen](maxlen=WINDOW)
         self._size: Any = None
@@ -236,8 +245,7 @@ class Sorter:
         self.repeats = 0
 
     def take(self, seen: Seen) -> Iterator[tuple[Seen, Decision]]:
-        """Take the next frame. Where each frame that waits no longer belongs, in the order of their numbers: see
-        `decided`."""
+        """Take the next frame. Yields the frames that need not wait any longer, see `decided`."""
         newest = self.held[-1] if self.held else self._last
         number = self._unwrapped(seen.number, seen.time, is_anew=seen.reconnected)
         restarts = 0 if newest is None else newest.count_restarts
@@ -254,8 +262,8 @@ class Sorter:
         yield from self.decided(2)
 
     def _count_restarts_of(self, seen: Seen, number: int, newest: Seen) -> int:
-        """Of a frame whose number is not beyond that of the newest one: exchanged, or numbered anew. With a frame of
-        another phase only direct neighbours are exchanged."""
+        """The restarts of a frame whose number is not beyond that of the newest one: it is exchanged with a neighbour,
+        or the numbers restarted. Frames of different phases are only exchanged with their direct neighbours."""
         last, step = self._last, self._step or 1
         is_other = seen.phase != newest.phase and NOT_TOLD not in (seen.phase, newest.phase)
         one_before = [each.number for each in self.held[:-1] if each.count_restarts == newest.count_restarts]
@@ -271,26 +279,26 @@ class Sorter:
         return newest.count_restarts + (seen.phase != newest.phase or number < newest.number - step)
 
     def decided(self, patience: int) -> Iterator[tuple[Seen, Decision]]:
-        """Where each frame that waits no longer belongs.
+        """The frames that need not wait any longer, in the order of their numbers, with where they belong.
 
         Args:
             patience: 2: more frames are coming; 1: none has come for a while; 0: none will come.
 
         Raises:
-            DataError: numbers tell nothing, as all are the same.
+            DataError: all numbers are the same.
         """
         while self.held and not (len(self.held) <= WINDOW and self._waits(patience)):
             seen = self.held.pop(0)
             yield seen, self._decide(seen, patience)
 
     def _waits(self, patience: int) -> bool:
-        """Whether the first of the frames that are held is not decided before others have come."""
+        """Whether the first of the held frames must wait for others."""
         seen, last = self.held[0], self._last
         if self._size not in (None, seen.size):
             return patience > 0 and all(each.size != self._size for each in self.held)
         goes_on = last is not None and seen.count_restarts == last.count_restarts and bool(self._taken)
         if goes_on and last is not None and seen.number <= last.number + max(self._step, 1):
-            block = self._taken[self._now]  # a number between those of the step waits for others, which may be, too
+            block = self._taken[self._now]  # a number between those of the step waits, because others may follow
             return patience > 1 and self._step > 1 and bool((seen.number - block.first) % block.step)
         return patience > 1 or (patience == 1 and goes_on and self._step == 0 and len(self.held) < 2)
 
@@ -318,7 +326,7 @@ class Sorter:
         return place
 
     def _is_another_count(self, seen: Seen, last: Seen) -> bool:
-        """Whether a number that rose while the server had gone rose by far more or less than the time did."""
+        """Whether the numbers rose by far more or less than the time did while the server was gone."""
         oldest = self._recent[0]
         if not seen.reconnected or seen.count_restarts != oldest.count_restarts or last.number == oldest.number:
             return False
@@ -327,21 +335,22 @@ class Sorter:
         return not expected / 2 <= seen.time - last.time <= 2 * expected + 2 * period
 
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
-        """Why the file ends, where numbers have begun anew; "": another block begins, or none."""
+        """Why the file ends if numbers have restarted; "": the file does not end."""
         if (seen.number, seen.phase) == (last.number, last.phase) and not (seen.reconnected or block.is_over):
-            raise DataError(f"{not_set(seen.number)}. What came before is in the file.")
+            raise DataError(f"{not_set(seen.number)}. Frames that came before are in the file.")
         is_same = seen.phase in (BY_ORDER, NOT_TOLD) or (
             seen.phase.kind is block.kind and (block.kind is VIEW or seen.phase.serial == self._serial)
         )
         if not seen.reconnected and (block.is_over or not is_same):
             return ""
         return (
-            f"frame numbers began anew at {seen.number}, after {last.number}: the server restarted, or its counter was "
-            "reset"
+            f"frame numbers restarted at {seen.number}, after {last.number} (the server restarted, or its counter was "
+            "reset)"
         )
 
     def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
-        """By how much numbers rise from frame to frame: by more than 1 where all of some do, and none was lost."""
+        """Find by how much numbers rise from frame to frame: by more than 1 if all of several do and no frame was
+        lost."""
         following = [last, seen, *self.held]
         rises = [b.number - a.number for a, b in pairwise(following) if a.count_restarts == b.count_restarts]
         step = math.gcd(*rises)
@@ -351,8 +360,8 @@ class Sorter:
         step = 1 if lost else step
         if self._step:
             self._note = (
-                f"Numbers rise by {step} from frame {seen.number} on, not by {block.step}: frames before it were lost, "
-                f"and what was stored up to frame {last.number} may have a wrong kind or angle. Leave it out."
+                f"Do not use the frames up to {last.number}: they may have a wrong kind or angle. From frame "
+                f"{seen.number} on, numbers rise by {step} instead of {block.step}, so frames were lost before."
             )
             numbers = [block.first + block.step * trigger for trigger in block.triggers]
             if seen.phase == BY_ORDER:
@@ -361,24 +370,24 @@ class Sorter:
             block.triggers = {i for number in numbers if (i := (number - block.first) // step) < block.n}
         elif step > 1:
             self._note = (
-                f"The numbers of frames rise by {step}: a plugin averages {step} frames, or passes on one in {step}. "
-                "Each that comes is taken for a frame of the plan. If the plan counts the camera's frames, take the "
+                f"Frame numbers rise by {step}: a plugin averages {step} frames, or passes on one in {step}. Each "
+                "frame that arrives counts as a frame of the plan. If the plan counts the camera's frames, take the "
                 "image before that plugin (NDArrayPort)."
             )
         self._step = block.step = step
 
     def _is_step_wrong(self, seen: Seen, last: Seen, block: _Taken) -> bool:
-        """Whether more numbers of the same acquisition than one are between those of the step."""
+        """Whether more than one number of the same acquisition is between those of the step."""
         now = (last.count_restarts, last.phase)
         ahead = [each for each in (seen, *self.held) if (each.count_restarts, each.phase) == now]
         return sum((each.number - block.first) % block.step > 0 for each in ahead) > 1
 
     def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
-        """Where a frame belongs that begins no file."""
+        """Where a frame belongs, if the file does not end."""
         kind, views = seen.phase.kind, self._views
         if seen.phase == NOT_TOLD:
             if block is None or is_anew or block.closed or seen.number >= block.end:
-                return Unknown("nothing tells whether it is a dark, a flat or a projection")
+                return Unknown("it is not known whether it is a dark, a flat or a projection")
         elif seen.phase == BY_ORDER:
             self._by_order(seen, block, is_anew)
         elif kind is None:
@@ -395,15 +404,18 @@ class Sorter:
         if block.closed or seen.count_restarts != block.count_restarts or trigger >= block.n:
             return self._outside(seen, block)
         if rest:
-            return Unknown(f"numbers rise by {block.step}, and its own is none of them")
+            return Unknown(f"numbers rise by {block.step}, but its number is between two of them")
         skipped, block.last = range(block.trigger(block.last) + 1, trigger), seen.number
         block.triggers.add(trigger)
         if seen.reconnected and not self._note and len(block.triggers) > 1:
-            self._note = f"The server had gone before frame {seen.number}: it is placed as if the count had gone on."
+            self._note = (
+                f"The server was gone before frame {seen.number}: the frame is assigned as if the count had continued."
+            )
         return Place(self._now, block.kind, trigger, skipped, block.basis)
 
     def _outside(self, seen: Seen, block: _Taken | None) -> Outside:
-        """A frame that is not stored. By its number the present block may be over, whatever is missing at its end."""
+        """A frame that is not stored. Its number may show that the present block is over, whatever is missing at its
+        end."""
         if block is None or block.closed or seen.number < block.end:
             return Outside()
         block.closed = True
@@ -411,7 +423,7 @@ class Sorter:
         return Outside(lost=range(block.last + block.step, end, block.step))
 
     def _by_order(self, seen: Seen, block: _Taken | None, is_anew: bool) -> None:
-        """Open the planned block that follows from the order of blocks and their counts."""
+        """Open the planned block that follows from the order and the lengths of the blocks."""
         i, step = self._now, self._step or 1
         if block is not None and not is_anew:
             first, basis = block.first, block.basis
@@ -428,9 +440,9 @@ class Sorter:
             first, i = first + self._planned[i].n * step, i + 1
 
     def _begin(self, seen: Seen, kind: FrameKind, is_anew: bool) -> None:
-        """Open the block that begins with a frame of another kind, or with other darks or flats."""
+        """Open the block that begins with this frame: of another kind, or of another series of darks or flats."""
         views, lost, basis = self._views, 0, Basis.WAITED
-        if views is not None and not views.is_over:  # within the projections, or at their end, some of which are lost
+        if views is not None and not views.is_over:  # within the projections, or at their end if some are lost
             is_same_count = seen.count_restarts == views.count_restarts
             views.closed = seen.number >= views.end if is_same_count else views.n_left <= WINDOW
         is_later = views is None or views.is_over
@@ -453,12 +465,12 @@ class Sorter:
         self._taken[i] = _Taken(block.kind, block.n, first, step, first - step, seen.count_restarts, basis)
 
     def _lost_before(self, seen: Seen, is_anew: bool, block: PlannedBlock) -> tuple[int, Basis]:
-        """Frames of a block that were lost before the first that came, and what tells it."""
+        """Number of frames of a block that were lost before the first that came, and how that is known."""
         known, step, n, noun = self._known, self._step or 1, block.n, block.kind.name.lower()
         second = next((each for each in self.held if each.count_restarts == seen.count_restarts), None)
         gap, is_other = n, known is not None and known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
         if known is not None and is_other and known.count_restarts == seen.count_restarts and not seen.reconnected:
-            gap = (seen.number - known.number) // step - 1  # from n on it is another count
+            gap = (seen.number - known.number) // step - 1  # if n or more: another count
         if gap == 0:
             return 0, Basis.NUMBERS
         if self._witness is not None and (second is None or second.number == seen.number + step):
@@ -466,9 +478,13 @@ class Sorter:
             lost = -1 if counted is None else counted // step - 1
             if 0 <= lost < n and lost <= gap:
                 words = count(lost, noun)
-                self._note = f"The camera had counted {words} before the first that came." if lost else self._note
+                self._note = (
+                    f"Before the first {noun} that arrived, the camera had counted {words}." if lost else self._note
+                )
                 return lost, Basis.COUNTER
-        is_said = seen.phase == BY_ORDER and bool(self._taken)  # of the file's first block, from which others follow
+        is_said = seen.phase == BY_ORDER and bool(
+            self._taken
+        )  # the message is given for the file's first block; the other blocks follow from it
         is_late = (self._began_within_scan and not is_said) or seen.reconnected
         is_late = is_late or gap < n or (is_anew and seen.number > 1)
         if not (is_late or is_anew or is_other) and known is not None and second is not None:
@@ -476,22 +492,23 @@ class Sorter:
         if is_late:
             off = "" if block.kind is VIEW else "the kinds of frames and "
             self._note = (
-                f"Nothing tells whether frame {seen.number} is the first {noun} of the scan, as frames came before it, "
-                f"or may have. It is taken for the first. If others were before it, {off}all angles are off by as many "
-                f"steps. {'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id tells it."
+                f"Frame {seen.number} is taken for the first {noun} of the scan, but others may have come before it. "
+                f"In that case {off}all angles are wrong by the number of lost steps. To avoid this, set "
+                f"{'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id."
             )
         return 0, Basis.UNKNOWN if is_late else Basis.WAITED
 
     def _go_on(self, seen: Seen, views: _Taken, other: Seen) -> None:
-        """The projections go on after frames of another kind, which are none of their triggers."""
+        """The projections continue after frames of another kind, which take no trigger of the projections."""
         lost, known = 0, self._known
         counts = {each.count_restarts for each in (seen, known, other, views) if each is not None}
         if known is not None and len(counts) == 1:
             lost = views.trigger(other.number) - views.trigger(views.last) - 1
             lost += (seen.number - known.number) // views.step - 1
         trigger = views.trigger(views.last) + 1 + lost
-        self._note = f"Other frames came within the projections, which go on with {trigger} at number {seen.number}" + (
-            f", as {lost} were lost before and after those." if lost else "."
+        self._note = (
+            f"Other frames came within the projections, which continue with projection {trigger} at number "
+            f"{seen.number}" + (f", because {lost} were lost before and after the other frames." if lost else ".")
         )
         views.first, views.count_restarts = seen.number - trigger * views.step, seen.count_restarts
         views.first_frame_of_other_kind = None
@@ -499,8 +516,8 @@ class Sorter:
         self._now = next(i for i, each in self._taken.items() if each is views)
 
     def _unwrapped(self, raw: int, time: float = math.nan, *, is_anew: bool = False) -> int:
-        """A number that goes on where a counter of 16 or 32 bits has begun again at its end. A longer time than before
-        says that 0 may be lost."""
+        """The number, continued beyond the end of a counter of 16 or 32 bits. If more time has passed than between the
+        frames before, number 0 may be lost."""
         last, self._raw = raw if self._raw is None else self._raw, raw
         for low, top in _RANGES:
             if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
@@ -509,17 +526,15 @@ class Sorter:
                 times = [each.time for each in (*self._recent, *self.held)]
                 is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
                 if last < top or raw > low + 1 or (raw != low and is_long):
-                    left_out = "" if self._last_wrap > top - low else f", and {low} is taken for left out"
-                    self._note = (
-                        f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}{left_out}."
-                    )
+                    left_out = "" if self._last_wrap > top - low else f", and {low} as if it had been skipped"
+                    self._note = f"Numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
             elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self._raw = last  # exchanged with its neighbour
                 return raw + self._wrapped - self._last_wrap
         return raw + self._wrapped
 
     def pass_over(self, raw: int) -> range:
-        """Frames up to this number of the present block will not come; the numbers of those that had not come yet."""
+        """No frame up to this number of the present block will come any more. Returns the numbers that are missing."""
         block, number = self._taken.get(self._now), self._unwrapped(raw)
         if block is None or block.closed or not block.last < number < block.end:
             return range(0)
@@ -528,7 +543,7 @@ class Sorter:
         return lost
 
     def lose(self, place: Place) -> None:
-        """The frame at this place cannot be used."""
+        """The frame that was assigned here cannot be used."""
         self._taken[place.block].triggers.discard(place.trigger)
 
     @property
@@ -537,13 +552,13 @@ class Sorter:
 
     @property
     def basis(self) -> Basis:
-        """What the number of the first projection rests on."""
+        """How the number of the first projection was found."""
         return Basis.WAITED if self._views is None else self._views.basis
 
     @property
     def complete(self) -> bool:
-        """Whether every planned block has begun, and the present one and the projections are over, so that no more
-        frames are expected."""
+        """Whether no more frames are expected: every planned block has begun, and the present block and the projections
+        are over."""
         begun = all(i in self._taken for i in range(len(self._planned)))
         return begun and self._taken[self._now].is_over and (self._views is None or self._views.is_over)
 
@@ -553,13 +568,13 @@ class Sorter:
         return self._serial == BY_ORDER.serial
 
     def _kinds(self, first: int) -> list[FrameKind]:
-        """Of the planned blocks from the first one on."""
+        """Kinds of the planned blocks, from this one on."""
         return [each.kind for each in self._planned[first:]]
 
     @property
     def n_left(self) -> int:
-        """Frames that may yet come at the end of what is counted from the first projection: of the projections or,
-        where kinds go by order, of the whole plan."""
+        """Number of frames that may still come at the end, counted from the first projection: of the projections or, if
+        kinds follow from the order, of the whole plan."""
         views, n = self._views, 0
         if views is None:
             return 0
@@ -576,8 +591,8 @@ class Sorter:
         return self._taken[block].is_over
 
     def missing(self, block: int) -> list[int]:
-        """Triggers of a planned block that gave no frame."""
+        """Triggers of a planned block without a frame."""
         planned, taken, now = self._planned[block], self._taken.get(block), self._taken.get(self._now)
         if taken is None and now is not None and now.kind is planned.kind and self._now >= len(self._planned):
-            taken = now  # extra ones at the end stand for those that are planned there
+            taken = now  # unplanned frames at the end take the place of the planned ones
         return [trigger for trigger in range(planned.n) if taken is None or trigger not in taken.triggers]

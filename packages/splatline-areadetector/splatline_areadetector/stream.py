@@ -1,9 +1,9 @@
-"""FrameStream: a subscription to an areaDetector's image over PVAccess, emptied at once into memory of ours.
+"""FrameStream: a subscription to an areaDetector's image over PVAccess. Frames go at once into our own memory.
 
-The server keeps a queue for each client and overwrites its newest entry when it is full, without a word. So it is asked
-for about a second, and a process of its own (`receiver`) takes at once whatever it delivers. `pipeline=true` would
-let the server wait for us, but today's servers of NDPluginPva then repeat frames. What is lost shows as a gap in the
-frames' numbers.
+The server keeps a queue for each client. If the queue is full, the server overwrites its newest entry without an error.
+So we ask for a queue of about a second, and a process of its own (`receiver`) takes at once what the server delivers.
+With `pipeline=true` the server would wait for us, but today's servers of NDPluginPva then repeat frames. Lost frames
+show as a gap in the frame numbers.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from splatline_areadetector.receiver import frame_of
 SCHEME = "pva://"
 _LEAST, _MOST = 4, 1000  # frames of the queue
 _USUAL = 100.0  # frames/s of a camera whose period is not known
-_STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one is
-_AT_HAND = 4  # items that this process holds; all others wait in the receiver
+_STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one is started
+_AT_HAND = 4  # items held in this process; all others wait in the receiver
 _PIPE = 2**20  # bytes
 ANSWERS_WITHIN = 3.0  # s
-UNREACHABLE = "Check the name, that its IOC runs, and which hosts are asked (EPICS_PVA_ADDR_LIST)"
+UNREACHABLE = "Check the name, whether its IOC runs, and which hosts are asked (EPICS_PVA_ADDR_LIST)"
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A frame that cannot be stored, and why, without a full stop; every such frame is the same."""
+    """A frame that cannot be stored. `why` is without a full stop, and the same for all such frames."""
 
     unique_id: int
     why: str
@@ -45,19 +45,19 @@ class Refused:
 
 @dataclass(frozen=True)
 class Overflow:
-    """A frame for which the ring had no room, as frames were not taken from it in time."""
+    """A frame for which the ring buffer had no room, because frames were not taken from it in time."""
 
     unique_id: int
 
 
 @dataclass(frozen=True)
 class Disconnected:
-    """The server has gone: it was stopped, or has not answered for EPICS_PVA_CONN_TMO (40 s)."""
+    """The server has gone: it was stopped, or did not answer for EPICS_PVA_CONN_TMO (40 s)."""
 
 
 @dataclass(frozen=True)
 class Died:
-    """The process that receives has died with this exit code; another one is being started."""
+    """The process that receives frames has died with this exit code; another one is being started."""
 
     code: int
 
@@ -67,12 +67,12 @@ Item = ArrayFrame | Refused | Overflow | Disconnected | Died
 
 @dataclass(frozen=True)
 class Queues:
-    """How many frames wait where.
+    """How many frames may wait, and where.
 
     Attributes:
-        seconds: of frames in the server's queue, which holds as many arrays of its IOC's memory.
-        megabytes: of these, at most.
-        ring_megabytes: of frames in ours, at most.
+        seconds: s of frames in the server's queue, in the memory of its IOC.
+        megabytes: size limit of this queue.
+        ring_megabytes: size limit of the frames in our memory.
     """
 
     seconds: float = 1.0
@@ -80,7 +80,7 @@ class Queues:
     ring_megabytes: float = 2048.0
 
     def frames(self, frame_bytes: int, period: float | None) -> int:
-        """Frames to ask the server for.
+        """Length of the queue to ask the server for, in frames.
 
         Args:
             period: s between frames; None: not known.
@@ -91,10 +91,10 @@ class Queues:
 
 
 def image_problem(url: str) -> str:
-    """What is wrong with the address of an image; "" if nothing is."""
+    """What is wrong with the address of an image; "" if it is right."""
     name = url.removeprefix(SCHEME)
     good = name and name != url and not any(letter.isspace() for letter in name)
-    return "" if good else f"{url!r} names no image; expected pva://PREFIX:Pva1:Image"
+    return "" if good else f"{url!r} is not the address of an image; expected pva://PREFIX:Pva1:Image"
 
 
 class FrameStream:
@@ -103,17 +103,17 @@ class FrameStream:
     Args:
         url: pva://NAME.
         queues: see `Queues`.
-        period: s between frames, about; None: not known.
+        period: approximate s between frames; None: not known.
         within: s to wait for the server's first answer.
 
     Attributes:
-        name: of the process variable.
-        first: the frame that the server had when it was asked, later the last one of a ride; None: it had none yet.
-        queue: frames that the server was asked to hold.
-        still: intervals of the Unix time during which no frame could be received.
+        name: name of the process variable.
+        first: the frame that the server had when we connected, later the last one of the scan; None: none yet.
+        queue: length of the server's queue that was asked for, in frames.
+        still: intervals of Unix time during which no frame could be received.
 
     Raises:
-        ConfigError: the address is no pva://NAME, p4p is not installed, or the variable is no NTNDArray.
+        ConfigError: the address is not pva://NAME, p4p is not installed, or the variable is not an NTNDArray.
         DeviceTimeout: no server answers.
         FrameRefusedError: its frames cannot be stored.
     """
@@ -141,7 +141,7 @@ class FrameStream:
             opened.callback(self._end)
             if not self._ready.wait(_STARTS) or not math.isnan(self._died_at):
                 raise ConfigError(
-                    f"The process that receives {self.name} did not start within {_STARTS:g} s, or ended. Nothing was "
+                    f"The process that receives {self.name} ended, or did not start within {_STARTS:g} s. Nothing was "
                     "recorded."
                 )
             self._close = opened.pop_all().close
@@ -155,7 +155,7 @@ class FrameStream:
             return self._items.popleft()
 
     def ahead(self, n: int, timeout: float) -> list[Item]:
-        """The next items, at most n of them, which `next` still returns. Waits for each."""
+        """The next items, at most n, without taking them from the stream. Waits for each."""
         items = list[Item]()
         while len(items) < n and (item := self.next(timeout)) is not None:
             items.append(item)
@@ -177,11 +177,11 @@ class FrameStream:
         return True
 
     def stood_still(self, begin: float, end: float) -> float:
-        """s of this interval of the Unix time in which no frame could be received, or of a second after it."""
+        """s during this interval of Unix time, and the second after it, in which no frame could be received."""
         return sum(max(0.0, min(end + 1.0, b) - max(begin, a)) for a, b in [*self.still])
 
     def close(self) -> None:
-        """End the subscription; frames that were taken stay. A second time does nothing."""
+        """End the subscription; received frames stay. A second call does nothing."""
         self._close()
 
     def __enter__(self) -> Self:
@@ -200,13 +200,15 @@ class FrameStream:
                 self.name,
                 f"no answer within {within:g} s",
                 advice=UNREACHABLE,
-                state="It was only asked, and nothing was changed",
+                state="It was only read, and nothing was changed",
             ) from None
         except RemoteError as error:
-            raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None
+            raise ConfigError(
+                f"The server of {self.name} does not let us read it: {error}. Nothing was started."
+            ) from None
 
     def _start(self) -> None:
-        """Start a receiver. Ctrl-C does not reach it, and it imports what this process does."""
+        """Start a receiver. Ctrl-C does not reach it, and it imports from the same places as this process."""
         self._process = subprocess.Popen(
             [
                 sys.executable,
@@ -224,7 +226,7 @@ class FrameStream:
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
             | getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
-        with suppress(ImportError, AttributeError, OSError):  # a user may own so many pages of pipes, and no more
+        with suppress(ImportError, AttributeError, OSError):  # the system limits the pages of pipes of a user
             import fcntl
 
             assert self._process.stdout is not None
@@ -238,7 +240,7 @@ class FrameStream:
         self._reader.join()
 
     def _read(self) -> None:
-        """Take what the receiver passes on, in a thread. Where it dies, another one is started."""
+        """Take what the receiver passes on, in a thread. If the receiver dies, start another one."""
         while not self._over:
             process = self._process
             assert process.stdin is not None and process.stdout is not None
@@ -246,7 +248,7 @@ class FrameStream:
                 while line := stream.readline():
                     self._take(stream, *json.loads(line))
             code, self._died_at = process.wait(), time.time()
-            if self._over or not self._ready.is_set():  # the constructor waits for the first, and raises
+            if self._over or not self._ready.is_set():  # the constructor waits for this, and raises
                 self._ready.set()
                 return
             self._put(Died(code))
@@ -282,7 +284,7 @@ class FrameStream:
 def _refuse_other(name: str, value: Any) -> None:
     if not value.getID().startswith("epics:nt/NTNDArray"):
         raise ConfigError(
-            f"{name} is a {value.getID() or 'structure'}, not an image (NTNDArray); expected the PvName of the plugin "
+            f"{name} is a {value.getID() or 'structure'}, not an image (NTNDArray). Expected the PvName of the plugin "
             "NDPluginPva or NDPluginPvxs, such as PREFIX:Pva1:Image. Nothing was started."
         )
 
@@ -295,4 +297,4 @@ def _context() -> Any:
             f'PVAccess needs p4p, which cannot be loaded ({error}): pip install "splatline[areadetector]". Nothing was '
             "started."
         ) from error
-    return Context("pva", nt=False)  # p4p's own unwrapping ends the subscription at a compressed frame
+    return Context("pva", nt=False)  # p4p's own unwrapping would end the subscription at a compressed frame

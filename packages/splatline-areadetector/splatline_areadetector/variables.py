@@ -1,7 +1,7 @@
 """Variables: process variables of an IOC, subscribed to over PVAccess or Channel Access, each with its history.
 
-Nothing is written. Values and frames come by different ways, and a computer that stood still takes all of them at once:
-so a value counts from the time that its IOC gave it.
+Nothing is written. Values and frames arrive on different ways, and a computer that stalled gets all of them at once. So
+a value counts from the time that its IOC gave it.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from drivers.base.errors import DeviceTimeout
 from splatline_areadetector.receiver import Subscribed
 
 Value = float | str
-_ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others
-_LONGEST_DELAY = 60.0  # s: an IOC whose clock is off by more has none that is set
+_ANSWER, _OTHERS = 3.0, 1.5  # s to wait for an answer: of variables that are needed, of others
+_LONGEST_DELAY = 60.0  # s: if the clock of an IOC is off by more, it was never set
 
 
 def url_problem(url: str) -> str:
-    """What is wrong with the address of process variables; "" if nothing is."""
+    """What is wrong with the address of process variables; "" if it is right."""
     scheme, _, name = url.partition("://")
     good = scheme in ("pva", "ca") and name and not any(letter.isspace() for letter in name)
-    return "" if good else f"{url!r} names no process variables; expected pva://PREFIX or ca://PREFIX"
+    return "" if good else f"{url!r} is not a prefix of process variables; expected pva://PREFIX or ca://PREFIX"
 
 
 class History:
     """The values of a variable by the time at which its IOC set them, s since the Unix epoch.
 
     Args:
-        now: of this computer.
+        now: clock of this computer.
 
     Attributes:
-        delay: the least time from a change to its arrival, with the difference of the clocks; None: none was seen.
+        delay: the shortest time from a change to its arrival, including the difference of the clocks; None: no change
+            yet.
     """
 
     def __init__(self, now: Callable[[], float] = time.time) -> None:
@@ -46,7 +47,7 @@ class History:
         self.delay: float | None = None
 
     def add(self, stamp: float, value: Value) -> None:
-        """The next value, with the IOC's time. The first is that of the subscription, which may be old."""
+        """Add the next value, with the IOC's time. The first value comes with the subscription and may be old."""
         received = self._now()
         if self._values:
             if not abs(received - stamp) < _LONGEST_DELAY:  # its clock was never set
@@ -68,7 +69,7 @@ class History:
         return self._stamps[-1] if self._stamps else 0.0
 
     def rise(self, begin: float, end: float) -> float | None:
-        """By how much a counter rose between two times of its IOC; None: it is not known."""
+        """By how much a counter rose between two times of its IOC; None: not known."""
         try:
             before, after = (float(self.until(seconds)[-1]) for seconds in (begin, end))
         except (IndexError, ValueError):
@@ -76,8 +77,8 @@ class History:
         return max(0.0, after - before)
 
     def risen(self, end: float, rest: float) -> float | None:
-        """By how much a counter had risen at a time of its IOC since it last fell (to 0), or stood still for `rest` s;
-        None: it has risen ever since it is known."""
+        """By how much a counter had risen at a time of its IOC, since it last fell (to 0) or paused for `rest` s; None:
+        it never fell or paused since we know it."""
         n = bisect_right(self._stamps, end)
         values = [float(value) for value in self._values[:n]]
         for i in range(n - 1, 0, -1):
@@ -88,7 +89,8 @@ class History:
         return None
 
     def until(self, seconds: float) -> Sequence[Value]:
-        """The values that the IOC had set by then, oldest first; always the first one, which was there before us."""
+        """The values that the IOC had set by then, oldest first. Always includes the first, which was there before
+        us."""
         return self._values[: max(1, bisect_right(self._stamps, seconds))]
 
 
@@ -98,10 +100,10 @@ class Variables:
     Args:
         url: pva://PREFIX or ca://PREFIX.
         names: what follows the prefix.
-        needed: those that must answer within 3 s.
+        needed: names that must answer within 3 s.
 
     Raises:
-        DeviceTimeout: one that is needed does not answer.
+        DeviceTimeout: a needed variable does not answer.
         ConfigError: the library is not installed.
     """
 
@@ -127,7 +129,7 @@ class Variables:
                 url,
                 f"no answer within {_ANSWER:g} s",
                 request=", ".join(self.prefix + name for name in silent),
-                advice="Check the prefix, that its IOC runs, and which hosts are asked (EPICS_CA_ADDR_LIST, "
+                advice="Check the prefix, whether its IOC runs, and which hosts are asked (EPICS_CA_ADDR_LIST, "
                 "EPICS_PVA_ADDR_LIST)",
                 state="Nothing was started",
             )
@@ -162,7 +164,7 @@ Add = Callable[[float, Value], None]
 
 
 def _plain(value: Any) -> Value:
-    """A number, or text: of a label, a string, or an array of characters."""
+    """A number, or text from a label, a string or an array of characters."""
     if hasattr(value, "dtype") and value.ndim:
         return bytes(value.astype("u1")).split(b"\0")[0].decode(errors="replace")
     return str(value) if isinstance(value, str) else float(value)
@@ -195,7 +197,7 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
         if not update.ok:
             return
         is_choice = update.datatype == aioca.DBR_ENUM
-        if is_choice and not labels:  # which updates with a time leave out
+        if is_choice and not labels:  # because updates with a time leave out the labels
             labels.extend((await aioca.caget(update.name, format=aioca.FORMAT_CTRL)).enums)
         add(float(update.timestamp), labels[int(update)] if is_choice and int(update) < len(labels) else _plain(update))
 
@@ -205,10 +207,10 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
             for name, add in adders.items()
         ]
 
-    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
-
-    def close() -> None:
+    async def end() -> None:
         for each in subscriptions:
-            _loop().call_soon_threadsafe(each.close)
+            each.close()
 
-    return close
+    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
+    # It waits: aioca closes what is left when the program ends, in another thread, which crashes in the midst of ours.
+    return lambda: asyncio.run_coroutine_threadsafe(end(), _loop()).result()

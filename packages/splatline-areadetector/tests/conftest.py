@@ -1,4 +1,4 @@
-"""EPICS on loopback, with ports of its own, so that tests can run side by side."""
+"""EPICS on loopback with its own ports, so that tests can run in parallel."""
 
 from __future__ import annotations
 

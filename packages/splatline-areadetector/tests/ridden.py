@@ -1,4 +1,4 @@
-"""Rides of tests: the configuration, the ride in this process without a live volume, and what its file holds."""
+"""Helpers for tests of `beamline ride`: its configuration, a run in this process without a live volume, its file."""
 
 from __future__ import annotations
 
@@ -146,7 +146,11 @@ class RideProgram:
             self.process = subprocess.Popen([sys.executable, *begin, *words], stdout=stream, stderr=subprocess.STDOUT)
 
     def __enter__(self) -> Self:
-        return self.wait_for(lambda: "Waiting for the first frame" in self.output)
+        try:
+            return self.wait_for(lambda: "Waiting for the first frame" in self.output)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __exit__(self, *error: object) -> None:
         self.process.kill()
@@ -156,7 +160,7 @@ class RideProgram:
     def output(self) -> str:
         return self._output.read_text(encoding="utf-8")
 
-    def wait_for(self, reached: Callable[[], bool], seconds: float = 120.0) -> Self:
+    def wait_for(self, reached: Callable[[], bool], seconds: float = 400.0) -> Self:
         deadline = time.monotonic() + seconds
         while not reached():
             assert time.monotonic() < deadline and self.process.poll() is None, self.output

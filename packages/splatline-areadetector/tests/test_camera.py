@@ -1,4 +1,4 @@
-"""The camera driver for areaDetector keeps the laws of every camera, against a fake IOC, and says what is wrong."""
+"""The camera driver for areaDetector passes the suite of all cameras against a fake IOC, and reports what is wrong."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ SETTINGS = AreaDetectorSettings(
 EXTERNAL = CameraSettings(0.01, TriggerSource.EXTERNAL, (32, 64, 64, 96))
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"exposure": 0.0}, "exposure of 0 s"),
-    ({"roi": (224, 0, 64, 96)}, "beyond the sensor of 256 x 320"),
-    ({"binning": 5}, "not divided by binning 5"),
+    ({"roi": (224, 0, 64, 96)}, "larger than the sensor of 256 x 320"),
+    ({"binning": 5}, "cannot be divided by binning 5"),
     ({"readout": "fast"}, "readout 'fast' is unknown; legal: standard"),
 ]
 
@@ -125,7 +125,7 @@ def test_another_size_than_configured_says_where_to_look(spinnaker: FakeIoc) -> 
     with closing(spinnaker.camera()) as camera:
         spinnaker.tell("size 16 24")
         try:
-            with pytest.raises(DeviceError, match=r"frames are 16 x 24 pixels, and 64 x 96 were set\. .*NDArrayPort"):
+            with pytest.raises(DeviceError, match=r"frames have 16 x 24 pixels, but 64 x 96 were set\. .*NDArrayPort"):
                 _first_frame(camera, spinnaker)
         finally:
             spinnaker.tell("size")
@@ -150,7 +150,7 @@ def test_a_lost_frame_leaves_a_gap(spinnaker: FakeIoc) -> None:
 
 
 def test_another_sensor_than_configured_is_refused(spinnaker: FakeIoc) -> None:
-    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, and .*sensor is \[512, 320\]"):
+    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, but .*sensor is \[512, 320\]"):
         spinnaker.camera(sensor=(512, 320))
 
 

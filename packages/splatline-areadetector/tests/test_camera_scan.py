@@ -1,4 +1,4 @@
-"""A whole scan of ours, by `beamline scan`, with a camera behind areaDetector: a fly scan whose stage triggers it."""
+"""`beamline scan` with a camera behind areaDetector: a complete fly scan in which the stage triggers the camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NTNDArrays as frames: pixels by codec, window, attributes; the stream that holds them."""
+"""NTNDArrays become frames: decoded pixels, window, attributes; and the stream of frames."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
         value.codec = {"name": codec, "parameters": 6}
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in sides]
     began = time.monotonic()
-    with pytest.raises(FrameRefusedError, match=f"its dimensions say {sides[1]} x {sides[0]} uint16; expected as many"):
+    with pytest.raises(FrameRefusedError, match=f"not fit its dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
         array_frame(value, 0.0)
     assert time.monotonic() - began < 1
 
@@ -81,7 +81,7 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
 @pytest.mark.parametrize("codec", CODECS)
 def test_pixels_that_a_message_cannot_hold_are_not_looked_for(codec: str) -> None:
     tracemalloc.start()
-    with pytest.raises(ValueError, match=r"pixels cannot be decoded \(they are fewer than 16384 x 16384\)"):
+    with pytest.raises(ValueError, match=r"pixels cannot be decoded \(there are fewer than 16384 x 16384\)"):
         decoded(codec, np.ones(4096, np.uint8), (16384, 16384), np.dtype("u2"))
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()
@@ -101,7 +101,7 @@ def test_window_and_attributes() -> None:
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"codec": {"name": "zfp", "parameters": 6}}, "by zfp, which this program does not know; set Codec1:Comp"),
+        ({"codec": {"name": "zfp", "parameters": 6}}, "with zfp, which this program cannot decode; set Codec1:Comp"),
         ({"codec": {"name": "blosc", "parameters": 0}}, "its codec blosc does not say the type of its pixels"),
         ({"attributes": {"ColorMode": 1}}, "its pixels are Bayer, not mono"),
     ],
@@ -125,7 +125,7 @@ def test_the_queue_is_about_a_second_and_at_most_512_mb() -> None:
 
 def test_addresses() -> None:
     assert image_problem("ca://P:Pva1:Image") and image_problem("pva://") and not image_problem("pva://P:Pva1:Image")
-    with pytest.raises(ConfigError, match="names no image; expected pva://PREFIX:Pva1:Image"):
+    with pytest.raises(ConfigError, match="is not the address of an image; expected pva://PREFIX:Pva1:Image"):
         FrameStream("P:Pva1:Image")
 
 

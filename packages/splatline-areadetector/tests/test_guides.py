@@ -1,4 +1,4 @@
-"""What tells kinds and angles: histories of variables, tomoscan's status, attributes, a PandABox's file."""
+"""Where kinds and angles come from: histories of variables, tomoscan's status, attributes, a PandABox's file."""
 
 from __future__ import annotations
 
@@ -94,6 +94,26 @@ def test_tomoscans_kinds_although_its_clock_is_half_an_hour_off(tmp_path: Path) 
     assert (plan.exposure(FrameKind.FLAT), plan.exposure(FrameKind.DARK)) == (0.01, 0.03)
 
 
+@pytest.mark.usefixtures("loopback")
+def test_frames_that_a_busy_computer_takes_late_have_the_kinds_of_their_times(tmp_path: Path) -> None:
+    """All came late, by times that differ: no other clock, by which a kind would change before its time."""
+    with FakeIoc() as ioc:
+        ioc.tomoscan(**TOMOSCAN)
+        config = config_of(tmp_path, ioc.url, {"from": "tomoscan", "prefix": "pva://T:TomoScan:"}, exposure_s=None)
+        guide: Any = guide_of(config.ride)
+        for delay in (0.9, 2.5):
+            guide.phase(_frame(1, 100.0, 100.0 + delay))
+        begin = time.time()
+        for n, (status, frame_type) in enumerate((("dark", "DarkField"), ("flat", "FlatField"))):
+            ioc.put({"TomoScan:ScanStatus": f"Collecting {status} fields", "TomoScan:FrameType": frame_type}, begin + n)
+        deadline, newest = begin + 60, ("Collecting flat fields", "FlatField")
+        while (guide.status, guide._variables.text("FrameType")) != newest and time.time() < deadline:
+            time.sleep(0.05)
+        assert guide.phase(_frame(2, begin + 0.9, begin + 1.9)).kind is FrameKind.DARK
+        assert guide.phase(_frame(3, begin + 1.1, begin + 2.1)).kind is FrameKind.FLAT
+        guide.close()
+
+
 def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
     angles = {"from": "attribute", "views": 3}
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, darks={"count": 2, "at": "both"}).ride)
@@ -106,7 +126,9 @@ def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
     ]
     assert np.isnan(angles_told).all()
     lacking = guide_of(config_of(tmp_path, "pva://P:I", angles).ride)
-    with pytest.raises(ConfigError, match="SampleRotary, an attribute that the frames do not have; they have ColorM"):
+    with pytest.raises(
+        ConfigError, match=r"The frames have no attribute SampleRotary \(ride.angles.name\); they have ColorM"
+    ):
         lacking.phase(_frame(9)), lacking.angle(_frame(9), 0)
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
     told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "x", ""))]
@@ -145,21 +167,22 @@ DEGREES = np.linspace(0.0, 171.0, 20)
 @pytest.mark.parametrize(
     ("data", "sentence"),
     [
-        (None, "INENC1.VAL.Value is not there; set ride.angles.dataset to the positions, such as /INENC1.VAL.Value"),
+        (None, "INENC1.VAL.Value does not exist; set ride.angles.dataset to the positions, such as /INENC1.VAL.Value"),
         ({}, "is a group; set ride.angles.dataset"),
         (np.array([b"9"] * 20), "holds text, not numbers"),
         (np.ones(20, bool), "holds bool, not numbers"),
-        (np.zeros((20, 2)), r"has the shape \(20, 2\), not a number a trigger"),
-        (5.0, r"has the shape \(\), not a number a trigger"),
-        (np.arange(21.0), "has 21 rows, and ride.angles.views is 20: move the file of another scan away, or set views"),
-        (np.radians(DEGREES), "has steps of 0.1571, as of radians; set ride.angles.deg_per_unit to 57.29578"),
-        (np.linspace(0, 2 * np.pi, 20), "as of radians"),
-        (np.radians(DEGREES[::-1]) + 100, "as of radians"),
-        (np.arange(20) * 5000, "has steps of 5000, as of encoder counts; set ride.angles.deg_per_unit to 360 / counts"),
-        (np.arange(20) * -50.0, "as of encoder counts"),
-        (np.arange(20) * 1234.5, "as of encoder counts"),
-        (np.full(20, np.nan), "has 0 positions in 20 rows, and they do not change"),
-        (np.full(20, 7.0), "has 20 positions in 20 rows, and they do not change"),
+        (np.zeros((20, 2)), r"has the shape \(20, 2\), not one number for each trigger"),
+        (5.0, r"has the shape \(\), not one number for each trigger"),
+        (np.arange(21.0), "has 21 rows, but ride.angles.views is 20: if the file belongs to another"),
+        (np.radians(DEGREES), "has steps of 0.1571, which look like radians; set ride.angles.deg_per_unit to 57.29578"),
+        (np.linspace(0, 2 * np.pi, 20), "which look like radians"),
+        (np.radians(DEGREES[::-1]) + 100, "which look like radians"),
+        (np.arange(20) * 5000, "steps of 5000, which look like encoder counts; set ride.angles.deg_per_unit to 360"),
+        (np.arange(20) * -50.0, "which look like encoder counts"),
+        (np.arange(20) * 1234.5, "which look like encoder counts"),
+        (DEGREES + 3.6e6, r"3600171, which is more than 1e\+06 degrees from zero; set ride.angles.deg_per_u"),
+        (np.full(20, np.nan), "has 0 positions in 20 rows, but they do not change"),
+        (np.full(20, 7.0), "has 20 positions in 20 rows, but they do not change"),
     ],
 )  # fmt: skip
 def test_a_pandaboxs_file_that_tells_no_angles_is_refused_before_the_scan(
@@ -189,6 +212,7 @@ def test_a_file_that_is_no_hdf5_is_refused_before_the_scan(tmp_path: Path) -> No
         (9 * np.arange(20), {}, "0° to 171°"),
         (np.radians(DEGREES), {"deg_per_unit": 57.29577951308232}, "0° to 171°"),
         (np.arange(20) * 5000, {"deg_per_unit": 0.0018, "offset_deg": -5}, "-5° to 166°"),
+        (DEGREES + 3.6e6, {"offset_deg": -3.6e6}, "0° to 171°"),
         (np.arange(20) * 137.5077, {}, "0° to 2612.65°"),  # golden angles
         (np.radians(DEGREES), {"deg_per_unit": 1}, "0° to 2.98451°"),  # a degree it is, says the configuration
     ],
@@ -197,7 +221,7 @@ def test_a_pandaboxs_file_that_is_there_says_what_it_has(tmp_path: Path, data: A
     with h5py.File(tmp_path / "panda.h5", "w") as file:
         file["INENC1.VAL.Value"] = data
     guide = _panda(tmp_path, **angles)
-    assert f"panda.h5 has 20 rows, {ends}, which are this scan's unless it is written anew" in guide.status
+    assert f"panda.h5 has 20 rows, {ends}: those of this scan, unless it is rewritten" in guide.status
     told = [math.degrees(guide.angle(_frame(1), i)) for i in range(20)]
     factor, offset = angles.get("deg_per_unit", 1), angles.get("offset_deg", 0)
     assert np.allclose(told, factor * np.asarray(data, float) + offset, atol=1e-4)
@@ -216,7 +240,7 @@ def test_rows_that_are_no_position_and_rows_that_do_not_come_are_no_angle(tmp_pa
 
 def test_a_file_is_read_anew_for_each_scan_and_rows_beyond_its_views_are_left(tmp_path: Path) -> None:
     path, guides = tmp_path / "panda.h5", list[Any]()
-    assert _panda(tmp_path).status.endswith("panda.h5 is not there yet")
+    assert _panda(tmp_path).status.endswith("panda.h5 does not exist yet")
     for start in (0.0, 5.0):
         with h5py.File(path, "w") as file:
             file["INENC1.VAL.Value"] = start + DEGREES
@@ -229,19 +253,21 @@ def test_a_file_is_read_anew_for_each_scan_and_rows_beyond_its_views_are_left(tm
     with h5py.File(path, "w") as file:  # while frames come, triggers that are nobody's
         file["INENC1.VAL.Value"] = np.arange(30.0) * 9
     assert math.degrees(guides[0].angle(_frame(1), 19)) == pytest.approx(171)
-    with pytest.raises(ConfigError, match=r"has 30 rows, and ride\.angles\.views is 20"):
+    with pytest.raises(ConfigError, match=r"has 30 rows, but ride\.angles\.views is 20"):
         guides[0].plan()
 
 
 def test_a_missing_file_is_refused_with_the_first_projection(tmp_path: Path) -> None:
     """It may come after the darks."""
-    with pytest.raises(ConfigError, match=r"panda.h5 \(ride.angles.file\) is not there. Nothing was recorded"):
+    with pytest.raises(ConfigError, match=r"panda.h5 \(ride.angles.file\) does not exist. Nothing was recorded"):
         _panda(tmp_path).plan()
     given = {"from": "panda", "views": 20, "file": str(tmp_path / "panda.h5")}
     guide: Any = guide_of(config_of(tmp_path, "pva://P:I", given, darks={"count": 2}).ride)
     guide._wait = 0.2
     assert len(guide.plan().blocks) == 2
-    with pytest.raises(DataError, match=r"is not there: no projection has an angle\. What came before is in the file"):
+    with pytest.raises(
+        DataError, match=r"No projection has an angle: .* does not exist\. Frames that came before are in"
+    ):
         guide.angle(_frame(1), 0)
 
 
@@ -281,6 +307,23 @@ def test_variables_that_do_not_answer() -> None:
             assert (there.number("a"), there.text("b"), there.number("c"), there.text("c")) == (2.5, "text", None, "")
         with pytest.raises(DeviceTimeout, match="T:c"):
             Variables("pva://T:", ("a", "c"), ("c",))
+
+
+@pytest.mark.usefixtures("loopback")
+def test_variables_by_channel_access_are_closed_when_close_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that ends meanwhile crashes in the library."""
+    aioca, closed = pytest.importorskip("aioca"), list[str]()
+    close = aioca.Subscription.close
+
+    def slowly(subscription: Any) -> None:
+        time.sleep(0.1)
+        close(subscription)
+        closed.append(subscription.name)
+
+    monkeypatch.setattr(aioca.Subscription, "close", slowly)
+    with Variables("ca://NOBODY:", ("a", "b")) as there:
+        assert there.number("a") is None
+    assert closed == ["NOBODY:a", "NOBODY:b"]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Frames of a run, each once and in order, as clients of areaDetector see them; what they ask, and what is refused."""
+"""`beamline publish`: clients see each frame of a run once and in order; their requests, and errors."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_damaged_file_is_told_and_the_next_run_is_published(tmp_path: Path) ->
         del file["entry/frame_log/kind"]
         file["entry/frame_log/kind"] = np.zeros(2, np.int32)
     with closing(RunFrames(tmp_path, told.append, clock)) as frames:
-        assert _come(frames, clock) == [] and "No more frames of this run are published" in told[0]
+        assert _come(frames, clock) == [] and "Publishing of this run has ended" in told[0]
         with _written(tmp_path / "2026-01-01T000001_b") as writer:
             _append(writer, *SCAN[:2])
         assert len(_come(frames, clock)) == 2
@@ -161,19 +161,21 @@ def test_a_client_sees_pixels_number_and_attributes(image: ImageServer) -> None:
 
 
 def test_a_port_that_is_taken_is_one_sentence(image: ImageServer, capfd: Any) -> None:
-    with pytest.raises(DataError, match=rf"Port {image.port} of 127\.0\.0\.1 is taken .* another --port, or none"):
+    with pytest.raises(
+        DataError, match=rf"uses port {image.port} of 127\.0\.0\.1\. .* another --port, or leave it out"
+    ):
         ImageServer("T:Pva1:Image", "127.0.0.1", image.port)
 
 
 def test_an_address_of_another_host_is_one_sentence(loopback: dict[str, str], capfd: Any) -> None:
-    with pytest.raises(DataError, match=r"192\.0\.2\.1 cannot be listened at"):
+    with pytest.raises(DataError, match=r"Clients cannot connect to the address 192\.0\.2\.1"):
         ImageServer("T:Pva1:Image", "192.0.2.1", 0)
 
 
 @pytest.mark.parametrize("prefix", ["", "2bma", "2bm a:", "x" * 41 + ":", "pva://a:"])
 def test_a_prefix_that_is_none_is_refused(prefix: str) -> None:
     result = beamline("publish", "--prefix", prefix)
-    assert result.exit_code == 2 and "a colon at the end, as in 2bma:SPL:." in result.stderr
+    assert result.exit_code == 2 and "a colon at the end, such as 2bma:SPL:." in result.stderr
 
 
 def test_libraries_that_are_missing_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,16 +249,19 @@ def test_a_scan_keeps_its_own_exposure_and_says_so_once() -> None:
     shown.ask(cam1_AcquireTime=0.01)
     shown.ask(cam1_AcquireTime=0.01)
     assert shown.values["cam1:AcquireTime_RBV"] == 0.05
-    assert shown.said == ["A client asked for an exposure of 0.01 s; the scan has its own, 0.05 s."]
+    assert shown.said == ["A client asked for an exposure of 0.01 s. The scan keeps its own, 0.05 s."]
 
 
 @pytest.mark.parametrize(
     ("asked", "why"),
     [
-        ({"HDF1_FilePath": "/"}, "/ is not below .*, the folder of --files"),
-        ({"HDF1_FileName": "../b"}, r"'\.\./b' with the template '%s%s\.h5' is no name of a file"),
-        ({"HDF1_FileTemplate": "%s%999999d"}, "is no name of a file; expected %s%s.h5"),
-        ({"HDF1_FileName": "taken"}, r"taken\.h5 cannot be made: it exists, and nothing is overwritten"),
+        ({"HDF1_FilePath": "/"}, "/ is not below the folder of --files, .*"),
+        ({"HDF1_FileName": "../b"}, r"'\.\./b' with the template '%s%s\.h5' does not give a file name"),
+        ({"HDF1_FileTemplate": "%s%999999d"}, "does not give a file name; expected %s%s.h5"),
+        (
+            {"HDF1_FileName": "taken"},
+            r"taken\.h5 cannot be made: it exists already, and this program overwrites nothing",
+        ),
     ],
 )
 def test_a_file_that_cannot_be_written_is_told_to_client_and_operator(
@@ -279,7 +284,7 @@ def test_without_a_folder_no_client_has_files_written(tmp_path: Path) -> None:
     shown = Shown(None)
     shown.ask(HDF1_FilePath=str(tmp_path), HDF1_FileName="a", HDF1_Capture=1)
     assert shown.values["HDF1:FilePathExists_RBV"] == 0
-    assert "start it with --files FOLDER" in shown.said[0]
+    assert "Start `beamline publish` with --files FOLDER" in shown.said[0]
 
 
 def test_folders_are_made_only_below_that_of_files(tmp_path: Path) -> None:
@@ -295,7 +300,7 @@ def test_frames_of_another_size_end_the_file_and_say_so(tmp_path: Path) -> None:
     shown.ask(cam1_Acquire=1)
     shown.take(1)
     shown.detector.take(replace(FRAME, counts=FRAME.counts[:2]))
-    assert r"frames are uint16 (2, 4) now" in shown.said[0] and shown.values["HDF1:Capture_RBV"] == 0
+    assert r"they are uint16 (2, 4), and" in shown.said[0] and shown.values["HDF1:Capture_RBV"] == 0
     with h5py.File(tmp_path / "a.h5") as file:
         assert len(file["/entry/data/data"]) == 1
 

@@ -1,4 +1,4 @@
-"""A scan of ours, published, and ridden by ours: both files hold the same frames, to the bit."""
+"""`beamline ride` records a scan that `beamline publish` serves: both files hold the same frames, to the bit."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_our_scan_ridden_by_ours_is_equal_to_the_bit(loopback: dict[str, str], t
     )  # fmt: skip
     with ExitStack() as stack:
         server = stack.enter_context(_beamline("publish", tmp_path / "runs", "--prefix", "T:SPL:"))
-        _until_line(server, "Ctrl-C ends this")
+        _until_line(server, "Ctrl-C ends the publishing")
         rider = stack.enter_context(_beamline("ride", tmp_path / "my.yaml", "--no-live", "-o", tmp_path / "rides"))
         said = _until_line(rider, "Waiting for the first frame")
         own = stack.enter_context(_beamline(*scan))

@@ -1,4 +1,4 @@
-"""A ride on a fake IOC: kinds, angles, what is missing and why, where files end, and what is refused."""
+"""`beamline ride` with a fake IOC: kinds, angles, missing frames and their cause, ends of files, errors."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_tomoscan_tells_kinds_and_angles(tmp_path: Path, restarted: bool) -> Non
         file.ids, [*range(1, 4), *range(1, 5), *range(1, 9), *range(1, 5)] if restarted else range(101, 120)
     )
     assert np.allclose(file.seconds, np.where(file.kinds == 0, 0.03, 0.01))
-    assert any("of no scan" in text for text in told.before)
+    assert any("outside of a scan" in text for text in told.before)
 
 
 @pytest.mark.parametrize("first_id", [None, 100])
@@ -112,7 +112,9 @@ def test_a_first_projection_that_is_lost_shows_at_the_end_and_it_is_said_that_it
         told = ride_along(config_of(tmp_path, ioc.url, angles, first_id=first_id), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert isinstance(told.error, LedgerError) and file.missing == ([7] if first_id is None else [0])
-    undecided = "it may be the first that is missing: then all angles are 0.5° more, by which the volume is turned"
+    undecided = (
+        "the missing frame may be the first: then all angles are 0.5° larger than stated, which rotates the volume"
+    )
     assert (undecided in str(told.error)) is (first_id is None)
 
 
@@ -196,8 +198,8 @@ def test_lost_frames_are_named_with_whose_loss_it_was(tmp_path: Path) -> None:
     text = str(told.error)
     assert "4 of 20 projections are missing: 4-5, 10, 14 (from 36° to 126°)." in text
     assert "Frames 5-6 were lost by the plugin T:Pva1:, whose queue was full (DroppedArrays rose by 2)." in text
-    assert "Frame 11 was lost between the plugin, which sent them, and here" in text
-    assert "Frame 15 was lost before the plugin T:Pva1:: by the camera or its driver." in text
+    assert "Frame 11 was lost after the plugin had sent them: in the network" in text
+    assert "Frame 15 was lost by the camera or its driver, before the plugin T:Pva1:." in text
     (file,) = stored(tmp_path)
     assert file.missing == [4, 5, 10, 14] and np.allclose(file.degrees, 9.0 * (file.ids - 1))
 
@@ -227,8 +229,8 @@ def test_a_lower_number_or_another_size_begins_another_file(tmp_path: Path) -> N
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url), tmp_path, scan)
     assert isinstance(told.error, LedgerError)
-    assert "frame numbers began anew at 1, after 59: the server restarted, or its counter was reset" in told.warnings
-    assert "frames are 8 x 24 uint16 from number 6 on, after 16 x 24 uint16" in told.warnings
+    assert "frame numbers restarted at 1, after 59 (the server restarted, or its counter was reset)" in told.warnings
+    assert "frames from number 6 on are 8 x 24 uint16, before 16 x 24 uint16" in told.warnings
     files = stored(tmp_path)
     assert [file.ids.tolist() for file in files] == [[*range(50, 60)], [*range(1, 6)], [*range(6, 26)]]
     assert [file.status for file in files] == ["failed", "failed", "complete"]
@@ -251,7 +253,7 @@ def test_the_cameras_count_shows_that_the_first_projections_were_lost(tmp_path: 
         told = ride_along(config_of(tmp_path, ioc.url, camera="pva://T:cam1:"), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert np.allclose(file.degrees, 9.0 * (file.ids - 100)) and file.missing == list(range(lost))
-    assert ("The camera had counted 2 projections before the first that came" in told.warnings) is bool(lost)
+    assert ("the camera had counted 2 projections" in told.warnings) is bool(lost)
 
 
 def test_a_stop_and_a_stop_before_the_first_frame(tmp_path: Path) -> None:
@@ -275,9 +277,13 @@ def _nothing(stop: StopRequest) -> None:
 @pytest.mark.parametrize(
     ("records", "ride", "sentence"),
     [
-        ({"Pva1:MinCallbackTime_RBV": 0.5}, {}, "MinCallbackTime is 0.5 s: frames that come sooner are skipped"),
-        ({"Pva1:NDArrayPort_RBV": "OVER1"}, {}, "shows OVER1, not the camera: overlays may be in the pixels. Set"),
-        ({"Pva1:NDArrayPort_RBV": "ROI1"}, {"source": "ROI2"}, "NDArrayPort is ROI1, and ride.source ROI2"),
+        ({"Pva1:MinCallbackTime_RBV": 0.5}, {}, "MinCallbackTime to 0: it is 0.5 s, and the plugin skips frames"),
+        (
+            {"Pva1:NDArrayPort_RBV": "OVER1"},
+            {},
+            "sends the frames of OVER1, not those of the camera: overlays may be in the pixels. Set",
+        ),
+        ({"Pva1:NDArrayPort_RBV": "ROI1"}, {"source": "ROI2"}, "NDArrayPort is ROI1, but ride.source is ROI2"),
     ],
 )
 def test_settings_that_are_refused(
@@ -293,11 +299,11 @@ def test_settings_that_are_refused(
     ("value", "ride", "sentence"),
     [
         ({"attributes": {"ColorMode": 2}}, {}, "are RGB1, not mono; set cam1:ColorMode to Mono"),
-        ({"counts": np.zeros((4, 4), np.float32)}, {}, "pixels are float32, and counts are uint8 or uint16; set"),
+        ({"counts": np.zeros((4, 4), np.float32)}, {}, "pixels are float32, but they must be uint8 or uint16; set"),
         ({"counts": np.zeros((4, 4), np.int16)}, {}, "pixels are int16"),
-        ({"codec": {"name": "jpeg", "parameters": 5}}, {}, "compressed by jpeg, which does not keep counts"),
-        ({}, {"kinds": "HDF5FrameLocation"}, "HDF5FrameLocation, an attribute that the frames do not have; they have"),
-        ({}, {"exposure_s": None}, "Nothing tells the exposure"),
+        ({"codec": {"name": "jpeg", "parameters": 5}}, {}, "compressed with jpeg, which changes the counts"),
+        ({}, {"kinds": "HDF5FrameLocation"}, "The frames have no attribute HDF5FrameLocation (ride.kinds); they have"),
+        ({}, {"exposure_s": None}, "exposure time is not known"),
     ],
 )
 def test_frames_that_are_refused(tmp_path: Path, value: dict[str, Any], ride: dict[str, Any], sentence: str) -> None:
@@ -313,7 +319,7 @@ def test_a_camera_that_tells_no_exposure_time_tells_none(tmp_path: Path) -> None
         ioc.put({"cam1:AcquireTime_RBV": 0.0})
         config = config_of(tmp_path, ioc.url, camera="pva://T:cam1:", exposure_s=None)
         told = ride_along(config, tmp_path, lambda stop: ioc.send(range(1, 3)))
-    assert "Nothing tells the exposure" in str(told.error) and not stored(tmp_path)
+    assert "exposure time is not known" in str(told.error) and not stored(tmp_path)
 
 
 def test_a_binned_stream_is_refused_unless_it_is_named(tmp_path: Path) -> None:
@@ -338,7 +344,7 @@ def test_no_server_and_no_frames(tmp_path: Path) -> None:
             stop.stop("enough")
 
         told = ride_along(config, tmp_path, scan)
-    assert "No frame for 0.2 s, the server answers: the camera does not acquire" in " ".join(told.before)
+    assert "No frame for 0.2 s, although the server answers: the camera does not acquire" in " ".join(told.before)
 
 
 def test_tomoscan_without_angles_is_refused(tmp_path: Path) -> None:
@@ -352,4 +358,4 @@ def test_tomoscan_without_angles_is_refused(tmp_path: Path) -> None:
             ioc.send(range(1, 3))
 
         told = ride_along(config_of(tmp_path, ioc.url, angles), tmp_path, scan)
-    assert "NumAngles is 8, RotationStep 0: no angles follow" in str(told.error)
+    assert "no angles: pva://T:TomoScan:NumAngles is 8, RotationStep 0," in str(told.error)

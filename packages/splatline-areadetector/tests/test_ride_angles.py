@@ -1,4 +1,5 @@
-"""A ride stores each frame at its angle, or says which it does not know: what IOCs do with the numbers of frames."""
+"""`beamline ride` stores each frame with its angle, or reports those it does not know, whatever the frame numbers
+do."""
 
 from __future__ import annotations
 
@@ -37,9 +38,14 @@ def _rows(kind: int, triggers: Iterable[int], first: int, step: int = 1, word: s
     return [(kind, i, first + step * n, {"HDF5FrameLocation": told}) for n, i in enumerate(triggers)]
 
 
-def _send(ioc: FakeIoc, rows: Iterable[Any], period: float = 0.02) -> None:
-    for kind, i, number, attributes in rows:
-        ioc.post(array_value(_pixels(kind, i), number, attributes))
+def _send(
+    ioc: FakeIoc, rows: Iterable[Any], period: float = 0.02, begin: float | None = None, stated: float = 0.0
+) -> None:
+    """Send frames, one each `period` s. `begin`: the time that the first one states, each later one `stated` s later;
+    None: the time at which it is sent."""
+    for n, (kind, i, number, attributes) in enumerate(rows):
+        seconds = None if begin is None else begin + n * stated
+        ioc.post(array_value(_pixels(kind, i), number, attributes, seconds))
         time.sleep(period)
 
 
@@ -95,31 +101,31 @@ def test_a_camera_that_ran_free_before_the_projections(tmp_path: Path, pause: fl
     (file,) = stored(tmp_path)
     said = f"{told.error}{told.warnings}"
     if lost and not pause:
-        assert file.ids.tolist() == [*range(32, 91)] and "Nothing tells whether frame 32 is the first" in said
-        assert "it may be the first that is missing" in said
+        assert file.ids.tolist() == [*range(32, 91)] and "Frame 32 is taken for the first" in said
+        assert "the missing frame may be the first" in said
     else:
         assert np.allclose(file.degrees, 3.0 * (file.ids - 31)) and file.missing == [*range(lost)]
-        assert (told.error is None) is (lost == 0) and "Nothing tells" not in said
+        assert (told.error is None) is (lost == 0) and "is taken for the first" not in said
 
 
 def test_a_ride_that_subscribes_late_says_that_it_may_be_the_first_that_are_missing(tmp_path: Path) -> None:
     """Also where the server restarts meanwhile, in both files, and at a stop."""
     with FakeIoc() as ioc:
         _send(ioc, _rows(0, range(5), 1))  # before the ride subscribes
-        ioc.post(array_value(_pixels(0, 5), 6, seconds=time.time() + 1.5))  # about when the first one comes
+        before = time.time()  # the IOC's times are exact, however late this process sends
+        ioc.post(array_value(_pixels(0, 5), 6, seconds=before))
 
         def scan(stop: StopRequest) -> None:
-            time.sleep(1.0)
-            _send(ioc, _rows(0, range(6, 12), 7), 0.5)
-            _send(ioc, _rows(0, range(13, 16), 1), 0.1)  # the numbers begin anew
+            _send(ioc, _rows(0, range(6, 12), 7), begin=before + 0.5, stated=0.5)
+            _send(ioc, _rows(0, range(13, 16), 1), begin=before + 4.0, stated=0.1)  # the numbers begin anew
             time.sleep(2.5)
             stop.stop("the test waits no longer")
 
         told = ride_along(config_of(tmp_path, ioc.url), tmp_path, scan)
     one, other = stored(tmp_path)
     assert isinstance(told.error, ScanStopped) and _views(one) == [*range(6)] and _views(other) == [0, 1, 2]
-    assert len(re.findall(r"Nothing tells whether frame \d+ is the first projection", told.warnings)) == 2
-    assert "it may be the first 17 that are missing" in str(told.error)
+    assert len(re.findall(r"Frame \d+ is taken for the first projection", told.warnings)) == 2
+    assert "the missing 17 frames may be the first" in str(told.error)
 
 
 def test_neighbours_that_are_exchanged_are_stored_in_one_file(tmp_path: Path) -> None:
@@ -137,10 +143,14 @@ def test_a_first_dark_that_was_lost_shifts_kinds_by_order_which_is_said(tmp_path
     rows: list[Any] = [(k, i, n, {}) for k, i, n, _ in SCAN[1:]]
     told, (file,) = _ridden(tmp_path, rows, stop_after=2.0, **{**KINDS, "kinds": None})
     assert file.kinds.tolist() == [2] * 5 + [1] * 5 + [0] * 20 + [1] * 4 and len(_wrong(file)) == 20
-    assert "1 of 5 flats is missing: 4. As nothing tells the number of the first one, it may be the first that is " in (
-        said := str(told.error)
+    assert (
+        "1 of 5 flats is missing: 4. The number of the first projection is not known, so the missing frame may be the "
+        in (said := str(told.error))
     )
-    assert "frames next to those of another kind have the wrong kind, and all angles are 9° more. ride.kinds" in said
+    assert (
+        "frames next to those of another kind have the wrong kind, and all angles are 9° larger than stated. Set "
+        "ride.kinds" in said
+    )
 
 
 def _renumbered(numbers: Iterable[int], words: bool = True) -> list[Any]:
@@ -172,7 +182,7 @@ def test_numbers_of_acquisitions_of_16_bits_and_of_a_plugin_that_averages(
 def test_a_number_that_never_changes_is_refused(tmp_path: Path) -> None:
     told, files = _ridden(tmp_path, [(k, i, 0, {}) for k, i, *_ in SCAN])
     assert isinstance(told.error, ConfigError) and not files
-    assert "uniqueId is not set: it stays at 0 while the pixels change" in str(told.error)
+    assert "uniqueId stays at 0 while the pixels change" in str(told.error)
 
 
 @pytest.mark.parametrize("word", [None, "", "gone"])
@@ -210,4 +220,4 @@ def test_flats_within_the_projections_by_their_kind(tmp_path: Path, restarts: bo
     told, (file,) = _ridden(tmp_path, rows, **{**KINDS, "darks": {"count": 0}})
     assert told.error is None and not _wrong(file) and _views(file) == [*range(20)]
     assert file.kinds.tolist() == [1] * 5 + [0] * 10 + [1] * 5 + [0] * 10 + [1] * 5
-    assert "Other frames came within the projections, which go on with 10" in told.warnings
+    assert "Other frames came within the projections, which continue with projection 10" in told.warnings

@@ -1,4 +1,4 @@
-"""Rides of scans from which little comes: no projection, no frame that can be decoded, no angle for some."""
+"""`beamline ride` if little arrives: no projection, no frame that can be decoded, no angle for some frames."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_scan_without_projections(tmp_path: Path, blocks: tuple[tuple[str, str
     n = sum(each for *_, each in blocks)
     assert isinstance(told.error, LedgerError)
     assert "8 of 8 projections are missing: 0-7 (from 10° to 13.5°)" in str(told.error)
-    assert str(told.error).endswith(f"The file has {n} frames, and no projection with an angle.")
+    assert str(told.error).endswith(f"The file has {n} frames, but no projection with an angle.")
     (file,) = stored(tmp_path)
     assert file.ids.tolist() == [*range(1, n + 1)] and file.status == "failed"
 
@@ -76,14 +76,14 @@ def test_frames_that_cannot_be_decoded_are_told_once(tmp_path: Path, whole: int)
         assert [file.ids.tolist() for file in stored(tmp_path)] == [[*range(1, whole + 1)]]
     assert isinstance(told.error, LedgerError)
     lost = f"{20 - whole} of 20 projections are missing"
-    assert lost in str(told.error) and f"{20 - whole} frames came ({whole + 1}-20) but could not be used: " in str(
+    assert lost in str(told.error) and f"{20 - whole} frames arrived ({whole + 1}-20) but could not be used: " in str(
         told.error
     )
     assert told.warnings.count("cannot be decoded") == 1
     (file,) = stored(tmp_path)
     assert len(file.ids) == whole
     if not whole:
-        assert str(told.error).endswith("The file has 0 frames, and no projection with an angle.")
+        assert str(told.error).endswith("The file has 0 frames, but no projection with an angle.")
 
 
 def test_an_attribute_that_one_frame_lacks_costs_that_frame_alone(tmp_path: Path) -> None:
@@ -97,7 +97,9 @@ def test_an_attribute_that_one_frame_lacks_costs_that_frame_alone(tmp_path: Path
         told = ride_along(config_of(tmp_path, ioc.url, {"from": "attribute", "views": 20}), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert isinstance(told.error, LedgerError) and "1 of 20 projections is missing: 6" in str(told.error)
-    assert "1 frame came (7) but could not be used: nothing tells its angle" in str(told.error)
+    assert "1 frame arrived (7) but could not be used: the attribute SampleRotary with the angle is missing" in (
+        str(told.error)
+    )
     assert file.kinds.tolist() == [0] * 6 + [3] + [0] * 13 and len(file.ids) == 20
     assert np.allclose(np.delete(file.degrees, 6), np.delete(9.0 * np.arange(20), 6))
 
@@ -113,11 +115,11 @@ def test_a_pandaboxs_file_with_fewer_rows_than_views(tmp_path: Path) -> None:
     angles = _panda(tmp_path, 9.0 * np.arange(12))
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, angles), tmp_path, lambda stop: ioc.send(range(1, 21)))
-    assert "panda.h5 has 12 rows, 0° to 99°, which are this scan's unless it is written anew." in " ".join(told.before)
+    assert "panda.h5 has 12 rows, 0° to 99°: those of this scan, unless it is rewritten." in " ".join(told.before)
     assert isinstance(told.error, LedgerError) and "8 of 20 projections are missing: 12-19" in str(told.error)
-    assert "8 frames came (13-20) but could not be used: nothing tells its angle" in str(told.error)
+    assert "8 frames arrived (13-20) but could not be used: the angle is not known" in str(told.error)
     assert "Now: " in str(told.error) and "panda.h5 has 12 rows" in str(told.error)
-    assert told.warnings.count("nothing tells its angle") == 1
+    assert told.warnings.count("the angle is not known") == 1
     (file,) = stored(tmp_path)
     assert file.kinds.tolist() == [0] * 12 + [3] * 8 and np.allclose(file.degrees[:12], 9.0 * np.arange(12))
 
@@ -131,12 +133,12 @@ def test_a_pandaboxs_file_that_is_missing_or_wrong_is_told_in_one_sentence(
         config = config_of(tmp_path, ioc.url, angles, darks={"count": darks})
         told = ride_along(config, tmp_path, lambda stop: ioc.send(range(1, 24)))
     if rows is not None:
-        assert isinstance(told.error, ConfigError) and "as of radians" in str(told.error) and not told.before
+        assert isinstance(told.error, ConfigError) and "look like radians" in str(told.error) and not told.before
     elif not darks:
-        assert isinstance(told.error, ConfigError) and "is not there. Nothing was recorded." in str(told.error)
-        assert "Now: " in told.before[0] and "panda.h5 is not there yet." in told.before[0]
+        assert isinstance(told.error, ConfigError) and "does not exist. Nothing was recorded." in str(told.error)
+        assert "Now: " in told.before[0] and "panda.h5 does not exist yet." in told.before[0]
     else:
-        assert isinstance(told.error, DataError) and "is not there: no projection has an angle" in str(told.error)
+        assert isinstance(told.error, DataError) and "No projection has an angle: " in str(told.error)
         (file,) = stored(tmp_path)
         assert file.kinds.tolist() == [2] * darks
     assert not told.warnings
@@ -147,5 +149,5 @@ def test_a_frame_of_no_pixels_is_refused(tmp_path: Path) -> None:
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in (0, 16)]
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, PLAN), tmp_path, lambda stop: ioc.post(value))
-    assert isinstance(told.error, ConfigError) and "dimensions say 16 x 0 uint16" in str(told.error)
+    assert isinstance(told.error, ConfigError) and "not fit its dimensions, 16 x 0 uint16" in str(told.error)
     assert not stored(tmp_path)

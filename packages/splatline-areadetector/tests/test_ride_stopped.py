@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while frames come and a live volume is made: both are answered within 2 s of a free core."""
+"""Ctrl-C and SIGTERM during recording and live reconstruction: both take effect within 2 s of an idle core."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live volume of a ride: its process starts, and warms up, while the ride waits for the scan."""
+"""Live volume of `beamline ride`: its process starts and loads its code while the command waits for the scan."""
 
 from __future__ import annotations
 

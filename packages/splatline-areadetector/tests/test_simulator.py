@@ -1,4 +1,4 @@
-"""A ride on the simulator of APS (pvapy), as programs: a real scan, a ride that stands still, a server that dies."""
+"""`beamline ride` with APS's simulator (pvapy), as programs: a real scan, a process that stalls, a server that dies."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole:
     missing = sorted({*range(n)} - {*(file.ids - 1).tolist()})
     assert file.missing == missing and ((still > 1 and whole) or not missing) and len(missing) < 50 * still
     if missing:
-        assert code == 5 and "were lost by this program, which stood still for" in ride.output, ride.output
+        assert code == 5 and "were lost by this program, which stalled for" in ride.output, ride.output
 
 
 @pytest.mark.slow
@@ -228,7 +228,7 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> N
         with served(scan, 20) as start:
             start()
             assert ride.exit_code() == 5
-    assert "began anew at" in ride.output
+    assert "numbers restarted at" in ride.output
     first, second = stored(tmp_path)
     assert first.status == "failed" and second.status == "complete" and second.ids[0] < 60  # found again soon
     assert np.array_equal(second.ids, second.ids[0] + np.arange(n))
@@ -256,7 +256,7 @@ def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
         assert code in (0, 7) and not file.missing, ride.output
     else:
         assert code == 5 and file.missing, ride.output
-        assert "memory for waiting frames was full: the disk is too slow" in ride.output
+        assert "memory for waiting frames was full, because the disk is too slow" in ride.output
 
 
 @pytest.mark.slow

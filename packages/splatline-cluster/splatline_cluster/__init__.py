@@ -1,4 +1,4 @@
-"""Processes on this machine or on others that reconstruct slabs, by dask.distributed."""
+"""Reconstructs slabs in processes on this machine or on others, with dask.distributed."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from beamline.core.errors import BeamlineError, ConfigError
 from recon import Geometry, Reconstruction, RunControl
 from recon.base.method import Method
 
-_CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
-_PATIENCE = 60.0  # s that work goes without any worker
+_CONNECT_TIMEOUT = 30  # s to wait for a scheduler, and for its first worker
+_PATIENCE = 60.0  # s to wait if all workers have left
 LOOK_EVERY = 2.0  # s between two checks for a worker
-_TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
-_SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # modules in the current folder are not imported
+_TASK_SIZE_WARNING = "1 TB"  # size of a task from which distributed warns; a slab is sent as it is
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # so that modules in the current folder are not imported
 
 
 class WorkersLostError(BeamlineError):
-    """Workers did not come back with a slab."""
+    """A slab was lost with its workers."""
 
     exit_code = 5
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Workers that reconstruct; another worker repeats the work of a lost one.
+    """Workers that reconstruct slabs. If a worker is lost, another one repeats its work.
 
     Attributes:
-        patience: s after which work without any worker is given up.
+        patience: s without any worker, after which the work is given up.
     """
 
     workers: int
@@ -56,12 +56,12 @@ class Cluster:
         control: RunControl,
         **settings: Any,
     ) -> Reconstruction:
-        """Reconstruct on a worker with as many threads as this process has; without progress and stop.
+        """Reconstruct on a worker with as many threads as this process has, without progress and without a stop.
 
         Raises:
-            WorkersLostError: several workers were lost with this work, or all workers, or the scheduler.
+            WorkersLostError: several workers with this slab were lost, or all workers, or the scheduler.
         """
-        import numba  # here: beamline loads it after recon's compiled kernels
+        import numba  # imported here, because beamline loads numba after recon's compiled kernels
 
         work = (np.array(projections), geometry, method, settings, control.decide)
         future = self.client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
@@ -70,22 +70,22 @@ class Cluster:
             made: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
             raise WorkersLostError(
-                f"The scheduler, or several workers with the same slab, were lost ({error}). They may lack memory: "
-                "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
+                f"The scheduler was lost, or several workers with the same slab ({error}). They may have too little "
+                "memory: give a smaller --memory, or fewer workers. Finished slabs are kept: continue with --resume."
             ) from error
         return made
 
     def _wait_for(self, future: Future) -> None:
-        """Return when it is done; raises WorkersLostError after `patience` without a worker."""
+        """Return when the work is done. WorkersLostError: no worker for `patience`."""
         look, alone, done = min(LOOK_EVERY, self.patience), 0.0, Event()
-        # Not result(look): each TimeoutError of it is in a cycle with its frames, and these hold the partial volume.
+        # Do not use result(look): its TimeoutErrors form cycles with their frames, which keep the partial volume alive.
         future.add_done_callback(lambda _: done.set())
         while not (done.wait(look) or future.done()):
             alone = 0.0 if _count(self.client) else alone + look
             if alone >= self.patience:
                 raise WorkersLostError(
-                    f"All workers have left, and none came for {self.patience:g} s. Start some again; slabs that "
-                    "are finished stay: see --resume."
+                    f"Start workers again and continue with --resume: all workers have left, and none came for "
+                    f"{self.patience:g} s. Finished slabs are kept."
                 )
 
 
@@ -97,7 +97,7 @@ def _count(client: Client) -> int:
 
 
 def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
-    """On a worker. The same number of threads gives the same bits."""
+    """Reconstruct, on a worker. The same number of threads gives bit-identical results."""
     import numba
 
     data, geometry, method, settings, decide = work
@@ -108,22 +108,22 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
 
 @contextmanager
 def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
-    """The cluster that `spec` names; workers on this machine end with the block.
+    """Connect to the cluster that `spec` names. Workers on this machine end with the block.
 
     Args:
         spec: `local:N` for N workers on this machine, or `tcp://HOST:PORT` of a scheduler.
         first_worker_s: s to wait for the first worker.
 
     Raises:
-        ConfigError: no scheduler answers, no worker comes in time, or one has not the same version of splatline.
+        ConfigError: no scheduler answers, no worker comes in time, or a worker has another version of splatline.
     """
     with ExitStack() as closing:
         closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
         address: Any = spec
         try:
             if spec.startswith("local:"):
-                os.environ.update(_SAFE_PATH)  # in ours, since multiprocessing starts a helper of its own with it
-                # Without a page on a port, and without a limit of its own: --memory is that of a slab.
+                os.environ.update(_SAFE_PATH)  # for the helper process of multiprocessing, too
+                # Without a status page, and without a memory limit of dask: --memory limits a slab.
                 address = LocalCluster(
                     n_workers=int(spec.removeprefix("local:")),
                     threads_per_worker=1,
@@ -141,22 +141,22 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
             client.wait_for_workers(1, first_worker_s)
         except TimeoutError:
             raise ConfigError(
-                f"--cluster {spec}: the scheduler has no workers, and none came in {first_worker_s:g} s. Start some: "
-                f"dask worker {spec}."
+                f"Start workers with dask worker {spec}: the scheduler of --cluster has none, and none came in "
+                f"{first_worker_s:g} s."
             ) from None
         _require_same_version(client, spec)
         yield Cluster(max(1, _count(client)), client)
 
 
 def _require_same_version(client: Client, spec: str) -> None:
-    """Raises ConfigError if a worker lacks this package, or has another version of splatline."""
-    # A function of Python: a worker without this package has none of ours.
+    """Raise ConfigError if a worker does not have this package, or has another version of splatline."""
+    # Run a function of Python, because a worker without this package has none of ours.
     found = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
     others = {worker: there for worker, there in found.items() if there != recon.__version__}
     for worker, there in others.items():
         lacks = isinstance(there, Exception)
         what = f"splatline or splatline-cluster cannot be loaded ({there})" if lacks else f"splatline is {there}"
         raise ConfigError(
-            f"--cluster {spec}: {len(others)} of {len(found)} workers cannot take part: {what} at {worker}. Start the "
+            f"--cluster {spec}: {len(others)} of {len(found)} workers cannot be used: {what} at {worker}. Start the "
             f"workers where splatline {recon.__version__} and splatline-cluster are installed. Nothing was read."
         )

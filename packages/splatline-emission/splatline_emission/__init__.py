@@ -1,4 +1,4 @@
-"""Samples that emit (PET): counts of lines of response, and the activity of highest Poisson likelihood."""
+"""Samples that emit (PET): counts along lines of response, and the activity with the highest Poisson likelihood."""
 
 from splatline_emission.counts import Emission, read_counts, weighted_lines, write_counts
 from splatline_emission.likelihood import attenuation_factors, mlem, passes_by_halves

@@ -1,4 +1,4 @@
-"""`beamline emission`: simulates the counts of a sample that emits, and reconstructs its activity."""
+"""`beamline emission`: simulates the counts of a sample that emits (PET), and reconstructs its activity."""
 
 from __future__ import annotations
 
@@ -12,28 +12,50 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_existing
 
-_UPDATES = 200  # of the volume, by all subsets: the most that counts held out may ask for
+_UPDATES = 200  # most updates of the volume, over all subsets, if held-out counts choose the iterations
 _NEW = click.Path(path_type=Path)
 
 
 @click.group()
 def emission() -> None:
-    """Simulate or reconstruct the counts of a sample that emits (PET)."""
+    """Simulate the counts of a sample that emits (PET), or reconstruct its activity from counts."""
 
 
 @emission.command()
-@click.option("-o", "--output", metavar="FILE.h5", type=_NEW, required=True, help="Counts, as `recon` reads them.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE.h5",
+    type=_NEW,
+    required=True,
+    help="File for the counts; `beamline emission recon` reads it.",
+)
 @click.option("--truth", metavar="FILE", callback=parsed(lambda text: text and volume_path(text)),
-              help="Write the activity behind them, too.")  # fmt: skip
-@click.option("--views", type=click.IntRange(2, 100_000), default=120, show_default=True, help="Over half a turn.")
-@click.option("--shape", type=click.IntRange(1), nargs=2, default=(16, 64), show_default=True, help="Rows, columns.")
-@click.option("--trues", type=click.FloatRange(1), default=1.5e7, show_default=True, help="Counts without scatter.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all random numbers.")
+              help="Also write the true activity to this file.")  # fmt: skip
+@click.option(
+    "--views", type=click.IntRange(2, 100_000), default=120, show_default=True, help="Number of projections over 180°."
+)
+@click.option(
+    "--shape", type=click.IntRange(1), nargs=2, default=(16, 64), show_default=True, help="Detector rows and columns."
+)
+@click.option(
+    "--trues",
+    type=click.FloatRange(1),
+    default=1.5e7,
+    show_default=True,
+    help="Number of true counts, without scatter and randoms.",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the random numbers.")
 @json_option
 def simulate(
     output: Path, truth: Path | None, views: int, shape: tuple[int, int], trues: float, seed: int, as_json: bool
 ) -> None:
-    """Simulate counts of hot and cold rods in water (after NEMA NU 4-2008), in lines of 1 mm."""
+    """Simulate counts of hot and cold rods in water.
+
+    The phantom follows NEMA NU 4-2008; pixels are 1 mm.
+
+    Example: beamline emission simulate -o pet.h5 --truth truth.h5
+    """
     import numpy as np
 
     from beamline.core.quantities import VoxelKind
@@ -56,23 +78,32 @@ def simulate(
                 replace(bare_record(output, volume.data), volume=volume, length_unit="mm", kind=VoxelKind.ACTIVITY),
             )
         facts = {"output": output, "truth": truth, "counts": float(counts.sum())}
-        answer.done(facts, f"scan    {output}, {views} views, {counts.sum():.4g} counts")
+        answer.done(facts, f"scan    {output}, {views} projections, {counts.sum():.4g} counts")
 
 
 @emission.command()
 @click.argument("file", type=_NEW)
 @click.option("-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True,
-              help="The activity; the suffix chooses the format.")  # fmt: skip
+              help="File for the activity; its suffix chooses the format.")  # fmt: skip
 @click.option("-m", "--method", default="osem", show_default=True,
-              help="mlem, osem, or any other method, by lines that carry the likelihood to second order.")  # fmt: skip
-@click.option("--iterations", type=click.IntRange(1), help="Of mlem and osem. Default: as counts held out prefer.")
-@click.option("--subsets", type=click.IntRange(1), default=4, show_default=True, help="Of the views, for osem.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all random numbers.")
+              help="mlem, osem, or any method of `beamline recon`, such as pnp-dct (smallest error).")  # fmt: skip
+@click.option(
+    "--iterations", type=click.IntRange(1), help="Iterations of mlem and osem. Default: chosen with held-out counts."
+)
+@click.option(
+    "--subsets", type=click.IntRange(1), default=4, show_default=True, help="Subsets of the projections, for osem."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the random numbers.")
 @json_option
 def recon(
     file: Path, output: Path, method: str, iterations: int | None, subsets: int, seed: int, as_json: bool
 ) -> None:
-    """Reconstruct the activity behind the counts of FILE, in counts per mm of line."""
+    """Reconstruct the activity from counts.
+
+    The activity is in counts per mm of line.
+
+    Example: beamline emission recon pet.h5 -o activity.h5
+    """
     import numpy as np
 
     import recon as reconstruction

@@ -1,4 +1,4 @@
-"""Counts of lines of response with what their mean holds: the value, its file, and line integrals with weights."""
+"""Counts along lines of response with the parts of their mean: the value, its file, line integrals with weights."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from recon import Geometry, Grid
 
 WATER, AIR, TEFLON = 0.0096, 1e-5, 0.0174  # 1/mm at 511 keV: water 0.096 cm²/g, PTFE 0.079 cm²/g at 2.2 g/cm³
 HEIGHT = 40.0
-_RAYS = (-1 / 3, 0.0, 1 / 3)  # of a pixel, in pixels from its middle along a row
+_RAYS = (-1 / 3, 0.0, 1 / 3)  # rays of a pixel: distances from its middle along a row, in pixels
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A cylinder along the axis. `activity` and `mu`: over those of what it displaces; `at`: (x, y)."""
+    """A cylinder along the axis. `activity` and `mu` are relative to those of the displaced material. `at`: (x, y)."""
 
     radius: float
     at: tuple[float, float]
@@ -32,7 +32,7 @@ class Rod:
 
 
 def _at(turn: int) -> tuple[float, float]:
-    """A sixth of a turn from place to place."""
+    """Position of the rod number `turn`; neighbouring rods are 60° apart."""
     return 13 * math.cos(turn * math.pi / 3), 13 * math.sin(turn * math.pi / 3)
 
 
@@ -46,11 +46,11 @@ RODS = (
 
 @dataclass(frozen=True)
 class Scanner:
-    """What a scanner counts, and adds to the counts of the activity.
+    """The counts of a scanner: trues, scatter and randoms.
 
     Attributes:
-        trues: counts of pairs that arrive unscattered, of all lines together.
-        scatter, randoms: their counts over the trues. Scatter is a broad blur of the trues, randoms are even.
+        trues: number of pairs that arrive unscattered, over all lines.
+        scatter, randoms: counts relative to the trues. Scatter is a broad blur of the trues, randoms are uniform.
         scatter_mm: standard deviation of that blur.
         spread: relative standard deviation of the efficiency from pixel to pixel.
     """
@@ -63,7 +63,7 @@ class Scanner:
 
 
 def chords(geometry: Geometry, which: str) -> NDArray[np.float64]:
-    """Line integrals [view, row, col] of "activity" (1 in the water) or "mu"; means over the rays of a pixel."""
+    """Line integrals [view, row, col] of "activity" (1 in the water) or "mu", averaged over the rays of a pixel."""
     rows, cols = geometry.detector_shape
     inside = np.abs(geometry.pixel_pitch * (np.arange(rows) - geometry.axis_row)) < HEIGHT / 2
     u = geometry.pixel_pitch * (np.arange(cols)[:, None] + np.array(_RAYS) - geometry.axis_col)
@@ -77,7 +77,7 @@ def chords(geometry: Geometry, which: str) -> NDArray[np.float64]:
 
 
 def activity(grid: Grid, fine: int = 4) -> F32:
-    """Activity [z, y, x], 1 in the water, by `fine`² points of each voxel."""
+    """Activity [z, y, x], 1 in the water, from `fine`² points in each voxel."""
     z, y, x = grid.coordinates()
     part = ((np.arange(fine) + 0.5) / fine - 0.5) * grid.voxel_size
     ys, xs = (y[:, None] + part).ravel(), (x[:, None] + part).ravel()
@@ -89,8 +89,8 @@ def activity(grid: Grid, fine: int = 4) -> F32:
 
 
 def counts_of(geometry: Geometry, scanner: Scanner, seed: int) -> tuple[F32, dict[str, F32], float]:
-    """Counts [view, row, col] drawn from Poisson's law, what their mean holds by the names of `read_counts`, and counts
-    per mm of a line of activity 1.
+    """Simulate counts. Returns Poisson counts [view, row, col], the parts of their mean by the names of `read_counts`,
+    and the counts per mm of a line of activity 1.
     """
     rng = np.random.default_rng(seed)
     lines, depth = chords(geometry, "activity"), chords(geometry, "mu")
@@ -107,19 +107,19 @@ def counts_of(geometry: Geometry, scanner: Scanner, seed: int) -> tuple[F32, dic
 
 
 F32 = NDArray[np.float32]
-_SMOOTH = (0.0, 1.5, 1.5)  # views, rows and columns, standard deviation, of the mean that weights follow
-_FEWEST_OF_A_LINE = 0.5  # counts of a line's mean, at least
+_SMOOTH = (0.0, 1.5, 1.5)  # standard deviation of the smoothing for weights, in projections, rows and columns
+_FEWEST_OF_A_LINE = 0.5  # smallest mean counts of a line
 
 
 @dataclass(frozen=True, eq=False)
 class Emission:
-    """Counts along lines of response, binned as parallel views, with scatter, randoms and survival.
+    """Counts along lines of response, binned as parallel projections, with scatter, randoms and survival.
 
         mean = survival * A activity + background
 
     Attributes:
-        counts: float32 [view, row, col], 0 or more, not corrected: their noise is Poisson's.
-        geometry: of the lines; A takes line integrals on voxels.
+        counts: float32 [view, row, col], 0 or more, uncorrected, so that their noise is Poisson.
+        geometry: geometry of the lines; A computes line integrals of voxels.
         survival: [view, row, col], attenuation factor (see `attenuation_factors`) times sensitivity.
         background: [view, row, col], mean randoms and scatter.
     """
@@ -133,22 +133,23 @@ class Emission:
         for name in ("counts", "survival", "background"):
             values, shape = getattr(self, name), (self.geometry.n_views, *self.geometry.detector_shape)
             if values.shape != shape or not (np.isfinite(values).all() and values.min() >= 0):
-                raise ValueError(f"{name} must be finite and 0 or more, of shape {shape}, got shape {values.shape}")
+                raise ValueError(f"{name} must be finite, 0 or more and of shape {shape}; got shape {values.shape}")
         if not self.counts.any():
-            raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
+            raise ValueError("there is nothing to reconstruct, because all counts are zero")
 
 
 def read_counts(path: Path) -> Emission:
-    """The group /emission of an HDF5 file: `counts` [view, row, col], `angles` in degrees, `pixel_size` in mm, and, as
-    far as they are known, `attenuation` (line integrals), `normalisation` (efficiency), mean `randoms` and `scatter`.
+    """Read the group /emission of an HDF5 file: `counts` [view, row, col], `angles` in degrees, `pixel_size` in mm,
+    and, as far as they are known, `attenuation` (line integrals), `normalisation` (efficiency), mean `randoms` and
+    `scatter`.
 
     Raises:
-        DataError: the file cannot be read, lacks counts, angles or pixel size, or has values that are no counts.
+        DataError: the file cannot be read, has no counts, angles or pixel size, or has values that cannot be counts.
     """
     with open_hdf5(path) as file, readable(path):
         group = file.get("emission", {})
         if missing := {"counts", "angles", "pixel_size"} - {*group}:
-            raise DataError(f"{path} has no /emission/{min(missing)}. Nothing was written.")
+            raise DataError(f"{path} has no dataset /emission/{min(missing)}. Nothing was written.")
         counts = np.asarray(group["counts"][()], np.float32)
         zeros, ones = np.zeros_like(counts), np.ones_like(counts)
         sets = {"attenuation": zeros, "normalisation": ones, "randoms": zeros, "scatter": zeros}
@@ -163,7 +164,7 @@ def read_counts(path: Path) -> Emission:
 
 
 def write_counts(path: Path, counts: F32, geometry: Geometry, sets: Mapping[str, F32]) -> None:
-    """Write what `read_counts` reads. Raises DataError: `path` exists or cannot be written; nothing is left."""
+    """Write a file for `read_counts`. DataError: `path` exists or cannot be written; nothing is left."""
     with atomic_file(path) as partial, created(partial) as file:
         group = file.create_group("emission")
         for name, values in {"counts": counts, **sets}.items():
@@ -172,15 +173,16 @@ def write_counts(path: Path, counts: F32, geometry: Geometry, sets: Mapping[str,
 
 
 def weighted_lines(emission: Emission) -> tuple[F32, F32]:
-    """Line integrals of the activity and weights [view, row, col] that carry the likelihood of counts to any method.
+    """Line integrals of the activity and weights [view, row, col], so that any method can use the likelihood of counts.
 
-    To second order about an expected mean λ the negative log-likelihood of y is ½ w (p - p~)², with p~ = (y - b) / s,
-    whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed by neighbours: the
-    counts of a line alone would weigh its lucky ones least, and lower the sum. Lines of survival 0 weigh nothing.
+    To second order about an expected mean λ, the negative log-likelihood of y is ½ w (p - p~)² with p~ = (y - b) / s,
+    whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed over neighbours: with
+    the counts of a line alone, lines with many counts by chance would get the smallest weights, and the sum would be
+    too low. Lines of survival 0 have weight 0.
     """
     survival, zeros = emission.survival, np.zeros_like(emission.counts)
     seen = survival > 0
-    # Of counts over survival: efficiency and attenuation differ from line to line, activity hardly does.
+    # Smooth counts over survival, because efficiency and attenuation differ from line to line, and activity hardly.
     level = gaussian_filter(np.where(seen, emission.counts, 0), _SMOOTH, mode="nearest")
     shape = gaussian_filter(survival * seen, _SMOOTH, mode="nearest")
     mean = np.maximum(level * np.divide(survival, shape, out=1 + zeros, where=shape > 0), emission.background)

@@ -1,4 +1,4 @@
-"""MLEM and OSEM: the activity of highest Poisson likelihood."""
+"""MLEM and OSEM: find the activity with the highest Poisson likelihood."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from scipy.special import xlogy
 from recon import Geometry, Grid, Projector, Volume
 from splatline_emission.counts import F32, Emission
 
-_LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
+_LEAST = 1e-6  # voxels below this fraction of the largest sensitivity are not measured and get no activity
 
 
 def attenuation_factors(mu: Volume, geometry: Geometry) -> F32:
-    """exp(-∫ μ) [view, row, col]: the fraction of photon pairs that leave the sample, wherever on the line they are
-    emitted.
+    """exp(-∫ μ) [view, row, col]: fraction of photon pairs that leave the sample; the same for all points of a line.
 
     Args:
         mu: attenuation at 511 keV, 1/mm.
@@ -37,21 +36,21 @@ def mlem(
 
         x <- x / (Aᵀs) * Aᵀ[s y / (s A x + b)]
 
-    With one subset each iteration raises L = Σ y log(mean) - mean. More subsets of the views are OSEM (Hudson & Larkin
-    1994): about as many times faster, without that promise. Memory: 4 volumes with one subset, else 3 + subsets; 4 x
-    the projections of a subset.
+    With one subset, each iteration raises L = Σ y log(mean) - mean. N subsets of the projections are OSEM (Hudson &
+    Larkin 1994): about N times as fast, but L need not rise. Memory: 4 volumes with one subset, else 3 + subsets; 4
+    times the projections of a subset.
 
     Args:
         on_iteration: called with the number of each iteration, from 1, L (up to a constant), and
-            ||counts - mean|| / ||counts||. Both are of the volume before it; with subsets each view at its turn. The
-            iterations end if it returns something true.
+            ||counts - mean|| / ||counts||. Both are for the volume before the iteration; with subsets, for the volume
+            before each subset. The iterations end if it returns True.
 
     Returns:
-        counts per mm of line, 0 or more; 0 where no line sees a voxel.
+        counts per mm of line, 0 or more; 0 in voxels that no line meets.
 
     Raises:
-        ValueError: no iterations, or other subsets than 1 to the number of views. A line with counts whose mean is
-            zero whatever the activity.
+        ValueError: fewer than one iteration; subsets not between 1 and the number of projections; or a line has counts
+            although its mean is zero for any activity.
     """
     if iterations < 1:
         raise ValueError(f"iterations must be 1 or more, got {iterations}")
@@ -64,8 +63,8 @@ def mlem(
 
 
 class _Pass(NamedTuple):
-    """After a pass over all views: `activity` [z, y, x], which the next one overwrites, and of that before it, each
-    view at its turn, L and Σ (counts - mean)².
+    """State after a pass over all projections: `activity` [z, y, x], which the next pass overwrites; L and
+    Σ (counts - mean)² for the activity before each subset.
     """
 
     activity: F32
@@ -77,8 +76,8 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
     """Endless passes of `mlem`."""
     views = emission.geometry.n_views
     if not 1 <= subsets <= views:
-        raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
-    whole = Projector(emission.geometry, grid).plain  # expectation maximisation needs a matrix >= 0
+        raise ValueError(f"subsets must be 1 to {views}, the number of projections, got {subsets}")
+    whole = Projector(emission.geometry, grid).plain  # because expectation maximisation needs a matrix >= 0
     parts = [(some, whole.subset(some)) for some in (np.arange(first, views, subsets) for first in range(subsets))]
     sensitivities = [projector.adjoint(emission.survival[some]) for some, projector in parts]
     least = _LEAST * max(float(each.max()) for each in sensitivities)
@@ -91,8 +90,8 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
             mean = survival * projector.forward(x) + emission.background[some]
             if blind := np.count_nonzero(counts[mean <= 0]):
                 raise ValueError(
-                    f"{blind} lines have counts and the mean 0: they miss the grid, or "
-                    "their survival is 0. Give a larger grid, their background, or no counts"
+                    f"{blind} lines have counts although their mean is 0: they miss the grid, or their survival is 0. "
+                    "Give a larger grid, their background, or no counts"
                 )
             ratio = np.divide(counts, mean, out=np.zeros_like(mean), where=mean > 0)
             likelihood += float(np.sum(xlogy(counts, mean) - mean, dtype=np.float64))
@@ -106,18 +105,18 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
 def passes_by_halves(emission: Emission, grid: Grid, subsets: int, most: int, rng: np.random.Generator) -> int:
     """The number of iterations of `mlem`, up to `most`, for which held-out counts are predicted best.
 
-    Each count goes to one of two halves by a coin, which makes them independent Poisson counts of half the mean
-    (Kingman 1993, Poisson Processes, section 5.1), of all lines. Activity x of one half meets lines q = (y - b) / s of
-    the other, whose noise it does not know. Along rows of pixels, with |ω| as in FBP,
+    Each count goes to one of two halves at random. The halves are independent Poisson counts of half the mean (Kingman
+    1993, Poisson Processes, section 5.1), for all lines. The activity x of one half is compared with the lines
+    q = (y - b) / s of the other half, whose noise is independent. Along rows of pixels, with |ω| as in FBP,
 
         Σ |ω| |F(q - A x)|²  =  Σ |ω| |F(A x - A truth)|² + noise of q     on average
 
     and the first sum on the right is |x - truth|², up to a factor (Natterer 1986, The Mathematics of Computerized
-    Tomography, section II.1). Without |ω|, or by the likelihood, lines are compared, which hardly show the noise of a
-    volume: two to three times as many iterations have the least error then. The search ends where the sum rises.
+    Tomography, section II.1). Without |ω|, or with the likelihood, lines would be compared, and lines hardly show the
+    noise of a volume: two to three times as many iterations would then seem best. The search ends when the sum rises.
 
     Returns:
-        `most` for counts that are not whole numbers, so that they are not Poisson's.
+        `most` if counts are not integers, because they are then not Poisson.
     """
     counts = emission.counts
     if not (np.rint(counts) == counts).all() or counts.sum() < 2:

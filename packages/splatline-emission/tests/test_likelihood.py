@@ -1,4 +1,4 @@
-"""MLEM against a general optimiser, its likelihood, and the counts that it keeps; attenuation and randoms given."""
+"""MLEM compared with a general optimiser: likelihood and total counts, with known attenuation and randoms."""
 
 from __future__ import annotations
 
@@ -187,5 +187,5 @@ def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
         with pytest.raises(ValueError, match=said):
             mlem(emission, grid, iterations, subsets)
     blind = np.where(np.arange(16)[:, None, None] == 3, 0, np.ones_like(emission.counts))
-    with pytest.raises(ValueError, match="mean 0"):
+    with pytest.raises(ValueError, match="mean is 0"):
         mlem(replace(emission, survival=blind.astype(F32), background=0 * emission.background), grid)

@@ -1,1 +1,1 @@
-"""What else the Gaussians behind a volume give: voxels of any size, views; and the surface of a volume."""
+"""Voxels of any size and projections from the Gaussians of a fit, and the surface mesh of a volume."""

@@ -1,4 +1,4 @@
-"""`beamline voxelise`, `render`, `surface`: voxels and views of the Gaussians behind a volume, and its surface."""
+"""`beamline voxelise`, `render`, `surface`: voxels and projections of a fit's Gaussians; the surface of a volume."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _NEW = click.Path(path_type=Path)
 
 
 def box_of(text: str) -> Box:
-    """Parse three intervals Z0:Z1,Y0:Y1,X0:X1 of lengths. Raises ValueError for any other text."""
+    """Parse three intervals of lengths, Z0:Z1,Y0:Y1,X0:X1. Raises ValueError for other text."""
     try:
         box = tuple((float(low), float(high)) for low, high in (part.split(":") for part in text.split(",")))
     except ValueError:
         box = ()
     if len(box) != 3 or not all(-math.inf < low < high < math.inf for low, high in box):
-        raise ValueError(f"{text!r} is not a box; expected Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
+        raise ValueError(f"{text!r}: expected a box Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
     return box
 
 
@@ -48,14 +48,14 @@ def angles_of(text: str) -> NDArray[np.float64]:
     except (ValueError, ZeroDivisionError):
         angles = np.empty(0)
     if not angles.size or not np.isfinite(angles).all():
-        raise ValueError(f"{text!r} names no angles; expected FIRST:END:STEP or A,B,... in degrees")
+        raise ValueError(f"{text!r}: expected angles FIRST:END:STEP or A,B,... in degrees")
     return np.radians(angles)
 
 
 @contextmanager
 def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Answer]]:
-    """The model behind `volume`, for a new file at `output`."""
-    from beamline.gaussians import read_model  # here: help needs none of it
+    """Read the Gaussians of `volume`, for a new file at `output`."""
+    from beamline.gaussians import read_model  # imported here, because help does not need it
 
     with answering(as_json) as answer:
         refuse_existing(output)
@@ -65,16 +65,25 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
 @click.command()
 @volume_argument
 @click.option("-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True,
-              help="Output; the suffix chooses the format.")  # fmt: skip
-@click.option("--voxel", type=click.FloatRange(min=0, min_open=True),
-              help="Edge of a voxel, in the unit of the volume. Default: that of VOLUME.")  # fmt: skip
-@click.option("--box", metavar="Z0:Z1,Y0:Y1,X0:X1", callback=parsed(box_of),
-              help="Box to fill, in the unit of the volume, from the axis. Default: that of VOLUME.")  # fmt: skip
+              help="File to write; its suffix chooses the format.")  # fmt: skip
+@click.option(
+    "--voxel",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Edge of a voxel in the unit of VOLUME (mm if the voxel size is known). Default: that of VOLUME.",
+)
+@click.option(
+    "--box",
+    metavar="Z0:Z1,Y0:Y1,X0:X1",
+    callback=parsed(box_of),
+    help="Box to fill, in the unit of VOLUME, with x and y from the rotation axis. Default: that of VOLUME.",
+)
 @json_option
 def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, as_json: bool) -> None:
-    """Fill voxels of any size and box from the Gaussians behind a volume.
+    """Write the Gaussians of a fit as voxels of any size, in any box.
 
-    These are the fit's, before its finish on voxels.
+    VOLUME must come from a Gaussian fit (`recon -m r2`). The Gaussians are those before the voxel refinement.
+
+    Example: beamline voxelise recon.h5 --voxel 0.0005 -o fine.h5
     """
     from beamline.storage.volumes.files import write_volume
     from splatline_models.made import box_grid, voxelised
@@ -92,32 +101,46 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 
 @click.command()
 @volume_argument
-@click.option("-o", "--output", metavar="PATH.h5", type=_NEW, required=True, help="New file.")
+@click.option("-o", "--output", metavar="PATH.h5", type=_NEW, required=True, help="File to write.")
 @click.option("--angles", metavar="FIRST:END:STEP|A,B,...", callback=parsed(angles_of),
-              help="Of the views, in degrees; END is not one of them. Default: those that were fitted.")  # fmt: skip
+              help="Angles of the projections in degrees, without END. Default: those that were fitted.")  # fmt: skip
 @json_option
 def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_json: bool) -> None:
-    """Project the Gaussians behind a volume: line integrals of views at any angle, as a scan in Data Exchange."""
+    """Project the Gaussians of a fit at any angles. Writes line integrals as a scan file in Data Exchange.
+
+    VOLUME must come from a Gaussian fit (`recon -m r2`) of a parallel beam.
+
+    Example: beamline render recon.h5 --angles 0:180:0.5 -o views.h5
+    """
     from splatline_models.made import write_views
 
     if output.suffix.lower() not in (".h5", ".hdf5"):
-        raise click.UsageError(f"-o {output}: views are HDF5; give a name such as {output.with_suffix('.h5')}.")
+        raise click.UsageError(
+            f"-o {output}: projections are written as HDF5; give a name such as {output.with_suffix('.h5')}."
+        )
     with _making(volume, output, as_json) as (model, answer):
         views = model.geometry.angles if angles is None else angles
-        write_views(output, model, views, answer.counting("views"))
-        answer.done({"output": output, "n_views": views.size}, f"output  {output}, {views.size} views")
+        write_views(output, model, views, answer.counting("projections"))
+        answer.done({"output": output, "n_views": views.size}, f"output  {output}, {views.size} projections")
 
 
 @click.command()
 @volume_argument
 @click.option("-o", "--output", metavar="PATH", type=_NEW, required=True,
-              help=f"Its suffix names the format: {', '.join(_MESHES)}.")  # fmt: skip
-@click.option("--level", type=float, help="Value at the surface. Default: half-way between air and matter.")
+              help=f"File to write; its suffix chooses the format: {', '.join(_MESHES)}.")  # fmt: skip
+@click.option(
+    "--level",
+    type=float,
+    help="Value at the surface, in the unit of VOLUME. Default: half-way between air and material.",
+)
 @json_option
 def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> None:
-    """Write the surface of a volume as a watertight mesh, in its unit of length (mm if the voxel size is known).
+    """Write the surface of a volume as a watertight mesh.
 
-    Matter that leaves the volume is closed at its faces. Finer: of `beamline voxelise` with smaller voxels.
+    Lengths are in the unit of the volume (mm if the voxel size is known). Where material reaches a face of the volume,
+    the surface is closed there. For a finer mesh use a volume of `beamline voxelise` with smaller voxels.
+
+    Example: beamline surface recon.h5 -o sample.stl
     """
     import meshio  # type: ignore[import-untyped]
 
@@ -126,7 +149,7 @@ def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> N
     from splatline_models.made import surface as surface_of
 
     if output.suffix.lower() not in _MESHES:
-        raise click.UsageError(f"-o {output}: expected a suffix of {', '.join(_MESHES)}.")
+        raise click.UsageError(f"-o {output}: expected one of the suffixes {', '.join(_MESHES)}.")
     with answering(as_json) as answer, opened_volume(volume) as record:
         refuse_existing(output)
         data = np.asarray(record.volume.data, np.float32)

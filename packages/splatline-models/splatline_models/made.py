@@ -1,4 +1,4 @@
-"""Voxels of any grid and views of the Gaussians behind a volume, and the surface of a volume."""
+"""Computes voxels and projections from a fit's Gaussians, and the surface mesh of a volume."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from recon import Grid, Volume, project, voxelize
 from recon.post import clusters
 
 F32 = NDArray[np.float32]
-_SLICES = 16  # made at a time
-_RANGE = 0.5, 99.5  # percentiles at which values are cut: a speck of metal is not the matter
-_APART = 5e-4  # least distance of a voxel from the level, over the largest: no vertex falls on a corner of the lattice
+_SLICES = 16  # computed at a time
+_RANGE = 0.5, 99.5  # percentiles at which values are cut, so that a speck of metal does not count as the material
+_APART = 5e-4  # least distance of a voxel from the level, over the largest: keeps vertices off the corners
 
 
 def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ...] | None) -> Grid:
-    """A grid of cubes of edge `voxel` in a box ((z0, z1), (y0, y1), (x0, x1)); None: those of `grid`.
+    """A grid of cubes of edge `voxel` in a box ((z0, z1), (y0, y1), (x0, x1)); None: as in `grid`.
 
     Raises:
-        ValueError: the box holds no voxel.
+        ValueError: the box is smaller than a voxel.
     """
     edge = grid.voxel_size if voxel is None else voxel
     if box is None:
@@ -35,13 +35,13 @@ def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ..
         box = ((z0, z1), (y0, y1), (x0, x1))
     nz, ny, nx = (round((high - low) / edge) for low, high in box)
     if min(nz, ny, nx) < 1:
-        raise ValueError(f"a box of {box} holds no voxel of {edge:g}")
+        raise ValueError(f"the box {box} is smaller than a voxel of {edge:g}")
     z, y, x = ((low + high) / 2 for low, high in box)
     return Grid((nz, ny, nx), edge, (z, y, x))
 
 
 def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Volume:
-    """Voxelise the model on a grid, sixteen slices at a time; `count` gets (slices done, all slices)."""
+    """Voxelise the model on a grid, sixteen slices at a time. `count` is called with (slices done, all slices)."""
     data = np.empty(grid.shape, np.float32)
     for first in range(0, grid.shape[0], _SLICES):
         part = slice(first, min(first + _SLICES, grid.shape[0]))
@@ -54,13 +54,16 @@ def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Vo
 def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Callable[[int, int], None]) -> None:
     """Write line integrals of the model at `angles` [view] in radians as Data Exchange, which every command reads.
 
-    The views are straight, in their place: the poses of the views that were fitted are those of their own angles.
+    The projections have no tilt and no shift, because the fitted poses belong to the fitted angles.
 
     Raises:
-        DataError: the model is of a cone, which Data Exchange does not state; `path` exists, or the disk refuses.
+        DataError: the model is of a cone beam, which Data Exchange cannot state; `path` exists; or the disk does not
+            take the file.
     """
     if model.geometry.is_cone:
-        raise DataError(f"{path}: views of a cone are not written: Data Exchange does not state it.")
+        raise DataError(
+            f"{path} cannot be written: the fit is of a cone beam, and Data Exchange cannot state a cone beam."
+        )
     geometry = replace(model.geometry.select([0]).straightened(), shifts=np.zeros((1, 2))).at(angles)
     with atomic_file(path) as partial, created(partial) as file:
         shape = (angles.size, *geometry.detector_shape)
@@ -68,7 +71,7 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
         data.attrs["units"] = "line_integrals"
         file["exchange/theta"] = np.degrees(angles)
         file["exchange/theta"].attrs["units"] = "deg"
-        file["exchange/title"] = f"views of the Gaussians behind {model.record.title}"
+        file["exchange/title"] = f"projections of the Gaussians of {model.record.title}"
         if model.record.length_unit == "mm":
             file.attrs["pixel_size_mm"] = geometry.pixel_pitch
         for view in range(angles.size):
@@ -82,7 +85,7 @@ class Mesh:
 
     Attributes:
         vertices: float32 [n, 3], (x, y, z) in the unit of the grid.
-        faces: int32 [m, 3], numbers of vertices, anticlockwise for one who looks from air at matter.
+        faces: int32 [m, 3], indices of vertices, anticlockwise as seen from the air.
     """
 
     vertices: F32
@@ -90,33 +93,33 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Volume of the matter inside: a sixth of Σ a · (b x c) over the triangles (divergence theorem)."""
+        """Volume inside the surface: a sixth of Σ a · (b x c) over the triangles (divergence theorem)."""
         a, b, c = np.moveaxis((self.vertices - self.vertices.mean(axis=0))[self.faces], 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c), dtype=np.float64)) / 6
 
     @property
     def euler(self) -> int:
-        """Vertices - edges + faces: 2 for each closed shell, less 2 for each of its handles."""
+        """Euler number, vertices - edges + faces: 2 for each closed shell, minus 2 for each of its handles."""
         return len(self.vertices) - len(self.faces) // 2
 
 
 def half_way(data: F32) -> float:
-    """The level half-way between air and matter (ISO 50 % rule): between the medians of two clusters by k-means.
+    """The level half-way between air and material (ISO 50 % rule): between the medians of two clusters (k-means).
 
     Raises:
-        ValueError: all values are one.
+        ValueError: all values are equal.
     """
     sample = data.ravel()[:: max(1, data.size // 2**20)]
     cut = np.clip(sample, *np.percentile(sample, _RANGE))
     sample = cut if np.ptp(cut) else data.ravel()
     if not np.ptp(sample):
-        raise ValueError("all values are one, so that there is no level between air and matter")
+        raise ValueError("all values are equal, so there is no level between air and material")
     dense = sample > clusters(sample, 2).threshold
     return float(np.median(sample[dense]) + np.median(sample[~dense])) / 2
 
 
 def surface(data: F32, grid: Grid, level: float) -> Mesh:
-    """The surface of the matter above a level (Lewiner et al. 2003), closed at the faces of the box.
+    """The surface of the material above a level (Lewiner et al. 2003), closed at the faces of the box.
 
     Raises:
         ValueError: no voxel is above the level, or some are not finite.
@@ -124,11 +127,11 @@ def surface(data: F32, grid: Grid, level: float) -> Mesh:
     if not np.isfinite(data).all():
         raise ValueError("some values are not finite")
     if not (data > level).any():
-        raise ValueError(f"no surface: no value lies above the level {level:.4g}")
+        raise ValueError(f"there is no surface, because no value is above the level {level:.4g}")
     block = np.pad(data - np.float32(level), 1, mode="edge")
     for axis in range(3):
         rim = np.moveaxis(block, axis, 0)
-        rim[[0, -1]] = -np.abs(rim[[0, -1]])  # matter ends at the face
+        rim[[0, -1]] = -np.abs(rim[[0, -1]])  # the material ends at the face
     block = np.copysign(np.maximum(np.abs(block), _APART * np.abs(block).max()), block)
     at, faces, _, _ = marching_cubes(block, 0.0)
     vertices = (at[:, ::-1] - 1) * grid.spacing[::-1] + np.asarray(grid.first[::-1])

@@ -85,10 +85,10 @@ def test_views_of_a_model_of_displaced_views_are_in_their_place(folder: Path) ->
 REFUSED = [
     (("voxelise", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
     (("render", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
-    (("render", "f.h5", "-o", "x.tif"), 2, "views are HDF5"),
-    (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "names no angles"),
-    (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "names no angles"),
-    (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "is not a box"),
+    (("render", "f.h5", "-o", "x.tif"), 2, "projections are written as HDF5"),
+    (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "expected angles FIRST:END:STEP"),
+    (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "expected angles FIRST:END:STEP"),
+    (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "expected a box Z0:Z1"),
 ]
 
 
@@ -136,7 +136,7 @@ def test_a_mesh_is_the_closed_ball(ball: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize(
     ("options", "code", "said"),
-    [(("--level", "7"), 5, "no value lies above the level 7"), (("-o", "x.tif"), 2, "expected a suffix of .stl")],
+    [(("--level", "7"), 5, "no value is above the level 7"), (("-o", "x.tif"), 2, "expected one of the suffixes .stl")],
 )
 def test_what_has_no_surface_is_refused_and_nothing_is_left(
     ball: Path, options: tuple[str, ...], code: int, said: str

@@ -1,4 +1,4 @@
-"""A round trip: a sphere comes back as a mesh from its scan."""
+"""Round trip: the mesh from the scan of a sphere is that sphere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Neural fields: a volume as a network of the coordinates, fitted to line integrals along sampled rays."""
+"""Neural fields: a network computes the density at a point, and is fitted to line integrals along sampled rays."""
 
 from splatline_neural.methods import NAF, IntraTomo, SaxNerf
 

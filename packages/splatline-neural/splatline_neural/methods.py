@@ -1,10 +1,14 @@
-"""NAF, IntraTomo and SaxNerf: neural fields as methods, with the settings that their user chooses.
+"""NAF, IntraTomo and SaxNerf: neural fields as methods, with the settings that a user can choose.
 
-They differ in the network and in the rays of a step; `train` fits all of them. Published: 150 000 steps of a view with
-50 views, at a rate of 0.001. Here: fewer at a higher rate, for a CPU. Three more departures: a hash grid
-ends where its cubes are a voxel (published: 16 levels, most of them finer than a voxel of 256³). Steps take any ray
-that has a weight (published: pixels above zero; what only rays through air meet is then undetermined).
-The density begins at the mean of the box (published: at half of the highest, where a high rate ends at zero).
+The methods differ in the network and in the rays of a step; `fit_field` fits all of them. Four things differ from the
+published methods:
+
+- Fewer steps at a higher rate, for a CPU. Published: 150 000 steps of one projection, 50 projections, rate 0.001.
+- The hash grid ends when its cubes are a voxel. Published: 16 levels, most of them finer than a voxel of 256³.
+- Steps use any ray that has a weight. Published: pixels above zero, so that points that only rays through air meet are
+  undetermined.
+- The density begins at the mean of the box. Published: at half of the highest density, from which a high rate ends at
+  zero.
 """
 
 from __future__ import annotations
@@ -28,11 +32,11 @@ from recon.splatting.initialise import first_volume
 from recon.voxels.voxel_problem import density_unit
 from splatline_neural.networks import F32, Field, HashGrid, Waves, drawn, rays_of
 
-CHUNK = 2**15  # Samples that one pass through the network takes
-_FLOATS = 24  # of a sample and a number of its layers: activations and their slopes
-_SOME = 256  # rays of a view that tell the mean density
-_DROP, _DROP_AT = 0.1, 0.5  # factor of the rate, and share of the run from which it holds
-_TOP = 0.98  # share of the highest density that counts as reached
+CHUNK = 2**15  # samples in one pass through the network
+_FLOATS = 24  # floats for each sample and number of a layer: activations and their gradients
+_SOME = 256  # rays of a projection from which the mean density is estimated
+_DROP, _DROP_AT = 0.1, 0.5  # factor of the rate, and fraction of the run after which it applies
+_TOP = 0.98  # the highest density counts as reached from this fraction on
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,15 @@ class FieldMethod(Iterative):
     """Settings that all neural fields share.
 
     Attributes:
-        steps: of one view each.
-        seconds: of the whole run, from the call to the last step; steps end it, too.
-        allow_negative: density without a limit to either side, in place of a sigmoid.
-        rays: of a step, drawn at random among those of its view.
-        samples: along a ray, 2 or more, one at random in each of as many equal parts. None: five for four voxels of the
-            longest edge, as published.
-        rate: of Adam; a tenth of it from half of the steps on.
-        highest: density, in density units (the 99.5th percentile of a first FBP).
-        width: numbers of a hidden layer.
+        steps: number of steps; each uses one projection.
+        seconds: time limit from the call to the last step; `steps` ends the run, too.
+        allow_negative: density without limits, in place of a sigmoid.
+        rays: number of rays in a step, drawn at random from its projection.
+        samples: number of samples along a ray, 2 or more; the ray is divided into as many equal parts with a random
+            point in each. None: five for every four voxels of the longest edge, as published.
+        rate: learning rate of Adam; a tenth of it after half of the steps.
+        highest: highest density, in density units (the 99.5th percentile of a first FBP).
+        width: size of a hidden layer.
     """
 
     takes: ClassVar[frozenset[str]] = frozenset({"device"})
@@ -73,11 +77,11 @@ class FieldMethod(Iterative):
 
     @abstractmethod
     def network(self, across: int) -> Field:
-        """The network for a box of so many voxels along its longest edge, without trained values."""
+        """The untrained network for a box with `across` voxels along its longest edge."""
 
     @property
     def limit(self) -> float | None:
-        """The highest density, or None."""
+        """The highest density; None: no limit."""
         return None if self.allow_negative else self.highest
 
     def samples_of(self, across: int) -> int:
@@ -86,14 +90,14 @@ class FieldMethod(Iterative):
 
     @property
     def windows(self) -> tuple[int, int]:
-        """Windows of rays of a step beside `rays`, and their edge in pixels."""
+        """Number of windows of rays in a step, in addition to `rays`, and their edge in pixels."""
         return 0, 0
 
     def toy(self) -> Self:
         return replace(self, steps=2, seconds=None, rays=min(self.rays, 16))
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for a share of a volume: with its share of the seconds."""
+        """The method for a part of a volume, with its part of the time limit."""
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
@@ -106,7 +110,8 @@ class FieldMethod(Iterative):
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Line integrals [view, row, col] in widest edges of the box times density units, and weights of about one."""
+    """Line integrals [view, row, col], in units of the box's widest edge times the density unit; weights of about
+    one."""
 
     data: F32
     weights: F32 | None
@@ -117,31 +122,34 @@ class _Views:
         return np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
 
     def mean_density(self) -> float:
-        """Mean density in the box, from some rays of each view."""
+        """Mean density in the box, from some rays of each projection."""
         pixels = np.arange(0, self.data[0].size, max(1, self.data[0].size // _SOME))
         lengths = sum(float(rays_of(self.geometry, v, pixels, self.grid).lengths.sum()) for v in range(len(self.data)))
         return float(self.data.reshape(len(self.data), -1)[:, pixels].sum()) / max(lengths, 1e-9)
 
 
 def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
-    """Fit the field to the views, and sample its density at the centres of voxels.
+    """Fit the field to the projections, and sample its density at the centres of voxels.
 
     Raises:
-        ValueError: views without matter.
+        ValueError: the projections show no sample.
 
     Warns:
-        UserWarning: rays have a width, which a field does not know; or densities reach the highest one.
+        UserWarning: rays have a width, which the field ignores; or densities reach the highest density.
     """
     begin, geometry = control.now(), problem.geometry
     if geometry.width:
-        warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
+        warnings.warn(
+            f"the width of rays ({geometry.width}) is ignored, because a neural field supports only thin rays",
+            stacklevel=2,
+        )
     used = np.setdiff1d(np.arange(geometry.n_views), np.asarray(problem.use.held_out, int))
     given = problem.views.masked()
     data, weights = given.data, given.weights
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
     if unit <= 0 or not (data[used] > 0).any():
-        raise ValueError("the views show no absorbing matter. A field needs views of a sample")
+        raise ValueError("the projections show no absorbing sample, but a field needs projections of a sample")
     edge = float(np.ptp(grid.edges, axis=0).max())
     if weights is not None:
         weights = weights / np.float32(weights[weights > 0].mean(dtype=np.float64))
@@ -150,8 +158,8 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)
     if not method.allow_negative and volume.data.max(initial=0) > _TOP * method.highest * unit:
         warnings.warn(
-            f"densities reach the highest one of the field, {method.highest * unit:.4g}: give a larger `highest` than "
-            f"{method.highest:g}",
+            f"give a larger `highest` than {method.highest:g}: densities reach the highest density of the field, "
+            f"{method.highest * unit:.4g}",
             stacklevel=2,
         )
     record = {**asdict(method), "steps": fit.step, "planned_steps": method.steps, "seed": problem.seed}
@@ -160,7 +168,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
 
 
 class _Fit:
-    """The state of a fit: network, optimiser, random generator, record."""
+    """A running fit: network, optimiser, random generator, record."""
 
     def __init__(
         self, method: FieldMethod, views: _Views, problem: ReconProblem, begin: float, control: RunControl
@@ -196,7 +204,7 @@ class _Fit:
         self._report(len(used))
 
     def _advance(self, view: int, rate: float) -> None:
-        """One step of Adam on the squared differences of rays of one view."""
+        """One step of Adam on the squared differences of rays of one projection."""
         method, count = self.method, max(1, CHUNK // self.samples)
         pixels = drawn(self.rng, self.views.usable(view), method.rays, *method.windows)
         values = self.views.data[view].reshape(-1)[pixels]
@@ -229,7 +237,7 @@ class _Fit:
 
     @torch.no_grad()
     def volume(self, grid: Grid) -> F32:
-        """Density [z, y, x] in density units at the centres of voxels, whose lines along x are lines of the network."""
+        """Density [z, y, x] in density units at the centres of voxels. Lines along x are the lines of the network."""
         low, high = self.views.grid.edges
         edge = (high - low).max()
         z, y, x = (
@@ -245,7 +253,7 @@ class _Fit:
         return out.reshape(grid.shape)
 
 
-_COARSEST = 16  # cubes an edge of the first level
+_COARSEST = 16  # cubes along an edge in the first level
 
 
 @dataclass(frozen=True)
@@ -253,8 +261,10 @@ class NAF(FieldMethod):
     """Neural attenuation field: a hash grid and a small perceptron (Zha et al. 2022, MICCAI).
 
     Attributes:
-        levels: of the grid, 1 to 16 from 16 cubes an edge, each with twice as many; None: until a cube is a voxel.
-        log2_table: logarithm of the most entries of a level, 8 to 24.
+        levels: number of levels of the grid, 1 to 16. The first has 16 cubes along an edge, each next one twice as
+            many.
+            None: until a cube is a voxel.
+        log2_table: base-2 logarithm of the largest number of entries in a level, 8 to 24.
     """
 
     name: ClassVar[str] = "naf"
@@ -275,7 +285,7 @@ class SaxNerf(NAF):
     """SAX-NeRF: as NAF, with attention along line segments, and windows of rays (Cai et al. 2024, CVPR).
 
     Attributes:
-        window_count, window_side: squares of pixels of each step, beside `rays` outside of them.
+        window_count, window_side: number and side of the squares of pixels in a step, in addition to `rays` outside.
     """
 
     name: ClassVar[str] = "sax-nerf"
@@ -292,12 +302,12 @@ class SaxNerf(NAF):
 
 @dataclass(frozen=True)
 class IntraTomo(FieldMethod):
-    """A field of Fourier features, the class of IntraTomo's sinogram prediction (Zang et al. 2021, ICCV).
+    """A field of Fourier features, the kind of network in IntraTomo's sinogram prediction (Zang et al. 2021, ICCV).
 
-    Its later refinement is left out. No code of the authors is public; width and bands are our own.
+    The later refinement of IntraTomo is left out. No code of the authors is public; width and bands are our choice.
 
     Attributes:
-        bands: octaves of the features, from one wave an edge of the box.
+        bands: number of frequencies, each twice the last; the first is one wave along an edge of the box.
     """
 
     name: ClassVar[str] = "intratomo"

@@ -1,6 +1,7 @@
-"""Networks from points to density: encodings of a point, a small perceptron, attention along line segments.
+"""Networks that compute the density at a point: encodings, a small perceptron, attention along line segments.
 
-All take points [line, sample, 3] in 0..1 of the field's box and give density [line, sample] in the field's unit.
+All take points [line, sample, 3], 0 to 1 in the box of the field, and return densities [line, sample] in the unit of
+the field.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from recon import Geometry, Grid
 F32 = NDArray[np.float32]
 Activation = Callable[[Tensor], Tensor]
 _PRIMES = 19349663, 83492791
-_SMALL = 1e-4  # first features of a hash grid
-_LEAST = 1e-3  # of the highest density, at the start
-_HEADS, _HEAD, _SEGMENT, _WIDER = 8, 4, 2, 4  # heads, numbers of each, samples of a segment, width of its perceptron
+_SMALL = 1e-4  # largest initial features of a hash grid
+_LEAST = 1e-3  # smallest initial density, as a fraction of the highest
+_HEADS, _HEAD, _SEGMENT, _WIDER = 8, 4, 2, 4  # heads, size of a head, samples of a segment, factor for its perceptron
 
 
 class HashGrid(nn.Module):
-    """Multiresolution hash grid (Müller et al. 2022): `levels` of 16, 32, ... cubes an edge, two features each.
+    """Multiresolution hash grid (Müller et al. 2022): `levels` with 16, 32, ... cubes along an edge, two features each.
 
-    Level l has cubes of 1 / (sides[l] - 2) of the unit box, and features at their corners, which are interpolated
-    trilinearly. A level has at most 2^log2_table entries; corners beyond share them by a hash (eq. 4).
+    Level l has cubes of 1 / (sides[l] - 2) of the unit box. Features are at their corners and are interpolated
+    trilinearly. A level has at most 2^log2_table entries; if it has more corners, they share entries by a hash (eq. 4).
     """
 
     def __init__(self, levels: int, log2_table: int, features: int = 2, coarsest: int = 16) -> None:
@@ -59,7 +60,8 @@ class HashGrid(nn.Module):
 
 
 class Waves(nn.Module):
-    """Fourier features: a point's coordinates, and their sines and cosines of `bands` octaves from one wave an edge."""
+    """Fourier features: the coordinates of a point, and their sines and cosines at `bands` frequencies. The first
+    frequency is one wave along an edge, each next one is twice as high."""
 
     def __init__(self, bands: int) -> None:
         super().__init__()
@@ -99,11 +101,11 @@ class LineAttention(nn.Module):
 
 
 class Field(nn.Module):
-    """Encoding, four linear layers with the encoding joined again before the third one, density.
+    """Encoding, four linear layers (the encoding is added again before the third), density.
 
     Args:
-        attention: line segments attend after the second layer.
-        highest: density is this times a sigmoid; None: no limit to either side.
+        attention: attention along line segments after the second layer.
+        highest: the density is this times a sigmoid; None: no limits.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class Field(nn.Module):
         return density[:, : points.shape[1]]
 
     def start(self, rng: torch.Generator, mean: float) -> None:
-        """First values, all from `rng`, but for the density: about `mean`, or a sigmoid would soon be flat."""
+        """Set initial values from `rng`. The density begins at about `mean`, because a sigmoid would soon be flat."""
         for part in self.modules():
             if isinstance(part, nn.Linear):
                 for values in part.parameters(recurse=False):
@@ -146,18 +148,18 @@ Places = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Parts of rays within a box whose widest edge is one.
+    """The parts of rays within a box whose widest edge is 1.
 
     Attributes:
-        start: float32 [n, 3], (x, y, z) where the ray enters.
-        path: float32 [n, 3] to where it leaves; zero for a ray that misses the box.
+        start: float32 [n, 3], point (x, y, z) at which the ray enters.
+        path: float32 [n, 3], vector to the point at which it leaves; zero for a ray that misses the box.
     """
 
     start: F32
     path: F32
 
     def samples(self, places: F32) -> F32:
-        """Points [n, m, 3] at shares `places` [n, m] or [m] of the paths, within the box."""
+        """Points [n, m, 3] at the fractions `places` [n, m] or [m] of the paths, within the box."""
         return np.clip(self.start[:, None] + places[..., None] * self.path[:, None], 0, 1)
 
     @property
@@ -166,7 +168,7 @@ class Rays:
 
 
 def rays_of(geometry: Geometry, view: int, pixels: Places, grid: Grid) -> Rays:
-    """Rays to pixels of a view, counted along its rows, through the box of `grid`."""
+    """Rays through the box of `grid` to pixels of a projection; pixels are counted along rows."""
     rows, cols = np.divmod(pixels, geometry.detector_shape[1])
     along_col, along_row, beam = geometry.axes(view)
     col, row = geometry.origin(view)
@@ -181,7 +183,7 @@ def rays_of(geometry: Geometry, view: int, pixels: Places, grid: Grid) -> Rays:
     low, high = grid.edges
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack(((low - start) / run, (high - start) / run))
-    # A ray along a side of the box lies between its ends, or misses them.
+    # A ray parallel to a side of the box is between its ends, or misses them.
     flat = np.broadcast_to(run == 0, ends.shape)
     inside = np.broadcast_to((start >= low) & (start <= high), ends.shape)
     ends = np.where(flat, np.where(inside, np.array([-np.inf, np.inf])[:, None, None], np.inf), ends)
@@ -193,16 +195,17 @@ def rays_of(geometry: Geometry, view: int, pixels: Places, grid: Grid) -> Rays:
 
 
 def _turned(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors (x, y, z), each turned about z by its angle."""
+    """Vectors (x, y, z), each rotated about z by its angle."""
     c, s, (x, y, z) = np.cos(angles), np.sin(angles), vectors.T
     return np.stack((c * x - s * y, s * x + c * y, z), 1)
 
 
 def drawn(rng: np.random.Generator, candidates: NDArray[np.bool_], count: int, windows: int, side: int) -> Places:
-    """Pixels of a view for one step: `windows` squares of `side` pixels, and `count` candidates outside of them.
+    """Pixels of a projection for one step: `windows` squares of `side` pixels, and `count` candidates outside of them.
 
     Args:
-        candidates: [row, col]; windows fall anywhere. Without windows at most so many pixels as there are candidates.
+        candidates: [row, col], for pixels outside of windows; windows may be anywhere. There are at most as many pixels
+            outside as candidates.
     """
     (rows, cols), places = candidates.shape, []
     free = candidates

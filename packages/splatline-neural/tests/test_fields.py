@@ -1,4 +1,4 @@
-"""Neural fields as methods: what a fit finds, what ends it, what it refuses."""
+"""Neural fields as methods: what a fit finds, what ends it, and its errors."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_time_ends_a_fit() -> None:
 
 def test_what_a_field_cannot_do_is_refused() -> None:
     _, data = box(VIEWS["parallel"])
-    with pytest.raises(ValueError, match="no absorbing matter"):
+    with pytest.raises(ValueError, match="no absorbing sample"):
         recon.reconstruct(np.zeros_like(data), VIEWS["parallel"], NAF())
     with pytest.raises(ValueError, match=r"'naf' has no option resume"):
         recon.reconstruct(data, VIEWS["parallel"], NAF(), control=RunControl(resume={}))
@@ -101,7 +101,7 @@ def test_what_a_field_cannot_do_is_refused() -> None:
 
 def test_a_width_of_rays_and_a_density_beyond_the_highest_are_told() -> None:
     _, data = box(VIEWS["parallel"])
-    with pytest.warns(UserWarning, match="rays without a width"):
+    with pytest.warns(UserWarning, match="supports only thin rays"):
         recon.reconstruct(data, VIEWS["parallel"].seen_with(RayWidth(1.0)), replace(SMALL["naf"], steps=1))
     with pytest.warns(UserWarning, match=r"give a larger `highest` than 0\.3"):
         recon.reconstruct(data, VIEWS["parallel"], replace(SMALL["naf"], highest=0.3))

@@ -1,4 +1,4 @@
-"""Rays of a field meet the box where the projector's rays do, for any geometry."""
+"""The rays of a field meet the box at the same points as the projector's rays, for any geometry."""
 
 from __future__ import annotations
 

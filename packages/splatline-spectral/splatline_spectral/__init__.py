@@ -1,1 +1,1 @@
-"""Absorption over energies: edges, the energy of a material's highest contrast, and volumes of materials."""
+"""Scans at several energies: absorption edges, the energy of the best contrast, and a volume for each material."""

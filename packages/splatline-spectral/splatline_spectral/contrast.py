@@ -1,4 +1,5 @@
-"""Contrast: of a region against its surroundings in a radiograph, its curve over energies, and the edge in it."""
+"""Contrast between a region of a radiograph and its surroundings, its curve over energies, and the edge in the
+curve."""
 
 from __future__ import annotations
 
@@ -14,12 +15,12 @@ from scipy.special import stdtr
 Reals = NDArray[np.float64]
 
 NEARLY_BEST = 0.95
-WINDOW = 7  # energies
-ENOUGH = 50  # pixels inside the rim for an estimate of the noise; with fewer the rim is used, too
+WINDOW = 7  # energies over which the noise is smoothed
+ENOUGH = 50  # pixels inside the rim to estimate the noise; with fewer, the rim is used, too
 FEWEST = 16  # pixels for any estimate of the noise
 DARK = 0.01  # largest share of dark pixels in a region
-KNOWN = 0.5  # least share of pixels with a value in a region
-_LIT, _LIT_SHARE = 0.5, 1e-3  # light: counts above the dark level, or share of the flat where that is less
+KNOWN = 0.5  # smallest share of pixels with a value in a region
+_LIT, _LIT_SHARE = 0.5, 1e-3  # least intensity: counts above the dark level, or fraction of the flat if that is less
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +28,9 @@ class ContrastRegions:
     """The pixels that are compared.
 
     Attributes:
-        inside: bool [row, col], of the material.
-        around: bool [row, col], of its surroundings, disjoint from `inside`; None: no comparison.
-        thickness: mm of the material, mean over `inside`; None: not known.
+        inside: bool [row, col], pixels of the material.
+        around: bool [row, col], pixels of its surroundings, disjoint from `inside`; None: no comparison.
+        thickness: mean thickness of the material over `inside` in mm; None: not known.
     """
 
     inside: NDArray[np.bool_]
@@ -49,9 +50,8 @@ class Series:
     Attributes:
         title: what is scanned.
         n: number of energies.
-        frames: (keV, line integrals [row, col]) of each energy, in any order; +inf where a pixel is dark, NaN
-            without a value.
-        regions: pixels that are compared.
+        frames: (keV, line integrals [row, col]) at each energy, in any order. +inf: the pixel is dark. NaN: no value.
+        regions: the pixels that are compared.
         elements: atomic numbers of the material; empty: not known.
     """
 
@@ -68,12 +68,13 @@ class XafsCurve:
 
     Attributes:
         energies: keV, rising, [n].
-        absorption: [n], of the region minus that of its surroundings, in `unit`.
-        contrast: the same as a line integral, [n]; None where only the absorption is known.
-        noise: rms noise of the difference of a pixel inside and one around, as a line integral, [n]; None likewise, and
-            where the regions are too small.
-        unit: "1/mm" where the thickness is known, else "line integral" or that of the file.
-        left_out: keV, rising, energies at which too little light was transmitted or too few pixels had a value.
+        absorption: [n], absorption of the region minus that of its surroundings, in `unit`.
+        contrast: [n], the same as a line integral; None: only the absorption is known.
+        noise: [n], rms noise of the difference between a pixel inside and a pixel around, as a line integral; None:
+            only
+            the absorption is known, or the regions are too small.
+        unit: "1/mm" if the thickness is known, else "line integral" or that of the file.
+        left_out: keV, rising, energies with too little transmitted intensity or too few pixels with a value.
     """
 
     energies: Reals
@@ -85,10 +86,10 @@ class XafsCurve:
 
     @property
     def contrast_to_noise(self) -> Reals | None:
-        """|contrast| over noise, [n]; None where either is unknown or the noise is 0.
+        """|contrast| divided by noise, [n]; None if either is unknown or the noise is 0.
 
-        Noise of a few hundred pixels is known to 5 %, and differs as much between energies: it is smoothed
-        over neighbouring energies.
+        The noise from a few hundred pixels is uncertain by 5 %, and scatters by that between energies. So it is
+        smoothed over neighbouring energies.
         """
         if self.contrast is None or self.noise is None or not (self.noise > 0).all():
             return None
@@ -97,13 +98,14 @@ class XafsCurve:
 
     @property
     def best(self) -> int:
-        """Index of the energy of the highest contrast-to-noise; of the highest absorption where noise is unknown."""
+        """Index of the energy with the highest contrast-to-noise; with the highest absorption if the noise is
+        unknown."""
         by = self.contrast_to_noise
         return int(np.argmax(np.abs(self.absorption) if by is None else by))
 
     @property
     def nearly_best(self) -> tuple[float, float]:
-        """Range in keV around the best energy with at least 95 % of its contrast-to-noise."""
+        """Range in keV around the best energy with at least 95 % of the best contrast-to-noise."""
         by = self.contrast_to_noise
         values = np.abs(self.absorption) if by is None else by
         good = values >= NEARLY_BEST * values[self.best]
@@ -116,8 +118,8 @@ class XafsCurve:
 
 
 def line_integrals(signal: Reals, flat: Reals) -> Reals:
-    """-log(signal / flat), [row, col], of counts above the dark level. +inf where no light was transmitted, NaN where
-    the flat is dark too, or where one of them is not finite."""
+    """-log(signal / flat), [row, col], from counts above the dark level. +inf: nothing was transmitted. NaN: the flat
+    is dark, too, or a value is not finite."""
     lit = np.minimum(_LIT, _LIT_SHARE * flat)
     out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
     known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)
@@ -127,11 +129,11 @@ def line_integrals(signal: Reals, flat: Reals) -> Reals:
 
 
 def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
-    """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
+    """Contrast in a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
     pixels).
 
-    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf), or less than half of them
-    have a value. The mean of the others is not the region's then, and pixels without light have no noise.
+    Both are NaN if a region cannot be used: more than 1 % of its pixels are dark (+inf), or fewer than half of them
+    have a value. In this case the mean of the other pixels is not that of the region, and dark pixels have no noise.
     """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:
@@ -141,7 +143,7 @@ def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
 
 
 def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: ContrastRegions) -> XafsCurve:
-    """The curve of points from `contrast_of`, sorted by energy; unknown points are left out."""
+    """The curve through points from `contrast_of`, sorted by energy; unknown points are left out."""
     order = np.argsort(energies, kind="stable")
     contrast, noise = np.array(points, dtype=np.float64).reshape(-1, 2).T[:, order]
     known, e = np.isfinite(contrast), energies[order]
@@ -152,14 +154,14 @@ def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Co
 
 
 def _level(frame: Reals, mask: NDArray[np.bool_]) -> tuple[float, float]:
-    """Mean over the mask, and the noise of a pixel of it.
+    """Mean over the mask, and the noise of one of its pixels.
 
     The noise is the response of a filter that removes planes and products of lines (Immerkaer, Comput. Vis. Image
-    Underst. 64, 300, 1996), scaled from its median over the pixels for a normal distribution, so that edges within the
-    region have little influence. The region's rim is excluded where enough pixels are within it.
+    Underst. 64, 300, 1996). It is computed from the median over the pixels, so that edges within the region have little
+    influence. The rim of the region is left out if enough pixels remain.
     """
     rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    # Only the region and its neighbouring pixels: frames may be far larger.
+    # Use only the region and its neighbouring pixels, because frames may be far larger.
     part = slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(cols[0] - 1, 0), cols[-1] + 2)
     frame, mask = frame[part], mask[part]
     values = frame[mask]
@@ -181,8 +183,8 @@ def _level(frame: Reals, mask: NDArray[np.bool_]) -> tuple[float, float]:
 
 
 def local_parabolas(x: Reals, y: Reals, window: int) -> tuple[Reals, Reals]:
-    """Value and slope at each x of the parabola through the nearest `window` points (for even spacing the filter of
-    Savitzky & Golay, Anal. Chem. 36, 1627, 1964); both [n], of at least `window` points."""
+    """Value and slope at each x of the parabola fitted to the nearest `window` points (for even spacing the filter of
+    Savitzky & Golay, Anal. Chem. 36, 1627, 1964). Both [n]; there must be at least `window` points."""
     values, slopes = np.empty_like(y), np.empty_like(y)
     for i in range(y.size):
         first = min(max(i - window // 2, 0), y.size - window)
@@ -191,31 +193,31 @@ def local_parabolas(x: Reals, y: Reals, window: int) -> tuple[Reals, Reals]:
     return values, slopes
 
 
-LEAST = 9  # Energies that a curve must have
-NARROW = 5  # points of a local parabola
-SURE = 5.0  # least ratio of the misfit of a smooth curve to the noise
-FALSE_ALARM = 1e-6  # probability for a curve without an edge, under normal noise of any size
-SMOOTH = 1e-3  # of the absorption: tolerated difference of a noiseless smooth curve from Victoreen's
+LEAST = 9  # fewest energies of a curve
+NARROW = 5  # points for a local parabola
+SURE = 5.0  # smallest ratio of the misfit of a smooth curve to the noise that shows an edge
+FALSE_ALARM = 1e-6  # probability of an edge in a curve without one, for normal noise of any size
+SMOOTH = 1e-3  # tolerated relative difference of a noise-free smooth curve from Victoreen's
 
 
 @dataclass(frozen=True)
 class AbsorptionEdge:
-    """Edge and white line of a curve."""
+    """Absorption edge and white line of a curve."""
 
     found: bool  # there is an edge within the range
     reason: str  # why no edge was found, as a sentence
-    energy: float | None  # keV of the steepest rise; None where no edge is found
+    energy: float | None  # keV of the steepest rise; None: no edge
     white_line: float | None  # keV of the maximum above the edge; None without a maximum within the range
     misfit: float  # rms difference from the best smooth curve, in units of the absorption
-    noise: float  # rms noise of the curve, likewise
+    noise: float  # rms noise of the curve, in units of the absorption
 
 
 def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
     """The edge of a curve.
 
-    A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise. There
-    is an edge where a step upwards at one of the energies improves the fit more than chance would in one of a million
-    such curves. The test is Student's t of the step, times the number of its possible places. There is also one where
+    A curve without an edge follows Victoreen, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise.
+    There is an edge if a step upwards at one of the energies improves the fit more than chance does in one of a million
+    such curves. The test is Student's t of the step, times the number of possible positions. There is also an edge if
     the curve differs from Victoreen's by five times its noise, estimated from second differences. The edge is the
     maximum of the slope near that step (of parabolas through five points). The white line is the maximum above it, if
     it exceeds the noise and the extrapolation of the curve's far end.
@@ -240,25 +242,25 @@ def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
 
     stands_out = chance < FALSE_ALARM or misfit > SURE * noise
     if not stands_out or misfit <= SMOOTH * float(np.abs(absorption).mean()):
-        return none("the curve is as smooth as one without an edge, to within its noise")
+        return none("within its noise the curve is as smooth as a curve without an edge")
     _, slope = local_parabolas(energies, absorption, NARROW)
     first = max(step - max(NARROW, energies.size // 10), 0)
     steepest = first + int(np.argmax(slope[first : step + max(NARROW, energies.size // 10)]))
     if slope[steepest] <= 0:
         return none("the absorption rises nowhere")
     if steepest < 2 or steepest > energies.size - 3:
-        return none("it is steepest at the end of the range; widen the range there")
+        return none("widen the range of energies: the curve is steepest at the end of the range")
     return AbsorptionEdge(
         True, "", _top(energies, slope, steepest, 1), _white_line(energies, absorption, steepest, noise), misfit, noise
     )
 
 
 def _step(rest: Reals, basis: Reals) -> tuple[int, float]:
-    """The step upwards that explains most of a residual: the index of the first energy above it, and the probability
-    (at most 1) that noise alone explains as much.
+    """The step upwards that explains most of a residual: the index of the first energy above the step, and the
+    probability (at most 1) that noise alone explains as much.
 
     Args:
-        rest: [n], residual after a projection on `basis`.
+        rest: [n], residual after the projection on `basis`.
         basis: orthonormal, [n, k].
     """
     at = np.arange(2, rest.size - 1)
@@ -277,7 +279,7 @@ def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> 
     far = energies > (energies[top] + energies[-1]) / 2
     if top > energies.size - 3 or far.sum() < 3:
         return None
-    # The far end as a + b E^-3: over a long range the top of a bare step is above the end, too.
+    # Continue the far end as a + b E^-3, because over a long range the top of a bare step is above the end, too.
     basis = _victoreen(energies)[:, :2]
     of_far = np.linalg.pinv(basis[far]).T @ basis[top]
     height = float(absorption[top] - of_far @ absorption[far])
@@ -287,7 +289,7 @@ def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> 
 
 
 def _noise(values: Reals) -> float:
-    """rms of white noise in smooth values: second differences of it have a variance of six."""
+    """rms of white noise in smooth values, from second differences, whose variance is six times that of the noise."""
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6))
 
 
@@ -298,7 +300,7 @@ def _victoreen(energies: Reals) -> Reals:
 
 
 def _top(energies: Reals, values: Reals, at: int, reach: int) -> float:
-    """Where the parabola through the points around a maximum is highest, within a step of it."""
+    """The energy at which the parabola through the points around a maximum is highest, within a step of the maximum."""
     part = slice(max(at - reach, 0), at + reach + 1)
     _, slope, bend = np.polynomial.polynomial.polyfit(energies[part] - energies[at], values[part], 2)
     low, high = energies[max(at - 1, 0)], energies[min(at + 1, energies.size - 1)]

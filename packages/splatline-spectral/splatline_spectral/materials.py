@@ -1,4 +1,4 @@
-"""`beamline materials`: a volume of each material, from scans at several energies."""
+"""`beamline materials`: computes a volume of each material from scans at several energies."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from beamline.core.files import refuse_existing, text_in
 from beamline.core.text import safe_name
 
 _TABLE = "a first line 'energy_kev,NAME,NAME,...', then a line of keV and 1/mm for each energy"
-_PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this share, if they are registered
-_ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
+_PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this fraction if the scans are registered
+_ARCS_ALIKE = 0.01  # the arcs of an exposure may differ by this fraction of the larger one
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Attenuation of materials.
+    """Attenuation of materials over energy.
 
     Attributes:
         energies: keV, [n], rising.
-        attenuation: 1/mm of the pure material, [n, material].
+        attenuation: [n, material], attenuation of the pure material in 1/mm.
     """
 
     path: Path
@@ -40,21 +40,21 @@ class Spectra:
     attenuation: NDArray[np.float64]
 
     def at(self, energy_kev: float | None, scan: Path) -> NDArray[np.float64]:
-        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError outside the table, or without energy."""
+        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError: no energy, or outside of the table."""
         if energy_kev is None or not self.energies[0] <= energy_kev <= self.energies[-1]:
             stated = "not stated" if energy_kev is None else f"{energy_kev:g} keV"
             raise ConfigError(
-                f"The energy of {scan} is {stated}; expected {self.energies[0]:g} to {self.energies[-1]:g} keV, as "
-                f"{self.path} has them. Nothing was written."
+                f"The energy of {scan} is {stated}; expected {self.energies[0]:g} to {self.energies[-1]:g} keV, the "
+                f"range of {self.path}. Nothing was written."
             )
         return np.array([np.interp(energy_kev, self.energies, column) for column in self.attenuation.T])
 
 
 def read_spectra(path: Path) -> Spectra:
-    """Read a CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
+    """Read a CSV table: the first line is `energy_kev` and the names of materials, the next lines are keV and 1/mm.
 
     Raises:
-        DataError: the file cannot be read, or is no such table.
+        DataError: the file cannot be read, or is not such a table.
     """
     try:
         head, *rest = (line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip())
@@ -62,36 +62,49 @@ def read_spectra(path: Path) -> Spectra:
         values = np.array([[float(cell) for _, cell in zip(head, line, strict=True)] for line in rest])
         values = values[np.argsort(values[:, 0])]
     except (OSError, csv.Error, ValueError, IndexError) as error:
-        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+        raise DataError(f"{path} cannot be read as a table of spectra ({error}). Expected {_TABLE}.") from error
     if head[0].strip() != "energy_kev" or not names or len({name.casefold() for name in names}) < len(names):
-        raise DataError(f"{path} begins {','.join(head)[:80]!r}. Expected {_TABLE}, with names that differ.")
+        raise DataError(f"{path} begins with {','.join(head)[:80]!r}. Expected {_TABLE}, with different names.")
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
-        raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
+        raise DataError(f"{path}: energies must differ, and all values must be finite and 0 or more.")
     if any(name != safe_name(name) for name in names):
-        raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
+        raise DataError(
+            f"{path}: names of materials become parts of file names and must be valid there; found "
+            f"{', '.join(map(repr, names))}."
+        )
     return Spectra(path, names, values[:, 0], values[:, 1:])
 
 
 @click.command()
 @click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--spectra", type=_FILE, required=True,
-              help="CSV table: energy_kev and names of materials in the first line, then keV and 1/mm.")  # fmt: skip
+              help="CSV table: first line energy_kev and names of materials, then keV and 1/mm.")  # fmt: skip
 @click.option("-o", "--output", metavar="PATH.h5", type=_FILE, required=True,
-              help="One file per material, with _NAME appended to this stem.")  # fmt: skip
+              help="Where to write: one file for each material, PATH_NAME.h5.")  # fmt: skip
 @click.option("--register", is_flag=True,
-              help="Find and correct the sample position and the magnification of each scan.")  # fmt: skip
+              help="Find and correct how the sample moved, and the magnification of each scan.")  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="Two materials that are two states of the same one: the share of the second is smooth.")  # fmt: skip
-@click.option("--axis", type=float, metavar="COL", help="Rotation axis. Default: that of the first scan.")
-@click.option("--rows", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Rows of the detector to use.")
-@click.option("--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Pixels joined each way.")
+              help="Two of the materials are two states of one; the fraction of the second is smooth.")  # fmt: skip
+@click.option(
+    "--axis", type=float, metavar="COL", help="Column of the rotation axis. Default: found in the first scan."
+)
+@click.option(
+    "--rows",
+    type=click.IntRange(0),
+    nargs=2,
+    metavar="FIRST END",
+    help="First detector row to use, and the one after the last. Default: all.",
+)
+@click.option("--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Average N x N pixels.")
 @json_option
 def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
-    """Fit the volume of each material to scans at several energies, all at once.
+    """Compute a volume of each material from scans at several energies. A voxel holds the fraction of the material.
 
-    Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
-    enough: all views together determine the materials. Views of different energies should have different angles. The
-    sample must not move between the scans, nor its magnification change, or --register finds how.
+    Each SCAN file must state its energy; you may give the folder of a series (`scan.energies`) in place of its scans.
+    Few projections at each energy are enough, because one fit uses all of them. Take different angles at different
+    energies. Give --register if the sample moved, or the magnification changed, between the scans.
+
+    Example: beamline materials E1.h5 E2.h5 --spectra mu.csv -o out.h5
     """
     import recon
     from beamline.api import Selection
@@ -114,7 +127,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: boo
             views = joined(scans, table, selection, values["register"], answer.warn)
             moves: Sequence[Any] = ()
             if values["register"]:
-                views, moves = recon.register_energies(views, answer.counting("registration"))
+                views, moves = recon.register_energies(views, answer.counting("registering the scans"))
             found = recon.fit_materials(views)
             if states:
                 found = recon.fit_share(views, found, (states[0], states[1]))
@@ -138,19 +151,21 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: boo
 
 
 def _move(move: Any) -> str:
-    """Where the sample stood in a scan."""
+    """How the sample was displaced in a scan, for the terminal."""
     at = ", ".join(f"{1e3 * getattr(move, axis):+.2f}" for axis in "xyz")
-    return f"displaced   {at} µm along x, y, z and {math.degrees(move.turn):+.3f}°; magnified {move.magnification:.4f}"
+    return (
+        f"displaced   {at} µm along x, y, z, turned {math.degrees(move.turn):+.3f}°, magnified {move.magnification:.4f}"
+    )
 
 
 def joined(
     scans: Sequence[Path], spectra: Spectra, selection: Any, registered: bool, warn: Callable[[str], None]
 ) -> Any:
-    """The corrected views of all scans as `recon.EnergyViews`; the axis of the first one is used for the others.
+    """The corrected projections of all scans as `recon.EnergyViews`. The axis of the first scan is used for all.
 
     Raises:
-        ConfigError: scans that do not fit together, or energies that are not in the table. DataError: a scan cannot be
-            read. ValueError: energies that do not tell the materials apart.
+        ConfigError: the scans do not fit together, or an energy is not in the table. DataError: a scan cannot be read.
+        ValueError: the energies do not distinguish the materials.
     """
     import recon
     from beamline.projections.prepare import prepare_projections
@@ -165,7 +180,7 @@ def joined(
             parts.append(prepare_projections(scan, selection, warn))
         selection = replace(selection, axis_col=parts[0].axis_col)
     if parts[0].length_unit != "mm":
-        raise ConfigError("The spectra are in 1/mm, and the scans state no pixel size. Nothing was written.")
+        raise ConfigError("The scans must state the pixel size, because the spectra are in 1/mm. Nothing was written.")
     first, weights = parts[0].geometry, [part.ray_weights() for part in parts]
     geometry = first
     for number, own in enumerate((part.geometry for part in parts[1:]), 2):
@@ -186,13 +201,14 @@ def joined(
 
 
 def _refuse_unlike(first: Any, own: Any, number: int, pixels: float) -> None:
-    """Refuse scans that differ in detector, beam, or the motion of the stage in an exposure."""
+    """Raise ConfigError if two scans differ in detector, beam, or the motion of the stage during an exposure."""
     alike = math.isclose(own.pixel_pitch, first.pixel_pitch, rel_tol=0 if own.is_cone else pixels)
     turns = ((first.width.arc, own.width.arc), (first.skew, own.skew))
     alike &= all(math.isclose(*turn, rel_tol=_ARCS_ALIKE) for turn in turns)
     if (own.detector_shape, own.sod, own.sdd) != (first.detector_shape, first.sod, first.sdd) or not alike:
         raise ConfigError(
-            f"Scan {number} does not fit scan 1: {own.detector_shape} pixels of {own.pixel_pitch:g} mm, an exposure of "
-            f"{math.degrees(own.width.arc):.3g}°, not {first.detector_shape} of {first.pixel_pitch:g}, "
-            f"{math.degrees(first.width.arc):.3g}°. Pixels that differ by up to a tenth need --register."
+            f"Scan {number} does not fit scan 1: it has {own.detector_shape} pixels of {own.pixel_pitch:g} mm and "
+            f"turns {math.degrees(own.width.arc):.3g}° in an exposure; scan 1 has {first.detector_shape} pixels of "
+            f"{first.pixel_pitch:g} mm and {math.degrees(first.width.arc):.3g}°. If only the pixel sizes differ, by up "
+            "to a tenth, give --register."
         )

@@ -1,4 +1,4 @@
-"""Measured: energies with absorption or radiographs, of a text table, an HDF5 file or a series of scans."""
+"""Reads absorption or radiographs over energies from a text table, an HDF5 file or a series of scans."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from splatline_spectral.contrast import ContrastRegions, Reals, Series, XafsCurv
 
 PixelBox = tuple[int, int, int, int]
 FramePart = tuple[slice, slice]
-Read = Callable[[int, FramePart], Reals]  # line integrals [row, col] of an energy, of a part of the frame
+Read = Callable[[int, FramePart], Reals]  # line integrals [row, col] at an energy, for a part of the frame
 
-_MOST_VIEWS = 32  # evenly spread: more say little more of a region, and take long to read
+_MOST_VIEWS = 32  # evenly spread; more would improve little and take long to read
 _EV_BEYOND, _KEV_BELOW = 500.0, 0.05
-"""keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
+"""keV: no beamline has energies above the first or below the second, so the unit must be wrong."""
 _KEV = {"keV": 1.0, "eV": 1e-3}
 
 
@@ -35,20 +35,20 @@ _KEV = {"keV": 1.0, "eV": 1e-3}
 def open_measured(
     path: Path, span: tuple[float, float], region: PixelBox | None, around: PixelBox | None, unit: str | None
 ) -> Iterator[Series | XafsCurve]:
-    """The curve or the radiographs of a file or of a series of scans, which is open within the context.
+    """The curve or the radiographs of a file or a series of scans. The file is open within the context.
 
     Args:
         path: a text table of energy and absorption; HDF5 with `energy` [n] and `mu` [n], or `frames` [n, row, col] with
             `flats` ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]); or the folder of a
             series of scans.
-        span: keV, the first and the last energy.
+        span: first and last energy in keV.
         region, around: (first row, row after the last, first column, column after the last) of the material, and of its
-            surroundings, from which the material is excluded. None: the whole frame, and no surroundings.
-        unit: of the energies, "keV" or "eV"; None: as in the file, else keV.
+            surroundings; the material is excluded from the surroundings. None: the whole frame; no surroundings.
+        unit: unit of the energies, "keV" or "eV"; None: as in the file, else keV.
 
     Raises:
         ConfigError: a region is not in the frame, or has no surroundings.
-        DataError: not such a file, or an energy occurs twice.
+        DataError: the file has another content, or an energy twice.
     """
     if path.is_file() and not h5py.is_hdf5(path):
         table = read_table(path)
@@ -60,7 +60,9 @@ def open_measured(
         return
     with open_hdf5(path) as file, readable(path):
         if "energy" not in file or not {"mu", "frames"} & {*file}:
-            raise DataError(f"{path} needs datasets energy, and mu or frames (with flats). Nothing was written.")
+            raise DataError(
+                f"{path} must have the dataset energy, and either mu or frames with flats. Nothing was written."
+            )
         stated = {"ev": "eV", "kev": "keV"}.get(str(file["energy"].attrs.get("units", "")).lower())
         energies = _in_kev(path, np.ravel(file["energy"][()]), unit or stated)
         if "mu" in file:
@@ -69,9 +71,14 @@ def open_measured(
         frames = file["frames"]
         flats = file.get("flats")
         if frames.ndim != 3 or len(frames) != energies.size:
-            raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
+            raise DataError(
+                f"{path}: frames has the shape {frames.shape}; expected [energy, row, col] with {energies.size} "
+                "energies."
+            )
         if flats is None or flats.shape not in (frames.shape, frames.shape[1:]):
-            raise DataError(f"{path}: frames need flats of {frames.shape} or {frames.shape[1:]}. Nothing was written.")
+            raise DataError(
+                f"{path}: flats must have the shape {frames.shape} or {frames.shape[1:]}. Nothing was written."
+            )
 
         def read(n: int, part: FramePart) -> Reals:
             darks = file.get("darks")
@@ -84,9 +91,9 @@ def open_measured(
 
 
 def read_table(path: Path) -> Reals:
-    """[n, 2] of two columns of text, energy and absorption, apart by commas, semicolons, tabs or blanks.
+    """Read two columns of text, energy and absorption, separated by commas, semicolons, tabs or blanks. Returns [n, 2].
 
-    Lines before the first number, and those that begin with # or %, are skipped.
+    Lines before the first number, and lines that begin with # or %, are skipped.
     """
     rows: list[tuple[float, float]] = []
     for number, line in enumerate(text_in(path).splitlines(), start=1):
@@ -98,24 +105,24 @@ def read_table(path: Path) -> Reals:
         except ValueError:
             if rows:
                 raise DataError(
-                    f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption."
+                    f"{path}, line {number}: expected an energy and an absorption, got {line.strip()!r}."
                 ) from None
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
 def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
-    """Energies, shape of the frames, and the mean line integrals over views from all sides: these show a region of the
-    detector alike at all energies, though each scan has angles of its own.
+    """Energies, shape of the frames, and a function for the mean line integrals over projections from all sides. These
+    means can be compared between energies, although each scan has angles of its own.
     """
     energies, shapes = list[float](), set[tuple[int, int]]()
     for path in scans:
         with open_scan(path) as source:
             if source.energy_kev is None:
-                raise DataError(f"{path} does not state its energy (instrument/beam/incident_energy of NXtomo).")
+                raise DataError(f"{path} must state its energy (instrument/beam/incident_energy of NXtomo).")
             energies.append(source.energy_kev)
             shapes.add(source.shape)
     if len(shapes) != 1:
-        raise DataError(f"The scans have frames of {sorted(shapes)} pixels; expected one size. Nothing was written.")
+        raise DataError(f"All scans must have frames of one size; found {sorted(shapes)} pixels. Nothing was written.")
 
     def read(n: int, part: FramePart) -> Reals:
         with open_scan(scans[n]) as source:
@@ -147,7 +154,7 @@ def _mean(source: ScanSource, kind: FrameKind, part: FramePart) -> Reals:
 
 
 def counts_in(values: Any) -> Reals:
-    """NaN where integers are the largest of their type: the pixel may be saturated."""
+    """Counts as float; NaN if an integer is the largest of its type, because the pixel may be saturated."""
     counts = np.asarray(values, dtype=np.float64)
     if values.dtype.kind in "ui":
         counts[values == np.iinfo(values.dtype).max] = np.nan
@@ -155,11 +162,11 @@ def counts_in(values: Any) -> Reals:
 
 
 def _order(path: Path, energies: Reals, span: tuple[float, float]) -> NDArray[np.intp]:
-    """The energies within the span, rising; DataError where one occurs twice."""
+    """Indices of the energies within the span, rising. DataError: an energy occurs twice."""
     order = np.argsort(energies, kind="stable")
     order = order[(energies[order] >= span[0]) & (energies[order] <= span[1])]
     if not (np.diff(energies[order]) > 0).all():
-        raise DataError(f"{path} has an energy more than once; average the values of each. Nothing was written.")
+        raise DataError(f"{path} has an energy more than once: average the values of each energy. Nothing was written.")
     return order
 
 
@@ -173,7 +180,7 @@ def _sorted_curve(path: Path, energies: Reals, absorption: Reals, span: tuple[fl
 def _series(path: Path, order: NDArray[np.intp], energies: Reals, regions: ContrastRegions, read: Read) -> Series:
     mask = regions.inside if regions.around is None else regions.inside | regions.around
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    # Only these rows and columns, and their neighbours, are read.
+    # Read only these rows and columns, and their neighbours.
     part = slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
     seen = ContrastRegions(regions.inside[part], None if regions.around is None else regions.around[part])
     return Series(path.name, order.size, ((float(energies[n]), read(int(n), part)) for n in order), seen)
@@ -190,7 +197,7 @@ def _regions(path: Path, shape: tuple[int, int], region: PixelBox | None, around
 def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
     if box[1] > shape[0] or box[3] > shape[1]:
         raise ConfigError(
-            f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "
+            f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is outside of frames of {shape[0]} x {shape[1]} pixels. "
             "Nothing was written."
         )
     mask = np.zeros(shape, dtype=np.bool_)
@@ -202,7 +209,7 @@ def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
     energies = np.asarray(values, np.float64) * _KEV[unit or "keV"]
     if not ((energies >= _KEV_BELOW) & (energies <= _EV_BEYOND)).all():
         raise DataError(
-            f"{path}: energies from {energies.min():g} to {energies.max():g} keV are impossible, expected "
-            f"{_KEV_BELOW:g} to {_EV_BEYOND:g}; their unit is given by --unit. Nothing was written."
+            f"{path}: energies from {energies.min():g} to {energies.max():g} keV are impossible; expected "
+            f"{_KEV_BELOW:g} to {_EV_BEYOND:g}. Give the unit of the file with --unit. Nothing was written."
         )
     return energies

@@ -1,7 +1,8 @@
-"""Results: curves and edges as sentences, as a table and as a picture, and the tabulated edges near them.
+"""Results of `beamline xafs`: curves and edges as text, table and picture, with the nearest tabulated edges.
 
-Tabulated edges are those of free atoms in xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). Compounds lie
-a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 eV above the K edge of nickel.
+Tabulated edges are those of free atoms in xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). Edges of
+compounds are a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 eV above the K edge of
+nickel.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from splatline_spectral.contrast import AbsorptionEdge, XafsCurve
 
 @dataclass(frozen=True, eq=False)
 class XafsResult:
-    """A curve and its edge. `title`: what was scanned; `elements`: of the material; empty: not known."""
+    """A curve and its edge. `title`: what was scanned. `elements`: those of the material; empty: not known."""
 
     title: str
     curve: XafsCurve
@@ -44,7 +45,7 @@ class XafsResult:
 
 
 def lines(results: Sequence[XafsResult]) -> list[str]:
-    """Sentences for people: of each curve, and how far its edge is from that of the first."""
+    """Lines for the terminal: each curve, and the distance of its edge from that of the first curve."""
     return [line for result in results for line in _lines(result, results[0].edge.energy)]
 
 
@@ -58,18 +59,18 @@ def _lines(result: XafsResult, first: float | None) -> Iterator[str]:
         yield f"no edge     {edge.reason}"
     else:
         apart = "" if first in (None, edge.energy) else f", {(edge.energy - (first or 0)) * 1e3:+.2f} eV from the first"
-        yield f"edge        {edge.energy:.4f} keV, where the absorption rises most steeply{apart}"
-        top = "none above the edge within the range" if edge.white_line is None else f"{edge.white_line:.4f} keV"
+        yield f"edge        {edge.energy:.4f} keV, the steepest rise of the absorption{apart}"
+        top = "no maximum above the edge within the range" if edge.white_line is None else f"{edge.white_line:.4f} keV"
         yield f"white line  {top}"
         yield f"in tables   {nearest_edges(edge.energy, result.elements)}"
     cnr, (low, high) = curve.contrast_to_noise, curve.nearly_best
-    what = "absorption" if cnr is None else f"contrast-to-noise of {cnr[curve.best]:.3g} a pixel at this thickness"
+    what = "absorption" if cnr is None else f"contrast-to-noise of a pixel at this thickness, {cnr[curve.best]:.3g}"
     best = f"{curve.energies[curve.best]:.4f} keV: highest {what}"
-    yield f"best        {best} (95 % of it from {low:.4f} to {high:.4f} keV)"
+    yield f"best        {best} (at least 95 % of it from {low:.4f} to {high:.4f} keV)"
 
 
 def nearest_edges(energy: float, elements: Sequence[int] = ()) -> str:
-    """The nearest tabulated edge of these elements; without elements, the nearest K edge and L3 edge of all."""
+    """The nearest tabulated edge of these elements; without elements, the nearest K edge and L3 edge of any element."""
     edges = sorted(edges_of(elements or range(1, HEAVIEST + 1)), key=lambda edge: abs(edge.energy - energy))
     nearest = edges[:1] if elements else [next(e for e in edges if e.shell == shell) for shell in ("K", "L3")]
     return "; ".join(
@@ -79,7 +80,7 @@ def nearest_edges(energy: float, elements: Sequence[int] = ()) -> str:
 
 
 def table(results: Sequence[XafsResult]) -> str:
-    """CSV: a row for each energy of each curve; contrast, noise and their ratio are empty where they are not known."""
+    """CSV: a row for each energy of each curve; contrast, noise and their ratio are empty if they are not known."""
     rows = [["state", "energy_kev", "absorption", "unit", "contrast", "noise", "contrast_to_noise"]]
     for result in results:
         curve = result.curve
@@ -93,8 +94,8 @@ def table(results: Sequence[XafsResult]) -> str:
 
 
 def picture(results: Sequence[XafsResult]) -> bytes:
-    """PNG: all curves over energy, with the edge (dashed) and the white line (dotted) of each in its colour, and their
-    contrast-to-noise below, where it is known."""
+    """PNG: all curves over energy, each with its edge (dashed) and white line (dotted) in its colour, and below their
+    contrast-to-noise, if it is known."""
     figure = new_figure((WIDTH, 5.4))
     top, below = np.ravel(np.asarray(figure.subplots(2, 1, sharex=True)))
     for result, shade in zip(results, np.linspace(0, 0.9, len(results)), strict=True):
@@ -110,15 +111,15 @@ def picture(results: Sequence[XafsResult]) -> bytes:
                 top.axvline(energy, color=colour, lw=1.0, ls=dashes)
     units = " or ".join(dict.fromkeys(result.curve.unit for result in results))
     finish(top, "energy (keV)", f"absorption ({units})", "edges dashed, white lines dotted", grid=True)
-    finish(below, "energy (keV)", "contrast-to-noise a pixel", grid=True)
+    finish(below, "energy (keV)", "contrast-to-noise of a pixel", grid=True)
     return png(figure)
 
 
 def write_results(results: Sequence[XafsResult], target: Path) -> None:
-    """Write the picture (PNG), and the table (CSV) beside it.
+    """Write the picture (PNG), and the table (CSV) next to it.
 
     Raises:
-        DataError: one of them exists, or the disk refuses; then neither is there.
+        DataError: one of them exists, or the disk does not take it; then neither is written.
     """
     contents = (target, picture(results)), (target.with_suffix(".csv"), table(results).encode())
     write_together((path, partial(write_whole, content=content)) for path, content in contents)

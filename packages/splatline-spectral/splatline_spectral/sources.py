@@ -1,4 +1,4 @@
-"""Sources: a scene, a file or a series of scans becomes curves of absorption over energy."""
+"""Turns a scene, a file or a series of scans into curves of absorption over energy."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from splatline_spectral.measured import PixelBox, open_measured
 from splatline_spectral.results import XafsResult
 
 _FLATS = 4
-"""Frames without the sample before each energy's radiograph, as at a beamline: the beam changes with the energy."""
-_THICK = 0.5  # of the largest thickness: pixels with at least this much are inside the material
+"""Number of flats before the radiograph at each energy. Each energy needs its own, because the beam changes with it."""
+_THICK = 0.5  # pixels with at least this fraction of the largest thickness are inside the material
 _NEAR = 24  # pixels around the material that count as its surroundings
 
 
@@ -45,16 +45,16 @@ def series_of_scene(
     """The radiographs of a scene at `energies` (keV), computed lazily.
 
     Args:
-        name: a scene file, or the name of a shipped scene.
-        material: whose contrast is measured; None: the one with a state of charge.
-        seed: of all random numbers.
-        charge: the state of charge, 0 to 1, that the material has instead of its own; None: its own.
+        name: a scene file, or the name of a scene in the package.
+        material: the material whose contrast is measured; None: the one with a state of charge.
+        seed: seed of all random numbers.
+        charge: state of charge, 0 to 1, of the material; None: that of the scene.
 
     Raises:
         ConfigError: there is no such scene, its sample is grey, or the material is not visible.
     """
     own = open_scene(name).scene.beam
-    # With both ends of the range any phantom of materials is a mixture, whose chords are used for every energy.
+    # With both ends of the range, any phantom of materials becomes a mixture; its chords are used for every energy.
     ends: dict[str, Any] = {
         "photons_per_s": own.photons_per_s,
         "spectrum": [[energies.min(), 1.0], [energies.max(), 1.0]],
@@ -62,7 +62,7 @@ def series_of_scene(
     ends |= {key: getattr(own, key) for key in ("sod", "sdd") if getattr(own, key) is not None}
     opened = open_scene(name, [f"beam={{{', '.join(f'{key}: {_plain(value)}' for key, value in ends.items())}}}"])
     if not isinstance(opened.scene.sample, Mixture):
-        raise ConfigError(f"{opened.path}: the sample has no material:, so that it is the same at every energy.")
+        raise ConfigError(f"{opened.path}: the sample has no key `material`, so it is the same at every energy.")
     beam = Beam(own.photons_per_s, own.sod, own.sdd, float(energies.mean()), own.bandwidth, own.harmonics)
     chosen = _chosen(opened.scene.sample, material)
     try:
@@ -71,7 +71,9 @@ def series_of_scene(
         scene = _EnergyScan(scan, sample, beam)
         regions = _regions(sample, chosen, scan)
     except ValueError as error:
-        raise ConfigError(f"{opened.path}: {chosen} cannot be compared: {error}. Nothing was simulated.") from None
+        raise ConfigError(
+            f"{opened.path}: {chosen} cannot be compared with its surroundings: {error}. Nothing was simulated."
+        ) from None
     fractions = [
         c.material.fractions for c in sample.constituents if c.material is not None and c.material.name == chosen
     ]
@@ -86,15 +88,15 @@ def _plain(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _EnergyScan:
-    """A scene that is exposed at several energies; `beam`: its light, of any energy."""
+    """A scene that is exposed at several energies. `beam`: its beam, at any energy."""
 
     scan: Scan
     sample: Mixture
     beam: Beam
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene. First comes a dark level,
-        then flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
+        """(keV, line integrals [row, col]) at each energy, with all effects of the scene. Darks come first, then flats
+        and a radiograph for each energy, in the period of the scene. A pixel without beam is +inf."""
         number = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(number)], axis=0)
         for energy in energies.tolist():
@@ -113,7 +115,7 @@ class _EnergyScan:
         return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
 
     def _counts(self, number: int, beam: bool = True, sample: bool = True) -> Reals:
-        """A frame of the standing stage, counts [row, col], NaN where they are the largest of the sensor."""
+        """A frame with a standing stage, counts [row, col]; NaN: the sensor's largest count."""
         time = number * self.scan.scene.scan.period_s
         first = self.scan.frame(len(self.scan) - self.scan.views).shot
         shot = replace(
@@ -126,21 +128,21 @@ class _EnergyScan:
 
 
 def _chosen(sample: Mixture, wanted: str | None) -> str:
-    """The material to measure. Raises ConfigError: the scene lacks it, or several are possible."""
+    """The material to measure. ConfigError: the scene does not have it, or several are possible."""
     present = {c.material.name: c.material for c in sample.constituents if c.material is not None}
     charged = [name for name, each in present.items() if each.state_of_charge is not None]
     if wanted is None and len(charged) == 1:
         return charged[0]
     if wanted not in present:
         raise ConfigError(
-            f"--material {wanted or 'is not given'}: the scene has {', '.join(present)}, {len(charged)} of them with a "
-            "state_of_charge. Nothing was simulated."
+            f"--material {wanted or 'is not given'}: choose one of {', '.join(present)} ({len(charged)} of them have a "
+            "state_of_charge). Nothing was simulated."
         )
     return str(wanted)
 
 
 def _charged(sample: Mixture, name: str, charge: float) -> Mixture:
-    """The same with another state of charge of a material. ValueError: it has none."""
+    """The sample with another state of charge of a material. ValueError: the material has none."""
     constituents = [
         replace(each, material=replace(each.material, state_of_charge=charge))
         if each.material is not None and each.material.name == name
@@ -151,7 +153,7 @@ def _charged(sample: Mixture, name: str, charge: float) -> Mixture:
 
 
 def _regions(sample: Mixture, material: str, scan: Scan) -> ContrastRegions:
-    """Pixels with much of the material, and those near it without it, in the sample if possible, else in air."""
+    """Pixels with much of the material, and nearby pixels without it: in the sample if possible, else in air."""
     thickness = sample.thickness(0.0, scan.detector)
     mine = np.array([c.material is not None and c.material.name == material for c in sample.constituents])
     own = thickness[mine].sum(axis=0)
@@ -172,12 +174,12 @@ _MOST = 5000
 
 @dataclass(frozen=True)
 class Jobs:
-    """Which curves of each source.
+    """Which curves to compute for each source.
 
     Attributes:
-        low, high, step: keV; of a file's energies `low` and `high` keep a part.
-        material, seed, charges: of a scene; no charges: its own.
-        regions, around, unit: of a file; (row, end, column, end) of the material, and around it.
+        low, high, step: keV; for a file, `low` and `high` select a part of its energies.
+        material, seed, charges: for a scene; no charges: that of the scene.
+        regions, around, unit: for a file; (row, end, column, end) of the material and of its surroundings.
     """
 
     low: float | None = None
@@ -195,7 +197,7 @@ def results_of(sources: Sequence[str], jobs: Jobs, progress: Callable[[int, int]
     """The curve and the edge of each source, region and state of charge.
 
     Args:
-        progress: gets how many of how many energies of a curve are done.
+        progress: is called with the number of energies done, and of all energies of the curve.
 
     Raises:
         ConfigError, DataError: a scene or file is wrong, or has too few energies.
@@ -210,8 +212,8 @@ def results_of(sources: Sequence[str], jobs: Jobs, progress: Callable[[int, int]
                 title = Path(source).name if isinstance(series, XafsCurve) else series.title
             if curve.energies.size < LEAST:
                 raise DataError(
-                    f"{source}: {curve.energies.size} usable energies are too few for an edge, which takes {LEAST}; "
-                    f"{curve.left_out.size} were too dark, too bright or without values. Nothing was written."
+                    f"{source}: an edge needs {LEAST} energies, but only {curve.energies.size} can be used "
+                    f"({curve.left_out.size} were too dark, too bright or without values). Nothing was written."
                 )
             name = title if len(variants) == 1 else f"{title}, {variant}"
             edge = find_edge(curve.energies, curve.absorption)
@@ -234,12 +236,14 @@ def _opened(source: str, jobs: Jobs, is_scene: bool, variant: float | PixelBox |
 def _grid(jobs: Jobs) -> Reals:
     """Energies from low to high, keV."""
     if jobs.low is None or jobs.high is None:
-        raise ConfigError("A scene needs a range of energies: --from 8.30 --to 8.42, in keV. Nothing was simulated.")
+        raise ConfigError(
+            "Give a range of energies for the scene, in keV, such as --from 8.30 --to 8.42. Nothing was simulated."
+        )
     n = math.floor((jobs.high - jobs.low) / jobs.step * (1 + 1e-9) + 1e-9) + 1
     if not LEAST <= n <= _MOST:
         raise ConfigError(
-            f"From {jobs.low:g} to {jobs.high:g} keV in steps of {jobs.step:g} are {max(n, 0)} energies; it must be "
-            f"{LEAST} to {_MOST}. Nothing was simulated."
+            f"Change --from, --to or --step: from {jobs.low:g} to {jobs.high:g} keV in steps of {jobs.step:g} there "
+            f"are {max(n, 0)} energies, but there must be {LEAST} to {_MOST}. Nothing was simulated."
         )
     return jobs.low + jobs.step * np.arange(n, dtype=np.float64)
 

@@ -1,4 +1,4 @@
-"""`beamline xafs`: scenes, tables, radiographs and series, and what is refused."""
+"""`beamline xafs`: scenes, tables, radiographs and series, and errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_shipped_scene_has_its_white_line_at_8348_5_ev(folder: Path) -> None
 def test_where_there_is_no_edge_it_says_so(folder: Path) -> None:
     result = xafs("edge_scan", "--from", "8.25", "--to", "8.29", "--step", "0.002", "-o", "far.png")
     assert result.exit_code == 6, result.output
-    assert "the curve is as smooth as one without an edge" in result.stdout
+    assert "the curve is as smooth as a curve without an edge" in result.stdout
     assert Path("far.png").exists() and Path("far.csv").exists()
 
 
@@ -79,17 +79,17 @@ def test_measured_radiographs_and_several_regions(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["edge_scan"], "--from 8.30 --to 8.42, in keV"),
-        (["edge_scan", "--from", "8.3", "--to", "8.305"], "are 6 energies; it must be 9 to 5000"),
-        (["edge_scan", "--from", "8.3", "--to", "8.4", "--material", "Cu"], "the scene has electrolyte, NMC811"),
-        (["mu.csv"], "their unit is given by --unit"),
-        (["mu.h5", "--from", "8.395"], "too few for an edge"),
+        (["edge_scan"], "in keV, such as --from 8.30 --to 8.42"),
+        (["edge_scan", "--from", "8.3", "--to", "8.305"], "there are 6 energies, but there must be 9 to 5000"),
+        (["edge_scan", "--from", "8.3", "--to", "8.4", "--material", "Cu"], "choose one of electrolyte, NMC811"),
+        (["mu.csv"], "unit of the file with --unit"),
+        (["mu.h5", "--from", "8.395"], "an edge needs 9 energies, but only"),
         (["none.h5"], "none.h5"),
-        (["scan.h5", "--region", "5:15,5:50"], "is not in frames of 20 x 24"),
-        (["scan.h5", "--region", "5"], "is not ROW:END,COL:END"),
+        (["scan.h5", "--region", "5:15,5:50"], "is outside of frames of 20 x 24"),
+        (["scan.h5", "--region", "5"], "expected ROW:END,COL:END"),
         (["scan.h5", "--region", "5:15,5:15", "--around", "5:15,5:15"], "no pixel outside of --region"),
         (["edge_scan", "--states", "0,2"], "numbers from 0 to 1"),
-        (["mu.h5", "-o", "mu.txt"], "is not a picture"),
+        (["mu.h5", "-o", "mu.txt"], "expected the name of a .png file"),
     ],
 )
 def test_what_is_refused_leaves_nothing(folder: Path, arguments: list[str], said: str) -> None:
@@ -101,11 +101,11 @@ def test_what_is_refused_leaves_nothing(folder: Path, arguments: list[str], said
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({"energy": [8.3, 8.4]}, "needs datasets energy"),
+        ({"energy": [8.3, 8.4]}, "must have the dataset energy"),
         ({"energy": [8.3, 8.3], "mu": [1.0, 2.0]}, "more than once"),
         ({"energy": [8.3, 8.4], "mu": [1.0, np.nan]}, "finite absorption"),
-        ({"energy": [8.3, 8.4], "frames": np.ones((3, 4, 4))}, "must be"),
-        ({"energy": [8.3, 8.4], "frames": np.ones((2, 4, 4))}, "need flats"),
+        ({"energy": [8.3, 8.4], "frames": np.ones((3, 4, 4))}, r"expected \[energy, row, col\] with 2"),
+        ({"energy": [8.3, 8.4], "frames": np.ones((2, 4, 4))}, "flats must have"),
     ],
 )
 def test_a_file_that_is_none_is_refused(tmp_path: Path, content: dict[str, Any], said: str) -> None:

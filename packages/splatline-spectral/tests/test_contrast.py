@@ -190,13 +190,13 @@ def test_a_curve_without_an_edge_has_none(low: float, width: float, noise: float
     found = find_edge(energies, _smooth(energies) + np.random.default_rng(seed).normal(0, noise, 121))
     assert not found.found
     assert (found.energy, found.white_line) == (None, None)
-    assert "as smooth as one without an edge" in found.reason
+    assert "as smooth as a curve without an edge" in found.reason
 
 
 def test_an_edge_at_the_end_of_the_range_is_told_apart() -> None:
     for energies in (np.arange(8.30, 8.344, 0.001), np.arange(8.3437, 8.40, 0.001)):
         found = find_edge(energies, _curve(energies, 8.3437))
-        assert not found.found and "steepest at the end of the range; widen the range" in found.reason
+        assert not found.found and "widen the range of energies: the curve is steepest at the end" in found.reason
 
 
 @pytest.mark.parametrize("line", [0.0, 0.6])

@@ -1,4 +1,4 @@
-"""`beamline materials`: charged and fresh grains from simulated scans around an edge; no half output."""
+"""`beamline materials`: charged and fresh grains from simulated scans around an edge; no half-written output."""
 
 from __future__ import annotations
 
@@ -128,9 +128,9 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
     wrong.write_text("kev,fresh\n8.3,1\n")
     for words, said in (
         ([*scans, "--spectra", narrow], "expected 8.34 to 8.36 keV"),
-        ([scans[0], "--spectra", spectra(tmp_path)], "cannot distinguish 2 materials"),
-        ([*scans, "--spectra", wrong], "begins 'kev,fresh'"),
-        ([*scans, "--spectra", tmp_path / "absent.csv"], "no table of spectra"),
+        ([scans[0], "--spectra", spectra(tmp_path)], "cannot separate 2 materials"),
+        ([*scans, "--spectra", wrong], "begins with 'kev,fresh'"),
+        ([*scans, "--spectra", tmp_path / "absent.csv"], "cannot be read as a table of spectra"),
     ):
         done = beamline("materials", *words, "-o", tmp_path / "out.h5", "--axis", "31.5")
         assert done.exit_code in (2, 5) and said in done.output, done.output
@@ -140,11 +140,11 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "names that differ"),
+        ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "different names"),
         ('energy_kev,"a\nb"\n8.3,1\n8.4,2\n', "parts of file names"),
-        ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "no table of spectra"),
+        ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "cannot be read as a table of spectra"),
         ("energy_kev,a\n8.3,1\n8.3,2\n", "energies must differ"),
-        ("\n", "no table of spectra"),
+        ("\n", "cannot be read as a table of spectra"),
     ],
 )
 def test_a_table_that_is_none_is_refused(tmp_path: Path, table: str, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Energy scan: frames are the scene's at each energy, regions are where the material is, grey is refused."""
+"""Scenes at several energies: frames are right at each energy, regions show the material, grey samples are errors."""
 
 from __future__ import annotations
 
@@ -114,12 +114,12 @@ def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
     ("changes", "material", "words"),
     [
         ({"phantom": {"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 1], "attenuation": 1}]}}, None,
-         "has no material:, so that it is the same at every energy"),
-        ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "the scene has electrolyte, NMC811, 0 of them"),
-        ({}, "Cu", "--material Cu: the scene has electrolyte, NMC811"),
+         "has no key `material`, so it is the same at every energy"),
+        ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "choose one of electrolyte, NMC811 .0 of them have"),
+        ({}, "Cu", "--material Cu: choose one of electrolyte, NMC811"),
         ({"beam": {"photons_per_s": 1}}, None, "materials need the beam's energy"),
         ({"detector": {"shape": [4, 4], "pixel_size_um": 0.1}, "axis_offset_px": 3000.0}, None,
-         "NMC811 cannot be compared: it is not in the field of view"),
+         "NMC811 cannot be compared with its surroundings: it is not in the field of view"),
     ],
 )  # fmt: skip
 def test_scenes_that_cannot_be_scanned_are_refused(

@@ -1,4 +1,4 @@
-"""The folder of a series of scans gives the materials, and the edge of the grains."""
+"""From the folder of a series of scans come the volumes of materials, and the edge of the grains."""
 
 from __future__ import annotations
 

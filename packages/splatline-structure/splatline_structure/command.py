@@ -1,4 +1,4 @@
-"""`beamline structure`: numbers of a volume's microstructure, with intervals."""
+"""`beamline structure`: measures the microstructure of a volume; each number has an interval."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ if TYPE_CHECKING:
     from splatline_structure.volumes import Box, ReadSlices
 
 _FILE = click.Path(path_type=Path)
-FEWEST_VIEWS = 16  # that can be parted, 8 of each half
+FEWEST_VIEWS = 16  # fewest projections that can be divided, 8 in each half
 
 
 def edges_of(text: str) -> Spacing:
-    """Parse edges of a voxel (z, y, x) in µm, one or three. Raises ValueError for others."""
+    """Parse the edges of a voxel (z, y, x) in µm: one number or three. Raises ValueError for other text."""
     try:
         z, y, x = map(float, text.split(":") if ":" in text else [text] * 3)
     except ValueError:
         z = y = x = math.nan
     if not all(0 < edge < math.inf for edge in (z, y, x)) or not math.isclose(y, x, rel_tol=1e-3):
         raise ValueError(
-            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or Z:Y:X, such as 3:1:1, with Y as X: pixels "
-            "of a slice are squares"
+            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or Z:Y:X, such as 3:1:1, with Y equal to X "
+            "because the pixels of a slice must be squares"
         )
     return z, y, x
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A volume that was read, and what was found in it.
+    """A volume that was read, and what was measured in it.
 
     Attributes:
-        grid, volume: of the box.
+        grid, volume: the grid and the voxels of the box.
     """
 
     path: Path
@@ -56,97 +56,144 @@ class Seen:
     found: Found
 
     def voxels(self, slices: slice) -> str:
-        """The box in these slices of the volume, as text."""
+        """The box in these slices of the volume, as text for the tables."""
         return ",".join(f"{each.start}:{each.stop}" for each in (slices, *self.box[1:]))
 
 
 @click.command(cls=Repeatable)
 @click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
-@click.option("--compare", is_flag=True, help="Two volumes, such as charged and discharged: what changed.")
-@click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
+@click.option("--compare", is_flag=True, help="Say what changed between two volumes, such as charged and discharged.")
+@click.option(
+    "--dataset",
+    metavar="PATH",
+    help="Array to read from an HDF5 file or .npz. Default: where `beamline recon` writes the volume.",
+)
 @click.option("--voxel-um", metavar="EDGE|Z:Y:X", callback=parsed(edges_of),
-              help="Edge of a voxel, or its three. Default: the file's.")  # fmt: skip
-@click.option("--materials", type=click.IntRange(2, 6), help="Number of materials. Default: that of labels, or 2.")
+              help="Edge of a voxel in µm, or its three edges. Default: as the file states.")  # fmt: skip
+@click.option(
+    "--materials",
+    type=click.IntRange(2, 6),
+    help="Number of materials. Default: the number of labels in the volume, or 2 for grey values.",
+)
 @click.option(
     "--particles",
     type=click.IntRange(1),
-    help="Material of the particles, from 1, the least dense. Default: the densest.",
+    help="Number of the material that forms the particles, from 1, the least dense. Default: the densest.",
 )
 @click.option(
     "--through",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Material whose connected share and tortuosity are taken.",
+    help="Number of the material in which the connected share and the tortuosity are measured, from 1.",
 )
 @click.option(
     "--parts",
     metavar="A B",
     type=_FILE,
     nargs=2,
-    help="The volume from every other view, and from the others: all slices, or only those that are measured.",
+    help="The volume reconstructed from each half of the projections, in two files with all slices or only the "
+    "measured ones. Default: both are reconstructed from the scan.",
 )
 @click.option(
     "--scan",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Scan of the volume, from whose halves it is made again. Default: the one that the volume names.",
+    help="Scan of the volume, which is reconstructed again from each half of its projections. Default: the scan that "
+    "the volume names.",
 )
-@click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
-@click.option("--crop", type=click.Choice(["square", "finite", "none"]), default="square", show_default=True,
-              help="square: inside the circle of the sample, or of the field, without a can's wall. finite: inside the "
-                   "circle beyond which voxels are not finite.")  # fmt: skip
-@click.option("--memory", metavar="SIZE", callback=parsed(memory_size),
-              help="For volumes, such as 8G. Of a larger one the slices in the middle that fit are looked at, and all "
-                   "for fractions and surface; several volumes are measured whole. Default: what is free.")  # fmt: skip
-@click.option("--slices", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Slices to take. Default: all.")
+@click.option(
+    "--quick",
+    is_flag=True,
+    help="Do not reconstruct from halves of the projections: faster, but the intervals leave out the error from few "
+    "projections.",
+)
+@click.option(
+    "--crop",
+    type=click.Choice(["square", "finite", "none"]),
+    default="square",
+    show_default=True,
+    help="Part of a slice to measure. square: the square inside the sample or the field of view, without "
+    "a can's wall. finite: the square inside the circle of finite voxels. none: everything.",
+)
+@click.option(
+    "--memory",
+    metavar="SIZE",
+    callback=parsed(memory_size),
+    help="Memory to use, such as 8G. Of a larger volume only the middle slices that fit are measured, and "
+    "all slices for fractions and surface; several volumes must fit whole. Default: what is free.",
+)
+@click.option(
+    "--slices",
+    type=click.IntRange(0),
+    nargs=2,
+    metavar="FIRST END",
+    help="First slice to measure and the one after the last. Default: all.",
+)
 @click.option(
     "--radius",
     type=click.IntRange(0, 20),
     default=1,
     show_default=True,
-    help="Radius of opening and closing particles, voxels.",
+    help="Radius, in voxels, of the ball that opens and closes particles; 0: neither.",
 )
 @click.option(
-    "--smallest", type=click.IntRange(0), default=27, show_default=True, help="Voxels of the smallest particle."
+    "--smallest",
+    type=click.IntRange(0),
+    default=27,
+    show_default=True,
+    help="Drop particles of fewer voxels than this.",
 )
 @click.option(
     "--neck",
     type=click.FloatRange(min=0),
     default=0.8,
     show_default=True,
-    help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: always.",
+    help="Two touching parts count as one particle if the neck has at least this fraction of the width of the narrower "
+    "part; 0: always.",
 )
 @click.option(
     "--side",
     type=click.IntRange(0),
     default=96,
     show_default=True,
-    help="Voxels of the central cube of the tortuosity; 0: none.",
+    help="Side, in voxels, of the central cube in which the tortuosity is computed; 0: no tortuosity.",
 )
 @click.option(
-    "--labels", type=click.Choice(["h5", "tif", "zarr"]), default="h5", show_default=True, help="Format of the labels."
+    "--labels",
+    type=click.Choice(["h5", "tif", "zarr"]),
+    default="h5",
+    show_default=True,
+    help="File format of the labels.",
 )
-@click.option("-o", "--output", type=_FILE, help="New folder. Default: VOLUME's stem + _structure, here.")
+@click.option(
+    "-o",
+    "--output",
+    type=_FILE,
+    help="New folder for the results. Default: name of VOLUME + _structure, in the current folder.",
+)
 @json_option
 def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
-    """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
-    share and tortuosity, each with an interval of 80 %.
+    """Measure the microstructure of a volume, each number with an interval.
 
-    The interval has four causes: the views (the volume is made again from each half of them), the levels of the
-    materials, the size of a voxel, and the number of particles. Where it is wider than half of the value, the number is
-    given as not determined.
+    Measured are fractions of materials, particles, surface, contacts, cracks, connected share and tortuosity.
 
-    Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
-    and labels.
+    Each interval is one of 80 %. It has four causes: few projections (the volume is reconstructed again from each half
+    of them), uncertain grey levels of the materials, the size of a voxel, and the number of particles. A number whose
+    interval is wider than half of its value is printed as not determined.
+
+    Several volumes are a series in time. The new folder contains report.html, numbers.csv, structure.json,
+    particles.csv and labels.
+
+    Example: beamline structure recon.h5
     """
     from beamline.core.machine import free_memory
     from beamline.storage.interrupted import volume_file
     from splatline_structure.volumes import read_volume
 
     if compare and len(volumes) != 2:
-        raise click.UsageError(f"--compare takes two volumes, got {len(volumes)}.")
+        raise click.UsageError(f"--compare needs two volumes, got {len(volumes)}.")
     if values["parts"] and (len(volumes) > 1 or values["scan"]):
-        raise click.UsageError("--parts are of one volume, without --scan.")
+        raise click.UsageError("--parts needs exactly one volume, and cannot be combined with --scan.")
     paths = [volume_file(path) for path in volumes]
     output = output or Path(f"{safe_name(paths[0].name.split('.')[0])}_structure")
     with answering(as_json) as answer:
@@ -169,7 +216,7 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
 
 
 def _seen(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> Seen:
-    """One volume, and what was found in it."""
+    """Measure one volume."""
     from splatline_structure import intervals, volumes
 
     if read.limit_sentence:
@@ -178,18 +225,18 @@ def _seen(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> Seen:
     seen = measured(path, read, box, answer, **values)
     if not read.limit_sentence:
         return seen
-    slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("slabs"))
+    slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("reading slabs"))
     return replace(seen, found=intervals.with_all_slices(seen.found, slabs))
 
 
 def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: Any) -> Seen:
-    """What was found in the slices of a volume.
+    """Measure the slices of a volume that were read.
 
     Args:
-        box: that is looked at, also in the volumes from parts of the views.
+        box: the part to measure, also in the volumes from halves of the projections.
 
     Raises:
-        ConfigError: a material that is not there. ValueError: no contrast, or parts of other shapes.
+        ConfigError: there is no such material. ValueError: no contrast, or the halves have other shapes.
     """
     import numpy as np
 
@@ -204,41 +251,47 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     particles = values["particles"] or n_materials
     if labels.size not in (0, n_materials):
         raise ValueError(
-            f"it holds {labels.size} values ({', '.join(f'{each:g}' for each in labels)}), which are labels, not grey "
-            f"values: {n_materials} --materials cannot be told among them; leave it out, and each label is a material"
+            f"leave out --materials {n_materials}, because the volume holds {labels.size} different values "
+            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values, and each label is "
+            "a material"
         )
     if labels.size:
         materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
-        answer.warn(Note(f"{path} is taken as labels, not as grey values: the value {', '.join(materials)}."))
+        answer.warn(
+            Note(
+                f"{path} holds few different values, so they are read as labels and not as grey values: "
+                f"{', '.join(materials)}."
+            )
+        )
     if max(particles, values["through"]) > n_materials:
         raise ConfigError(
-            f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "
-            "written."
+            f"There is no material {max(particles, values['through'])}: the {n_materials} materials are numbered from "
+            "1. Nothing was written."
         )
     for half in _parts(path, read, answer, **values):
         if half.shape != data.shape:
             raise ValueError(
-                f"the volume from half of its views has the shape {half.shape}, not {data.shape}: give --parts of "
-                "these voxels, or --quick"
+                f"the volume from half of the projections has the shape {half.shape}, not {data.shape}: give --parts "
+                "with the same voxels, or --quick"
             )
         parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     try:
-        found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
+        found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure"))
     except ValueError as error:
         way_out = (
-            f"only slices {read.slices.start}:{read.slices.stop}, which memory holds, were looked at: give more "
-            "--memory, or others by --slices"
+            f"only slices {read.slices.start}:{read.slices.stop} fit the memory and were measured: give more "
+            "--memory, or choose other --slices"
             if read.limit_sentence
-            else "reconstruct from more views"
+            else "reconstruct from more projections"
         )
         raise ValueError(f"{error}; {way_out}{', or give fewer --materials' if n_materials > 2 else ''}") from error
     return Seen(path, read, box, grid, volume, found)
 
 
 def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[Any]:
-    """The slices of the volume from each half of its views; none where they are not asked for, or not there."""
+    """The slices of the volume from each half of its projections; empty if not asked for, or if there is no scan."""
     from beamline.storage.volumes.files import opened_volume
     from splatline_structure.volumes import parts_of
 
@@ -248,23 +301,23 @@ def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[
         halves = []
         for half in values["parts"]:
             with opened_volume(half) as opened:
-                holds_all = opened.grid.shape[0] == read.n_slices  # or these slices alone
+                holds_all = opened.grid.shape[0] == read.n_slices  # otherwise it holds only these slices
                 halves.append(opened.volume.data[read.slices if holds_all else slice(None)])
         return halves
     scan = values["scan"] or Path(read.record.raw_file)
     if not scan.is_file():
         answer.warn(
-            f"{path}: its scan is not there ({scan}): the intervals are without what the views do. Give --scan or "
-            "--parts."
+            f"The intervals of {path} leave out the error from few projections, because its scan {scan} does not "
+            "exist. Give --scan or --parts."
         )
         return []
     if (n_views := int(read.record.parameters.get("n_views", FEWEST_VIEWS))) < FEWEST_VIEWS:
-        raise ValueError(f"{n_views} views are too few to be parted: give --quick")
-    return parts_of(read, scan, 2, answer.warn, answer.counting("halves of the views"))
+        raise ValueError(f"{n_views} projections are too few to divide them into halves: give --quick")
+    return parts_of(read, scan, 2, answer.warn, answer.counting("reconstructing halves of the projections"))
 
 
 def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
-    """Write the folder, and say what is in it."""
+    """Write the folder, and print the numbers."""
     from beamline.core.events import json_of
     from beamline.report.html import Picture
     from splatline_structure import intervals, pictures, results
@@ -272,7 +325,7 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
     first = seen[0]
     table = first.found.intervals
     shown = pictures.pictures_of(first.found, first.volume, first.grid, first.read)
-    title = f"{seen[1].path.name} less {first.path.name}" if compare else f"Structure of {first.path.name}"
+    title = f"{seen[1].path.name} minus {first.path.name}" if compare else f"Structure of {first.path.name}"
     settings = {
         "volume": first.path,
         **{name: value for name, value in values.items() if value is not None},
@@ -296,11 +349,11 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         at = [float(each.read.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
         if curves:
             drawn = pictures.curves_of(curves, at, "volume")
-            shown.insert(0, Picture("Numbers of all volumes", "Values with their intervals.", drawn))
+            shown.insert(0, Picture("Numbers of all volumes", "Each value with its interval.", drawn))
     particles = first.found.structure.particles
     undecided = (
-        f"{first.found.undecided:.1%} of the voxels are undecided; "
-        f"{count(particles.label.size, 'particle')}, {int(particles.cut.sum())} cut by a face of the box."
+        f"{first.found.undecided:.1%} of the voxels could be of either material; "
+        f"{count(particles.label.size, 'particle')}, of which {int(particles.cut.sum())} touch a face of the box."
     )
     limits = [f"{first.path}: {first.read.limit_sentence}"] if first.read.limit_sentence else []
     box = " and ".join(each.voxels(each.read.slices) for each in (seen if compare else [first]))

@@ -1,4 +1,4 @@
-"""Intervals: each number as value, low and high, by the views, levels, voxels and particles."""
+"""Intervals of numbers: value, low and high end, from four causes: projections, levels, voxels and particles."""
 
 from __future__ import annotations
 
@@ -14,32 +14,33 @@ from splatline_structure.numbers import Rules, Structure, coarse, shares_of, str
 from splatline_structure.particles import Particles
 
 BIAS_UNSURE, NOISE = 0.5, 1.5
-"""Half-width by the views: over what half of them change a number by, and over half the difference of both halves."""
+"""Half-width from few projections, as factors: of the change when half of the projections is left out, and of half the
+difference between the two halves."""
 PROBED, PARTIAL = 0.05, 0.012
-"""Of the gap of two levels: by how much thresholds are moved to see what they do, and may lie off by partial voxels."""
+"""Fractions of the gap between two levels: by how much thresholds are moved to see their effect, and by how much they
+may be wrong because of partial-volume voxels."""
 OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
-"""By the first word of a number's name: what all views would still change it by, over what half of them do, and the
-half-width over what voxels twice as wide change it by; of others, and of voxels that are no cubes, OTHERS. Found,
-as the figures above, on simulated grains, and looked at once on others (docs/structure.md). Sizes and tortuosities
-moved either way."""
+"""By the first word of a number's name, two factors. The first, times the change from half of the projections to all,
+estimates the change from all to infinitely many. The second, times the change from voxels twice as wide, is the
+half-width from the voxels. OTHERS holds for other numbers, and its second factor for voxels that are not cubes. All
+figures here were found on simulated grains and checked once on others (docs/structure.md). Sizes and tortuosities
+changed in both directions."""
 OTHERS = 0.5, 0.3
-BIAS = 0.012  # of a fraction, or of all the rest: by so much fractions of grains come out low, however many the views
+BIAS = 0.012  # relative: fractions of grains (or of the rest) come out low by this, whatever the number of projections
 SPLIT_OR_MERGED = 0.62
-"""Of n whole particles some are split, merged or cut otherwise than in the sample: the share s of their volume below a
-size lies off by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
-LEVELS_MOVE = 0.5  # thresholds, over what half of the views move them by
+"""Some of n whole particles are split, merged or cut in another way than in the sample. So the fraction s of their
+volume below a size is wrong by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
+LEVELS_MOVE = 0.5  # error of thresholds, as a factor of their change with half of the projections
 UNDECIDED, SURE = 0.15, 0.8
-"""Most voxels that may be undecided, and the probability of one material from which on a voxel is decided."""
-WIDEST, NARROWEST = 0.5, 0.001  # of the value: a wider interval determines no number, and none is narrower to a side
+"""Largest fraction of undecided voxels; a voxel is decided if one material has this probability or more."""
+WIDEST, NARROWEST = 0.5, 0.001  # of the value: widest interval of a number that is determined; smallest half-width
 CAUSES = {
-    "views": "more views would narrow this",
-    "levels": "the threshold decides this, not the views",
-    "voxels": "the size of a voxel decides this, not the views",
-    "particles": "more whole particles would narrow this: a larger field",
+    "views": "more projections would narrow the interval",
+    "levels": "the threshold limits this; more projections would not help",
+    "voxels": "the voxel size limits this; more projections would not help",
+    "particles": "more whole particles (a larger field of view) would narrow the interval",
 }
-_NO_CAUSE = (
-    f"no cause changes this number; the interval is the narrowest that is given ({100 * NARROWEST:g} % to a side)"
-)
+_NO_CAUSE = f"no cause changes this number, so the interval has the smallest width ({100 * NARROWEST:g} % to each side)"
 _SHARES = "fraction", "sphericity", "cracks", "connected"
 
 
@@ -48,9 +49,9 @@ class Interval:
     """A number with its interval of a nominal 80 %.
 
     Attributes:
-        low, high: around the value as it would be with all views there could be.
-        moves: what more views would still change the value by, extrapolated; NaN: the views were not parted.
-        views, levels, voxels, particles: half-widths by each cause.
+        low, high: ends of the interval around the value that infinitely many projections would give.
+        moves: extrapolated change of the value with more projections; NaN: there were no halves of the projections.
+        views, levels, voxels, particles: half-width from each cause.
         why_not: why the number is not determined; empty: it is.
     """
 
@@ -71,23 +72,23 @@ class Interval:
 
     @property
     def words(self) -> str:
-        """What the interval comes from, or why there is none."""
+        """What limits the interval, or why there is none."""
         return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else _NO_CAUSE)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """All that a volume says of its structure.
+    """The structure of a volume, with the intervals of its numbers.
 
     Attributes:
         intervals: by the names of `Structure.numbers`, and those of `with_all_slices`.
-        undecided: share of voxels without a material of probability 0.8.
+        undecided: fraction of voxels in which no material has a probability of 0.8.
         unsure: bool [z, y, x], these voxels.
-        parts: structures of volumes from parts of the views.
-        off: share of a gap of levels by which thresholds may lie off.
-        rules: by which the numbers were taken.
+        parts: structures of the volumes from parts of the projections.
+        off: error of the thresholds, as a fraction of the gap between levels.
+        rules: how the numbers were measured.
         spacing: edges of a voxel (z, y, x), µm.
-        along_all: share of the particles' material in each slice, also of those beyond the ones looked at.
+        along_all: fraction of the particles' material in each slice, including slices that were not measured.
     """
 
     structure: Structure
@@ -110,12 +111,12 @@ def found_in(
     rules: Rules,
     tell: Callable[[int, int], None] = lambda n, of: None,
 ) -> Found:
-    """The structure of a volume, its numbers with intervals.
+    """The structure of a volume, with the intervals of its numbers.
 
     Args:
-        parts: the same volume from interleaved parts of its views; none: the views are no part of the intervals.
-        count: of materials.
-        tell: gets structures taken, and all.
+        parts: the same volume from interleaved parts of its projections; empty: the intervals leave them out.
+        count: number of materials.
+        tell: is called with the number of structures measured, and of all.
 
     Raises:
         ValueError: no contrast between materials.
@@ -131,7 +132,7 @@ def found_in(
         try:
             thresholds = materials_of(part, count).thresholds
         except ValueError:
-            why = "half of the views show no contrast between the materials: more views or photons are needed"
+            why = "take more projections or photons: half of the projections show no contrast between the materials"
             thresholds = materials.thresholds
         moved.append(float(np.abs((thresholds - materials.thresholds) / gaps).max()))
         halves.append(structure_of(part, thresholds, spacing, rules))
@@ -148,7 +149,7 @@ def found_in(
     unsure = probabilities(volume, materials.thresholds, float(materials.spread.max())).max(axis=0) < SURE
     undecided = float(unsure.mean())
     if undecided > UNDECIDED:
-        why = f"{undecided:.0%} of the voxels could be of either material: more views or photons are needed"
+        why = f"take more projections or photons: {undecided:.0%} of the voxels could be of either material"
     intervals = {
         name: Interval(value, why_not=why)
         if why
@@ -168,8 +169,8 @@ def found_in(
 
 
 def _of_particles(name: str, particles: Particles) -> float:
-    """Half-width of a quantile of sizes, as particles split, merge or are cut otherwise; 0 of another number, infinite
-    of a single whole particle."""
+    """Half-width of a quantile of sizes, because particles are split, merged or cut in another way; 0 for other
+    numbers, infinite for a single whole particle."""
     kind, _, percent = name.partition("_")
     if kind != "size" or particles.cut.all():
         return 0.0
@@ -192,12 +193,16 @@ def _interval(
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):
-        nothing = "nothing connects the faces" if math.isinf(value) else "there is no whole particle in the field"
-        return Interval(value, why_not=nothing if kind != "connected" else "there is none of the material")
+        nothing = "nothing connects the faces" if math.isinf(value) else "no particle is completely in the measured box"
+        return Interval(value, why_not=nothing if kind != "connected" else "there is none of this material")
     if of_particles == math.inf:
-        return Interval(value, why_not="only one particle is whole, which has no distribution of sizes")
+        return Interval(
+            value, why_not="only one particle is completely in the box, so there is no distribution of sizes"
+        )
     if not all(map(math.isfinite, (*halves, *sides, wide))):
-        return Interval(value, why_not="it is there or not by the threshold, half of the views, or the voxels")
+        return Interval(
+            value, why_not="the threshold, half of the projections or the voxel size decide whether it exists at all"
+        )
     still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan
     moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)
@@ -209,7 +214,7 @@ def _interval(
 
 
 def _judged(kind: str, interval: Interval) -> Interval:
-    """With the ends by its half-widths, within what such a number can be; one that is too wide determines nothing."""
+    """The interval with its ends, limited to possible values; not determined if it is too wide."""
     by_cause = [float(np.nan_to_num(getattr(interval, cause))) for cause in CAUSES]
     half = max(math.hypot(*by_cause), NARROWEST * abs(interval.value))
     middle = interval.value + float(np.nan_to_num(interval.moves))
@@ -220,11 +225,11 @@ def _judged(kind: str, interval: Interval) -> Interval:
 
 
 def with_all_slices(found: Found, slabs: Iterable[F32]) -> Found:
-    """With fractions and surface of all slices, named `_all`, whose half-widths are those of the middle ones.
+    """Add fractions and surface of all slices, named `_all`, with the half-widths of the measured slices.
 
     Args:
-        slabs: all slices, some at a time; each but the first begins with the last slice of the one before, as surface
-            may lie between them.
+        slabs: all slices, some at a time. Each slab except the first begins with the last slice of the slab before,
+            because surface may lie between them.
     """
     count, surfaces, shares, pairs = found.materials.levels.size, list[float](), list[F64](), list[int]()
     for slab in slabs:
@@ -240,17 +245,18 @@ def with_all_slices(found: Found, slabs: Iterable[F32]) -> Found:
     }
     for name, value in numbers.items():
         of_all = replace(found.intervals[name], value=value)
-        # Without ends nothing of the volume is determined, and why holds for all slices.
+        # Without ends no number is determined, for a reason that holds for all slices.
         intervals[f"{name}_all"] = of_all if math.isnan(of_all.low) else _judged(name.split("_")[0], of_all)
     return replace(found, intervals=intervals, along_all=along[found.rules.particles - 1])
 
 
 def difference(one: Interval, other: Interval) -> Interval:
-    """Of two states: the second less the first, with the intervals' half-widths added in squares, also by cause."""
+    """The change between two states: the second minus the first. Half-widths are added in squares, also for each
+    cause."""
     value, middle = other.value - one.value, (other.high + other.low - one.high - one.low) / 2
     half = math.hypot((one.high - one.low) / 2, (other.high - other.low) / 2)
     causes: dict[str, Any] = {cause: math.hypot(getattr(one, cause), getattr(other, cause)) for cause in CAUSES}
-    alike = "no change is told from none" if abs(middle) < half else ""
+    alike = "the change is smaller than its uncertainty" if abs(middle) < half else ""
     return Interval(
         value, middle - half, middle + half, other.moves - one.moves,
         why_not=one.why_not or other.why_not or alike, **causes,

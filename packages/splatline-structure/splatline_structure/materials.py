@@ -1,4 +1,4 @@
-"""Materials of a volume: their levels, labels of voxels, and the voxels that are undecided."""
+"""Materials of a volume: their grey levels, the labels of voxels, and the probability of each material."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ Labels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Spacing = tuple[float, float, float]
 
-_ROUNDS, _LOOKED_AT = 4, 160  # voxels of a side of the cube in the middle that shows the levels
-_CORE = 2  # voxels from an edge from which on a voxel shows the level of its material
-_TRIMMED = 0.02  # share of a core's voxels left out at each end: specks of others
-_LEAST = 200  # voxels of a core, else the outer quarter of the material's values shows the level
-MOST = 6  # materials
+_ROUNDS, _LOOKED_AT = 4, 160  # side in voxels of the central cube from which the levels are found
+_CORE = 2  # only voxels so many voxels from an edge are used for the level of a material
+_TRIMMED = 0.02  # fraction of a core's voxels left out at each end, because of specks of other materials
+_LEAST = 200  # fewest voxels of a core; with fewer, the outer quarter of the material's values gives the level
+MOST = 6  # largest number of materials
 MOST_BETWEEN = 1.5
-"""Voxels half-way between two levels over those near the rarer one; of one normal distribution cut in two, 2.2."""
+"""Largest ratio of voxels half-way between two levels to voxels near the rarer level. For one normal distribution cut
+in two the ratio is 2.2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Materials:
-    """Materials of a volume, from the least dense on.
+    """Materials of a volume, the least dense first.
 
     Attributes:
-        levels: rising, [material], in the unit of the volume.
-        spread: standard deviation of the voxels of each, away from edges.
-        errors: standard error of each level, by the noise of its voxels.
+        levels: [material], rising, in the unit of the volume.
+        spread: standard deviation of each material's voxels, away from edges.
+        errors: standard error of each level, from the noise of its voxels.
     """
 
     levels: F64
@@ -59,7 +60,7 @@ def central(mask: NDArray[Any], side: int, spacing: Spacing = (1, 1, 1)) -> NDAr
 
 
 def label_values(volume: F32) -> F64:
-    """The values of a volume of labels, which has been segmented: 2 to 6 different ones; none of grey values."""
+    """The values of a segmented volume (labels): 2 to 6 different values; empty for grey values."""
     for some in (volume[len(volume) // 2], volume):
         values = np.unique(some)
         if values.size > MOST:
@@ -70,11 +71,11 @@ def label_values(volume: F32) -> F64:
 def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
     """Levels of `count` materials: k-means, then the mean of each material's voxels more than two voxels from its edge.
 
-    Partial voxels lie between levels: they take no part. Of a large volume the 160³ voxels in the middle are looked at.
+    Partial-volume voxels are between levels and are not used. In a large volume the 160³ voxels in the middle are used.
     If the volume holds `count` labels, they are the levels.
 
     Raises:
-        ValueError: one value, or no contrast between two materials.
+        ValueError: the volume has only one value, or two materials have no contrast.
     """
     if (known := label_values(volume)).size == count:
         return Materials(known, np.full(count, 1e-3 * np.diff(known).min()), np.zeros(count))
@@ -91,28 +92,28 @@ def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
     if valleys.max() > MOST_BETWEEN:
         worst = int(valleys.argmax())
         raise ValueError(
-            f"no contrast: materials {worst + 1} and {worst + 2} of {count} have the levels {levels[worst]:.4g} and "
-            f"{levels[worst + 1]:.4g}, and {valleys[worst]:.2g} times as many voxels lie half-way between them as near "
-            "the rarer one"
+            f"materials {worst + 1} and {worst + 2} of {count} have no contrast: their levels are {levels[worst]:.4g} "
+            f"and {levels[worst + 1]:.4g}, and {valleys[worst]:.2g} times as many voxels are half-way between the "
+            "levels as near the rarer level"
         )
     return Materials(levels, spread, spread * np.array([math.sqrt(8 / core.size) for core in cores]))
 
 
 def _core(volume: F32, mask: Mask, k: int, count: int) -> F32:
-    """Values of a material away from its edges; where it has no room for that, those that lie farthest from others."""
+    """Values of a material away from its edges; in thin parts, the values farthest from those of other materials."""
     core = volume[ndimage.binary_erosion(mask, ball(_CORE), border_value=1)]
     if core.size >= _LEAST:
         return core
     values = volume[mask]
     if not values.size:
-        raise ValueError(f"fewer than {count} materials: no voxel is of material {k + 1}")
+        raise ValueError(f"it holds fewer than {count} materials: no voxel is of material {k + 1}")
     low, high = (0, 25) if k == 0 else (75, 100) if k == count - 1 else (37.5, 62.5)
     low, high = np.percentile(values, (low, high))
     return values[(values >= low) & (values <= high)]
 
 
 def _valleys(volume: F32, levels: F64) -> F64:
-    """Voxels half-way between neighbouring levels, over those near the rarer one of the two."""
+    """Ratio of voxels half-way between neighbouring levels to voxels near the rarer of the two levels."""
     gaps = np.diff(levels)
     near = np.minimum(np.r_[gaps[0], gaps], np.r_[gaps, gaps[-1]]) / 8
     at = [np.count_nonzero(np.abs(volume - level) < width) / width for level, width in zip(levels, near, strict=True)]
@@ -130,10 +131,10 @@ def labelled(volume: F32, thresholds: F64) -> Labels:
 
 
 def probabilities(volume: F32, thresholds: F64, deviation: F32 | float) -> F32:
-    """[material, z, y, x] probability that a voxel is of a material, for a normal error of its value.
+    """[material, z, y, x] probability that a voxel is of a material, if its value has a normal error.
 
     Args:
-        deviation: standard deviation of the error, of each voxel or of all.
+        deviation: standard deviation of the error, for each voxel or for all.
     """
     below = (ndtr((threshold - volume) / deviation) for threshold in thresholds)
     edges = [np.zeros_like(volume), *below, np.ones_like(volume)]

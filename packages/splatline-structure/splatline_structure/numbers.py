@@ -1,4 +1,4 @@
-"""Numbers of a structure: fractions, sizes, surface, contacts, cracks, connected share and tortuosity of a volume."""
+"""Numbers of a microstructure: fractions, sizes, surface, contacts, cracks, connected share and tortuosity."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from splatline_structure.transport import connecting, tortuosity
 
 @dataclass(frozen=True)
 class Rules:
-    """How numbers are taken; voxels that are no cubes count as cubes of their shortest edge.
+    """How numbers are measured. Voxels that are not cubes count as cubes of their shortest edge.
 
     Attributes:
-        particles: number of the material, from 1, the least dense, whose particles are measured.
-        through: of the material whose connected share and tortuosity are.
-        radius: voxels of the ball that opens and closes particles: cracks up to twice as wide are within them.
-        smallest: voxels of the smallest particle.
-        neck: parts that touch are one particle where the neck is this share of the narrower part, or wider.
-        side: voxels of the central cube in which the tortuosity is solved; 0: it is not.
+        particles: number of the material whose particles are measured, from 1, the least dense.
+        through: number of the material whose connected share and tortuosity are measured.
+        radius: radius in voxels of the ball that opens and closes particles: cracks up to twice as wide are closed.
+        smallest: smallest particle, in voxels.
+        neck: touching parts are one particle if the neck has at least this fraction of the narrower part's width.
+        side: side of the central cube in which the tortuosity is computed, in voxels; 0: no tortuosity.
     """
 
     particles: int
@@ -37,21 +37,21 @@ class Rules:
 
     @property
     def of_coarse_voxels(self) -> Rules:
-        """The same rules for voxels twice as wide."""
+        """The same rules, for voxels twice as wide."""
         return replace(self, smallest=max(self.smallest // 8, 1), side=(self.side + 1) // 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What a volume holds.
+    """What was measured in a volume.
 
     Attributes:
         labels: number of each voxel's material [z, y, x], from 0.
         numbered: number of each voxel's particle, 0: none.
-        particles: of these, µm.
-        numbers: by name; NaN: there is nothing to take it of, infinity: nothing connects two faces.
-        along_z: share of the particles' material in each slice.
-        radial: the same in rings around the middle, and their radii in µm.
+        particles: the particles, lengths in µm.
+        numbers: by name. NaN: there is nothing to measure. Infinity: nothing connects two faces.
+        along_z: fraction of the particles' material in each slice.
+        radial: fraction of the particles' material in rings around the middle, and the radii of the rings in µm.
     """
 
     labels: Labels
@@ -63,7 +63,7 @@ class Structure:
 
 
 def unit_of(name: str) -> str:
-    """The unit of a number; empty for shares, counts and factors."""
+    """The unit of a number; empty for fractions, counts and factors."""
     return "1/µm" if name.startswith("surface") else "µm" if name.startswith("size") else ""
 
 
@@ -72,7 +72,7 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
 
     Args:
         volume: [z, y, x], finite.
-        thresholds: between the levels of neighbouring materials, rising.
+        thresholds: thresholds between neighbouring materials, rising.
         spacing: edges of a voxel (z, y, x), µm.
     """
     labels = labelled(volume, thresholds)
@@ -95,14 +95,15 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
 
 
 def shares_of(labels: Labels, count: int, spacing: Spacing, rules: Rules) -> dict[str, float]:
-    """Fractions of `count` materials, and the surface of the particles' one: what slabs of a volume add up to."""
+    """Fractions of `count` materials, and the surface of the particles' material: numbers that can be summed over
+    slabs."""
     shares, mask = np.bincount(labels.ravel(), minlength=count) / labels.size, labels == rules.particles - 1
     surface = float(surfaces(mask.astype(np.uint8), spacing, goes_on=True)[-1]) / (mask.size * math.prod(spacing))
     return {**{f"fraction_{k}": float(share) for k, share in enumerate(shares, 1)}, "surface": surface}
 
 
 def coarse(volume: F32) -> F32:
-    """Voxels twice as wide: means of eight; a last odd one is left out."""
+    """The volume with voxels twice as wide: means of eight voxels; a last odd voxel is left out."""
     nz, ny, nx = (n // 2 for n in volume.shape)
     eight = volume[: 2 * nz, : 2 * ny, : 2 * nx].reshape(nz, 2, ny, 2, nx, 2)
     return np.asarray(eight.mean(axis=(1, 3, 5), dtype=np.float32))

@@ -1,4 +1,4 @@
-"""Particles: parts a mask at narrow necks, and measures the size, shape, place and contacts of each part."""
+"""Particles: separates a mask at narrow necks, and measures size, shape, position and contacts of each particle."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ NECK = 0.8
 """Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
 _FACES = ndimage.generate_binary_structure(3, 1)  # neighbours of a voxel, with itself
 _GRID = 0.5
-"""Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
-are split in error, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
+"""Error of a distance on the grid, in voxels. Without it 41 of 360 rotated ellipsoids, plates, bars and octahedra are
+split by mistake, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
 _DIRECTIONS = np.array([
     (z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) > (0, 0, 0)
 ])  # fmt: skip
@@ -31,11 +31,11 @@ class Particles:
     """Particles of a labelled volume, one entry for each.
 
     Attributes:
-        label: int32, in the labelled volume.
+        label: int32, number in the labelled volume.
         volume: in the unit of length cubed.
         surface: in the unit of length squared.
         centroid: [particle, 3], (z, y, x).
-        cut: it touches a face of the volume, so that its true size may be larger.
+        cut: the particle touches a face of the volume, so its true size may be larger.
         neighbours: numbers of the particles that it touches.
     """
 
@@ -53,11 +53,12 @@ class Particles:
 
     @property
     def sphericity(self) -> F64:
-        """Surface of the ball of the same volume over the particle's (Wadell 1935); 1 for a ball."""
+        """Surface of the ball of the same volume, divided by the particle's surface (Wadell 1935); 1 for a ball."""
         return np.pi * self.diameter**2 / np.maximum(self.surface, 1e-12)
 
     def quantile(self, share: float) -> float:
-        """Diameter below which `share` of the volume of whole particles lies; NaN without whole particles."""
+        """Diameter below which the fraction `share` of the volume of whole particles lies; NaN without whole
+        particles."""
         order = np.argsort(self.diameter[~self.cut])
         volume = self.volume[~self.cut][order]
         if not order.size:
@@ -69,11 +70,11 @@ class Particles:
 def cleaned(mask: Mask, radius: int = 1, smallest: int = 27, spacing: Spacing = (1, 1, 1)) -> Mask:
     """The mask opened and closed, with holes filled, and parts of fewer than `smallest` voxels removed.
 
-    The volume is continued beyond its faces, so that a particle there loses nothing. Voxels count as cubes of their
+    The volume is continued beyond its faces, so that a particle at a face loses nothing. Voxels count as cubes of their
     shortest edge.
 
     Args:
-        radius: of opening and closing by a ball, voxels; 0: neither.
+        radius: radius in voxels of the ball for opening and closing; 0: neither.
         spacing: edges of a voxel (z, y, x).
     """
     edges = np.array(spacing) / min(spacing)
@@ -93,13 +94,13 @@ def cleaned(mask: Mask, radius: int = 1, smallest: int = 27, spacing: Spacing = 
 def parted(mask: Mask, neck: float, spacing: Spacing = (1, 1, 1)) -> Numbers:
     """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, separated at narrow necks.
 
-    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two maxima are one particle if
-    the distance on the neck between them is at least `neck` times the smaller one: a maximum counts if its dynamics in
-    log(distance) are larger than -log(neck) (Grimaud 1992).
+    Watershed of the distance to the outside, starting from its maxima (Beucher & Lantuéjoul 1979). Two maxima are one
+    particle if the distance on the neck between them is at least `neck` times the smaller one: a maximum counts if its
+    dynamics in log(distance) are larger than -log(neck) (Grimaud 1992).
 
     Args:
         neck: 0: connected parts as they are; 1 or more: every maximum is a particle.
-        spacing: edges of a voxel (z, y, x); distances count in the shortest.
+        spacing: edges of a voxel (z, y, x); distances are in units of the shortest edge.
     """
     edges = np.array(spacing) / min(spacing)
     connected, _ = ndimage.label(mask)
@@ -110,7 +111,7 @@ def parted(mask: Mask, neck: float, spacing: Spacing = (1, 1, 1)) -> Numbers:
         inside = np.pad(connected[box] == number, 1)
         distance = ndimage.distance_transform_edt(inside, edges).astype(np.float32)
         tops = distance
-        if neck < 1:  # with this offset, heights differ by log(neck) where distances are `neck` times, less _GRID
+        if neck < 1:  # with this offset, log(neck) in height is the factor `neck` in distance, minus _GRID
             height = np.log(distance + np.float32(_GRID / (1 - neck)))
             tops = reconstruction(height + np.float32(math.log(neck)), height, footprint=_FACES)
         maxima, _ = ndimage.label(local_maxima(tops, connectivity=1) & inside)
@@ -121,7 +122,8 @@ def parted(mask: Mask, neck: float, spacing: Spacing = (1, 1, 1)) -> Numbers:
 
 
 def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0, 0, 0)) -> Particles:
-    """Sizes, shapes, places and contacts of the particles in a labelled volume; the volume ends nothing: see `cut`.
+    """Sizes, shapes, positions and contacts of the particles in a labelled volume; for particles at its faces see
+    `cut`.
 
     Args:
         labels: int [z, y, x], 0 outside.
@@ -149,18 +151,19 @@ def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0
 def surfaces(labels: NDArray[np.integer], spacing: Spacing = (1, 1, 1), goes_on: bool = False) -> F64:
     """[label] surface of each label within the volume, by Crofton's formula in the 13 directions of neighbours.
 
-    Lines through the voxels in a direction cross a surface as often as it is large and turned towards them; the mean
+    The number of crossings of lines in a direction is proportional to the surface as seen in this direction; the mean
     over all directions is half of the surface (Ohser & Schladitz 2009, 3D Images of Materials Structures, 5.2). Each
-    direction counts for those that lie nearest to it. A ball's surface is within 1 % from a radius of 10 voxels on;
-    faces of cubes, whose normals are those of the voxels, come out 5 % low. Faces of the volume are no surface.
+    direction stands for those nearest to it. The surface of a ball is right within 1 % from a radius of 10 voxels on.
+    Faces of cubes along the grid come out 5 % low. Faces of the volume do not count as surface.
 
     Args:
-        goes_on: the structure goes on beyond the volume: crossings per pair of voxels, times all voxels. Lines end at
-            the faces, so that a direction sees fewer pairs than there are voxels.
+        goes_on: the structure continues beyond the volume: crossings per pair of voxels, times all voxels, because
+            lines
+            end at the faces and a direction has fewer pairs than there are voxels.
     """
     steps = _DIRECTIONS * np.asarray(spacing)
     lengths = np.linalg.norm(steps, axis=1)
-    turn = np.arange(20_000) + 0.5  # points of a sphere, evenly (Vogel 1979)
+    turn = np.arange(20_000) + 0.5  # evenly spaced points on a sphere (Vogel 1979)
     up, around = 1 - 2 * turn / turn.size, math.pi * (1 + math.sqrt(5)) * turn
     out = np.sqrt(1 - up**2)
     points = np.stack((up, out * np.sin(around), out * np.cos(around)), axis=1)

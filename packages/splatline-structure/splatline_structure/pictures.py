@@ -1,4 +1,4 @@
-"""Pictures of a structure: a slice with its labels, curves with bands, and bars of the causes."""
+"""Pictures of a structure: a slice with its labels, curves with bands, and bars of what limits each interval."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splatline_structure.volumes import ReadSlices
 
 
 def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
-    """All pictures of a page; of sizes only where a particle is whole."""
-    with_band = ", halves of the views as a band" if found.parts else ""
+    """All pictures of a page; the picture of sizes only if a particle is whole."""
+    with_band = " (band: from each half of the projections)" if found.parts else ""
     shown = [
         Picture(
             "Materials",
-            "The middle slice, its labels (undecided: red), and particles.",
+            "The middle slice, its labels (red: could be of either material), and its particles.",
             slices(found, volume, grid),
         )
     ]
@@ -30,7 +30,8 @@ def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list
         shown.append(
             Picture(
                 "Sizes",
-                f"Share of the volume of whole particles below a diameter{with_band}; lines: intervals of the sizes.",
+                f"Fraction of the volume of whole particles below a diameter{with_band}. Lines: intervals of the "
+                "sizes.",
                 sizes(found),
             )
         )
@@ -38,17 +39,19 @@ def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list
         *shown,
         Picture(
             "Profiles",
-            f"Share of the particles' material{with_band}{'; grey: of all slices' if read.limit_sentence else ''}.",
+            f"Fraction of the particles' material{with_band}{'; grey: all slices' if read.limit_sentence else ''}.",
             profiles(found, grid, read),
         ),
         Picture(
-            "What decides", "Half-width of the interval of each number that is determined.", causes(found.intervals)
+            "What limits the intervals",
+            "Half-width from each cause, for the numbers that are determined.",
+            causes(found.intervals),
         ),
     ]
 
 
 def slices(found: Found, volume: F32, grid: Grid) -> bytes:
-    """The middle slice, beside its labels and its particles."""
+    """The middle slice, next to its labels and its particles."""
     figure = new_figure((WIDTH, WIDTH / 3 * grid.shape[1] / grid.shape[2] + 0.9))
     at, levels = grid.shape[0] // 2, found.materials.levels
     plane, window = planes(grid, "mm")[0], (float(levels[0]), float(levels[-1]))
@@ -69,7 +72,7 @@ def slices(found: Found, volume: F32, grid: Grid) -> bytes:
 
 
 def sizes(found: Found) -> bytes:
-    """Cumulative curves of volume over diameter, of whole particles, with the intervals of quantiles."""
+    """Cumulative volume of whole particles over diameter, with the intervals of the quantiles."""
     figure = new_figure((WIDTH, 3.2))
     axes = figure.subplots()
     whole = [each.particles.diameter[~each.particles.cut] for each in (found.structure, *found.parts)]
@@ -78,12 +81,12 @@ def sizes(found: Found) -> bytes:
     shares = {percent / 100: found.intervals[f"size_{percent}"] for percent in (10, 50, 90)}
     sure = {share: each for share, each in shares.items() if not each.why_not}
     axes.hlines([*sure], [each.low for each in sure.values()], [each.high for each in sure.values()], "C1")
-    finish(axes, "equivalent diameter (µm)", "share of the volume", f"{whole[0].size} whole particles", grid=True)
+    finish(axes, "equivalent diameter (µm)", "fraction of the volume", f"{whole[0].size} whole particles", grid=True)
     return png(figure)
 
 
 def profiles(found: Found, grid: Grid, read: ReadSlices) -> bytes:
-    """The share of the particles' material along z (of all slices in grey), and in rings around the middle."""
+    """The fraction of the particles' material along z (in grey: all slices), and in rings around the middle."""
     structures = [found.structure, *found.parts]
     figure = new_figure((WIDTH, 2.8))
     left, right = np.ravel(figure.subplots(1, 2, sharey=True))
@@ -92,20 +95,20 @@ def profiles(found: Found, grid: Grid, read: ReadSlices) -> bytes:
         all_z = z[0] + grid.spacing[0] * (np.arange(read.asked.start, read.asked.stop) - read.slices.start)
         left.plot(all_z, found.along_all, color="0.6")
     _banded(left, z, [each.along_z for each in structures])
-    finish(left, "z (mm)", "share", grid=True)
+    finish(left, "z (mm)", "fraction", grid=True)
     _banded(right, structures[0].radial[1], [each.radial[0] for each in structures])
-    finish(right, "from the middle (µm)", "", grid=True)
+    finish(right, "distance from the middle (µm)", "", grid=True)
     return png(figure)
 
 
 def _banded(axes: Any, at: NDArray[np.floating], curves: Sequence[NDArray[np.floating]]) -> None:
-    """The first curve, and a band from the lowest to the highest of all."""
+    """Draw the first curve, and a band from the lowest to the highest of all curves."""
     axes.fill_between(at, np.min(curves, axis=0), np.max(curves, axis=0), alpha=0.3)
     axes.plot(at, curves[0])
 
 
 def causes(intervals: Mapping[str, Interval]) -> bytes:
-    """Bars of the half-widths by each cause, in per cent of the value, of numbers that are determined."""
+    """Bars of the half-widths from each cause, in per cent of the value, for numbers that are determined."""
     shown = {name: each for name, each in intervals.items() if not each.why_not and getattr(each, each.decides) > 0}
     figure = new_figure((WIDTH, 1.0 + 0.34 * max(len(shown), 1)))
     axes = figure.subplots()
@@ -114,13 +117,13 @@ def causes(intervals: Mapping[str, Interval]) -> bytes:
         axes.barh(np.arange(len(shown)) + 0.2 * (k - 1.5), widths, 0.18, label=cause)
     axes.set_yticks(range(len(shown)), list(shown))
     axes.invert_yaxis()
-    axes.set(xscale="log", xlim=(0.01, None))  # fractions are some thousandths wide, sizes some tenths
+    axes.set(xscale="log", xlim=(0.01, None))  # half-widths of fractions are some thousandths, of sizes some tenths
     finish(axes, "half-width (% of the value)", "", size=8)
     return png(figure)
 
 
 def curves_of(series: Mapping[str, Sequence[Interval]], at: Sequence[float], across: str) -> bytes:
-    """Numbers against time, or views, with their intervals."""
+    """Numbers with their intervals, against time or number of projections."""
     figure = new_figure((WIDTH, 2.2 * len(series)))
     for axes, (name, each) in zip(
         np.ravel(figure.subplots(len(series), 1, sharex=True, squeeze=False)), series.items(), strict=True

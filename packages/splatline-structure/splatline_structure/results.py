@@ -1,4 +1,4 @@
-"""Results: numbers as text, JSON and CSV, particles as a table, labels as volumes, and the page."""
+"""Results of `beamline structure`: numbers as text, JSON and CSV; a table of particles; labels; the report page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS = "number", "unit", "value", "low", "high", "decides", "moves", *CAUSES
 
 
 def cells(name: str, interval: Interval) -> list[str]:
-    """A row of `COLUMNS`; numbers that are not determined are given as such."""
+    """A row of `COLUMNS`; "not determined" in place of a number that is not."""
     figures = [f"{getattr(interval, each):.4g}".replace("nan", "") for each in ("moves", *CAUSES)]
     if interval.why_not:
         return [name, unit_of(name), "not determined", "", "", interval.why_not, *figures]
@@ -34,7 +34,7 @@ def cells(name: str, interval: Interval) -> list[str]:
 
 
 def lines_of(intervals: Mapping[str, Interval]) -> list[str]:
-    """The table for people."""
+    """The table for the terminal."""
     return [
         f"{name:<14}{value:>15} {unit:<5}" + (f"{low} to {high}".ljust(20) if low else "") + f"  {words}"
         for name, unit, value, low, high, words, *_ in (cells(name, each) for name, each in intervals.items())
@@ -42,13 +42,13 @@ def lines_of(intervals: Mapping[str, Interval]) -> list[str]:
 
 
 def numbers_table(intervals: Mapping[str, Interval], box: str, box_of_all: str) -> str:
-    """All numbers as CSV, with the box of voxels that each is of."""
+    """All numbers as CSV, each with the box of voxels in which it was measured."""
     rows = [[*cells(name, each), box_of_all if name.endswith("_all") else box] for name, each in intervals.items()]
     return csv_text([[*COLUMNS, "box"], *rows])
 
 
 def particles_table(particles: Particles, grid: Grid) -> str:
-    """A row for each particle, the largest first; places are those of the volume's axes."""
+    """CSV with a row for each particle, the largest first; positions are along the axes of the volume."""
     first = 1e3 * np.array(grid.first)
     head = "label", "volume_um3", "diameter_um", "sphericity", "z_um", "y_um", "x_um", "cut", "contacts", "neighbours"
     rows: list[Sequence[object]] = [head]
@@ -61,7 +61,7 @@ def particles_table(particles: Particles, grid: Grid) -> str:
 
 
 def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All of a structure that is no array, for JSON; numbers that are not determined are null."""
+    """The structure without its arrays, for JSON; numbers that are not determined are null."""
     particles = found.structure.particles
     return {
         **settings, "levels": found.materials.levels.tolist(), "spread": found.materials.spread.tolist(),
@@ -77,7 +77,7 @@ def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_labels(path: Path, labels: np.ndarray, record: Any, grid: Grid) -> None:
-    """Whole numbers of voxels in the format of the suffix; HDF5 keeps them as whole numbers at their place."""
+    """Write the labels of the voxels, as integers, in the format of the suffix."""
     if path.suffix.lower() in (".h5", ".hdf5"):
         with created(path) as file:
             data, chunks = new_plot(file, "labels", grid, "mm"), (1, *labels.shape[1:])
@@ -111,7 +111,7 @@ def page(
 def write_all(
     folder: Path, texts: Mapping[str, str], labels: Mapping[str, np.ndarray], record: Any, grid: Grid
 ) -> None:
-    """Write the files of a new folder, which is there only at the end."""
+    """Write the files of a new folder."""
     folder.mkdir()
     for name, text in texts.items():
         write_whole(folder / name, text)

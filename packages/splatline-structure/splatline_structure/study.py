@@ -1,4 +1,4 @@
-"""`beamline study structure`: intervals of numbers against the number of views of a scan."""
+"""`beamline study structure`: numbers of a microstructure, with intervals, against the number of projections."""
 
 from __future__ import annotations
 
@@ -17,24 +17,41 @@ from splatline_structure.command import FEWEST_VIEWS, measured
 
 
 def numbers_of_views(text: str) -> list[int]:
-    """Parse whole numbers separated by commas. Raises ValueError for other text, or too few views to be parted."""
+    """Parse whole numbers separated by commas. Raises ValueError for other text, or for too few projections."""
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) >= FEWEST_VIEWS for part in parts):
         raise ValueError(
-            f"{text!r}: expected numbers such as 45,90,180, of {FEWEST_VIEWS} views or more, as both halves are "
-            "reconstructed"
+            f"{text!r}: expected numbers such as 45,90,180, each {FEWEST_VIEWS} or more, because each half of the "
+            "projections is reconstructed"
         )
     return list(dict.fromkeys(map(int, parts)))
 
 
 @click.command("study structure")
 @click.argument("scan", metavar="SCAN|RUN", type=click.Path(path_type=Path), callback=as_scan)
-@click.option("--views", metavar="N,N,...", required=True, callback=parsed(numbers_of_views), help="Numbers of views.")
-@click.option("--number", "names", multiple=True, default=("fraction_2", "size_50", "surface", "tortuosity_z"),
-              show_default=True, help="Number to follow, or all of a kind (tortuosity); may be repeated.")  # fmt: skip
-@click.option("-m", "--method", default="fista-tv", show_default=True, help="Of the reconstructions.")
+@click.option(
+    "--views",
+    metavar="N,N,...",
+    required=True,
+    callback=parsed(numbers_of_views),
+    help="Numbers of projections to compare, such as 45,90,180.",
+)
+@click.option(
+    "--number",
+    "names",
+    multiple=True,
+    default=("fraction_2", "size_50", "surface", "tortuosity_z"),
+    show_default=True,
+    help="Number to follow, or all of a kind (tortuosity); may be given several times.",
+)
+@click.option("-m", "--method", default="fista-tv", show_default=True, help="Method of the reconstructions.")
 @click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="New folder. Default: SCAN's stem + _views.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="New folder for the results. Default: name of SCAN + _views.",
+)
 @json_option
 def study_structure(
     scan: Path,
@@ -45,9 +62,13 @@ def study_structure(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Show what fewer views of SCAN cost in numbers of its microstructure: each with its interval, against views.
+    """Show how many projections the numbers of a microstructure need.
 
-    Before a beamtime, SCAN is one of `beamline simulate`: so it says how many views a wanted interval takes.
+    SCAN is reconstructed with each number of projections. The result shows each number with its interval.
+
+    Before a beamtime, use a SCAN of `beamline simulate`: the result says how many projections a wanted interval needs.
+
+    Example: beamline study structure scan.h5 --views 45,90,180
     """
     import numpy as np
 
@@ -65,7 +86,7 @@ def study_structure(
     }  # fmt: skip
     with answering(as_json) as answer:
         refuse_existing(output)
-        known = structure_of(  # of nothing, for the names of numbers
+        known = structure_of(  # of an empty volume, for the names of the numbers
             np.zeros((2, 2, 2), np.float32), np.arange(1.0, materials), (1, 1, 1), Rules(materials, 1)
         ).numbers
         asked = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
@@ -74,14 +95,14 @@ def study_structure(
                 f"--number {unknown[0]}: expected a kind, such as tortuosity, or one of {', '.join(known)}."
             )
         names = tuple(dict.fromkeys(chain(*asked.values())))
-        tell, series, axis_col, box = answer.counting("numbers of views"), {}, None, None
-        for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most views
+        tell, series, axis_col, box = answer.counting("reconstructing with fewer projections"), {}, None, None
+        for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most projections
             tell(done, len(views))
             record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
             if record.length_unit != "mm":
                 raise DataError(
-                    f"{scan} does not state the size of a pixel: `beamline ingest {scan} COPY.h5 --pixel-size-um SIZE` "
-                    "makes a copy that does. Nothing was written."
+                    f"{scan} does not state the pixel size: make a copy that does with `beamline ingest {scan} COPY.h5 "
+                    "--pixel-size-um SIZE`. Nothing was written."
                 )
             axis_col = record.axis_col
             try:
@@ -90,12 +111,16 @@ def study_structure(
                 read = ReadSlices(record, slices, slices, slices.stop)
                 series[n] = measured(scan, read, box, answer, **values).found.intervals
             except ValueError as error:
-                raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
+                raise DataError(
+                    f"{scan} cannot be measured with {n} projections: {error}. Nothing was written."
+                ) from error
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]
-        curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "views")
-        shown = [Picture("Numbers against views", "Values with their intervals; gaps are not determined.", curves)]
-        table = {f"{row[1]}, {row[0]} views": series[int(row[0])][row[1]] for row in rows}
-        page = results.page(f"Structure of {scan.name} against views", method, [], shown, table, {"scan": scan})
+        curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "projections")
+        shown = [Picture("Numbers against projections", "Each value with its interval; a gap: not determined.", curves)]
+        table = {f"{row[1]}, {row[0]} projections": series[int(row[0])][row[1]] for row in rows}
+        page = results.page(
+            f"Structure of {scan.name} against the number of projections", method, [], shown, table, {"scan": scan}
+        )
         with atomic_file(output) as folder:
             folder.mkdir()
             write_whole(folder / "numbers.csv", csv_text([["n_views", *results.COLUMNS], *rows]))

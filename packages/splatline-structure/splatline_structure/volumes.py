@@ -1,4 +1,5 @@
-"""Volumes: what is read of a file, the box that is looked at, and the same volume from parts of its views."""
+"""Reads the slices of a volume that fit the memory, finds the box to measure, reconstructs halves of the
+projections."""
 
 from __future__ import annotations
 
@@ -26,14 +27,14 @@ from recon.post import clusters
 from splatline_structure.materials import F32, Spacing
 
 Box = tuple[slice, slice, slice]
-_BESIDE = 16  # slices beside those that are looked at, which the prior of a method takes in
+_BESIDE = 16  # extra slices on both sides of the measured ones, because the prior of a method extends over them
 BYTES_OF_ALL, BYTES_OF_SQUARE, BYTES_BESIDE = 150, 75, 40 * 2 * _BESIDE
-"""Peak memory a voxel of the slices that are looked at, with both halves, where the box is all of them (145 as measured
-where particles percolate, 105 of grains) or the square in a circle, at most 41 % of them; and a voxel of one slice, as
-FISTA-TV makes halves also of the `_BESIDE` slices on both sides, at 40 bytes a voxel."""
-_LEAST = 8  # voxels of a side
-_MARGIN = 0.05  # of the square in the sample's circle, at each end: the wall of a can stays out
-_GOES_ON = 0.5  # of the mean inside, at the rim of the field: there the sample is wider than the field
+"""Peak memory in bytes a voxel of the measured slices, with both halves: if the box is the whole slice (measured: 145
+for percolating particles, 105 for grains), and if it is the square in a circle, at most 41 % of the slice. The third is
+for each voxel of one slice: FISTA-TV also reconstructs `_BESIDE` slices on both sides, at 40 bytes a voxel."""
+_LEAST = 8  # fewest voxels along a side
+_MARGIN = 0.05  # fraction of the square's side left out at each end, so that the wall of a can is outside
+_GOES_ON = 0.5  # if the rim of the field has this fraction of the inner mean, the sample is wider than the field
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +42,11 @@ class ReadSlices:
     """The slices of a volume that were read.
 
     Attributes:
-        record: of these slices, lengths in mm.
-        slices: their numbers in the volume.
-        asked: slices that were asked for; `slices` are fewer where memory does not hold them all.
-        n_slices: of the whole volume.
-        limit_sentence: says that memory does not hold all that were asked for; empty where it does.
+        record: these slices, lengths in mm.
+        slices: their indices in the volume.
+        asked: slices that were asked for; `slices` are fewer if not all fit the memory.
+        n_slices: number of slices of the whole volume.
+        limit_sentence: message that not all slices fit the memory; empty if they do.
     """
 
     record: Any
@@ -68,43 +69,44 @@ def read_volume(
     whole: bool = False,
     warn: Callable[[str], None] = lambda sentence: None,
 ) -> ReadSlices:
-    """The slices of a volume, or as many of them in the middle as fit the memory.
+    """Read the slices of a volume, or as many of them in the middle as fit the memory.
 
     Args:
-        voxel_um: edges of a voxel (z, y, x); None: the file's.
-        crop: what `box_in` will take: with "finite", values outside its circle may be anything.
-        whole: all slices that are asked for, or none.
-        warn: is told where the file states other edges.
+        voxel_um: edges of a voxel (z, y, x) in µm; None: as the file states.
+        crop: the crop for `box_in`; with "finite", values outside its circle may be anything.
+        whole: read all slices that are asked for, or raise.
+        warn: prints a warning if the file states other edges.
 
     Raises:
-        DataError: no volume of finite numbers, no size of a voxel, no such slices, or one of which fewer than 8 slices,
-            or than were asked for, fit the memory; by `whole` fewer than all that were asked for.
+        DataError: the file is not a volume of finite numbers, does not state the voxel size or has no such slices; or
+            fewer than 8 slices fit the memory (with `whole`: fewer than all that were asked for).
     """
     if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
         raise DataError(
-            f"{path} is a scan ({scan}): reconstruct it with `beamline recon`; if it is a volume, give --dataset. "
-            "Nothing was written."
+            f"Reconstruct {path} with `beamline recon` first: it is a scan ({scan}). If it does hold a volume, give "
+            "--dataset. Nothing was written."
         )
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as packed:
             unpacked = sum(each.file_size for each in packed.infolist())
         if unpacked > memory:
             raise DataError(
-                f"{path} unpacks to {size(unpacked)}, and {size(memory)} may be used: give more --memory, or save the "
-                "volume as .npy (numpy.save), which is read slice by slice. Nothing was written."
+                f"{path}: not enough memory. Unpacked it has {size(unpacked)}, and {size(memory)} are allowed. Give "
+                "more --memory, or save the volume as .npy (numpy.save), which is read slice by slice. Nothing was "
+                "written."
             )
     with opened_volume(path, dataset) as record:
         grid = record.volume.grid
         if voxel_um is None and record.length_unit != "mm":
             raise DataError(
-                f"{path} does not state the size of a voxel: give --voxel-um EDGE, or Z:Y:X if voxels are not cubes. "
+                f"Give --voxel-um EDGE, or Z:Y:X if voxels are not cubes: {path} does not state the voxel size. "
                 "Nothing was written."
             )
         if voxel_um is not None:
             if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
                 warn(
-                    f"{path} states voxels of {_edges(stated)} µm (z x y x x), which are not those of --voxel-um: "
-                    f"{_edges(voxel_um)} µm are taken."
+                    f"{path} states voxels with edges of {_edges(stated)} µm (z x y x x). The edges of --voxel-um "
+                    f"are used instead: {_edges(voxel_um)} µm. Leave --voxel-um out to use those of the file."
                 )
             grid = Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
         n_slices = grid.shape[0]
@@ -117,17 +119,18 @@ def read_volume(
         if most < least:
             needed = rounded((bytes_a_voxel * least + BYTES_BESIDE) * math.prod(grid.shape[1:]), up=True)
             raise DataError(
-                f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
-                f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
+                f"{path}: not enough memory. {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels need "
+                f"{size(needed)}, and {size(memory)} are allowed{' for each of several volumes' if whole else ''}. "
+                "Free memory, give more "
                 f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or "
                 "measure a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
         limit_sentence = (
-            f"{size(memory)} of memory hold {most} of {end - first} slices: numbers are of slices "
-            f"{fitting.start}:{fitting.stop}, in the middle, and those named _all of {first}:{end}, with intervals "
-            "as wide as in the middle. Free memory or give more --memory to measure more slices."
+            f"Only {most} of {end - first} slices fit into {size(memory)} of memory. Numbers are measured in the "
+            f"slices {fitting.start}:{fitting.stop}, in the middle; those whose names end in _all in {first}:{end}, "
+            "with intervals as wide as in the middle. To measure more slices, free memory or give more --memory."
             if excess
             else ""
         )
@@ -135,12 +138,12 @@ def read_volume(
         values = np.ascontiguousarray(record.volume.data[fitting], np.float32)
         if min(values.shape) < _LEAST:
             raise DataError(
-                f"{path} holds {values.shape}; expected {_LEAST} or more voxels a side. Nothing was written."
+                f"{path} has {values.shape} voxels; expected {_LEAST} or more along each side. Nothing was written."
             )
         if crop != "finite" and (share := 1 - np.isfinite(values).mean()):
             raise DataError(
-                f"{path} has values that are not finite, {share:.2%} of its voxels. If they lie outside the circle of "
-                "the field, --crop finite measures the square inside it. Nothing was written."
+                f"{share:.2%} of the voxels of {path} are not finite. If they are outside the circle of the field of "
+                "view, use --crop finite, which measures the square inside the circle. Nothing was written."
             )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
@@ -153,13 +156,14 @@ def _edges(spacing: ArrayLike) -> str:
 def slabs_of(
     path: Path, dataset: str | None, read: ReadSlices, box: Box, tell: Callable[[int, int], None]
 ) -> Iterator[F32]:
-    """The box in all slices that were asked for, at most as many at once as were read, and the last of the slab before.
+    """The box in all slices that were asked for, in slabs of at most as many slices as were read. Each slab begins with
+    the last slice of the slab before.
 
     Args:
-        tell: gets slabs taken, and all.
+        tell: is called with the number of slabs read, and of all slabs.
 
     Raises:
-        DataError: values that are not finite.
+        DataError: some values are not finite.
     """
     asked = np.arange(read.asked.start, read.asked.stop)
     slabs = [
@@ -179,11 +183,11 @@ def box_in(volume: F32, crop: Crop) -> Box:
     """The part of a volume that is measured.
 
     Args:
-        crop: "square": inside the circle of the sample, or of the field if the sample is wider. "finite": inside the
-            circle that has finite values in all slices. "none": all.
+        crop: "square": the square inside the sample, or inside the field of view if the sample is wider. "finite": the
+            square inside the circle of finite values. "none": everything.
 
     Raises:
-        ValueError: the volume is the same everywhere, or has values in the square that are not finite.
+        ValueError: the volume has the same value everywhere, or some values in the square are not finite.
     """
     nz, ny, nx = volume.shape
     if crop == "none":
@@ -192,7 +196,7 @@ def box_in(volume: F32, crop: Crop) -> Box:
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
-            raise ValueError("it has values that are not finite, and they are not those outside a circle")
+            raise ValueError("some of its values are not finite, and not all of these are outside a circle")
         return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
@@ -207,14 +211,14 @@ def box_in(volume: F32, crop: Crop) -> Box:
 def sample_circle(volume: F32) -> tuple[float, float, float]:
     """Centre (y, x) and radius of the sample seen along z, in voxels.
 
-    K-means divides the root of the mean over z above its least value into two classes, so that a pin of metal is not
-    one of them; the circle has the extent of the largest connected part.
+    The mean over z, minus its least value, is divided into two classes with k-means. Its square root is used, so that a
+    pin of metal is not a class of its own. The circle has the extent of the largest connected part.
 
     Args:
         volume: [z, y, x], finite.
 
     Raises:
-        ValueError: the mean is the same everywhere.
+        ValueError: the mean has the same value everywhere.
     """
     mean = volume.mean(axis=0, dtype=np.float64)
     mean = np.sqrt(mean - mean.min())
@@ -226,12 +230,12 @@ def sample_circle(volume: F32) -> tuple[float, float, float]:
 
 
 def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float], margin: float = 0.05) -> Box:
-    """All slices of the square inside a circle, of side 2 r cos 45° less a margin, cut to the volume.
+    """All slices of the square inside a circle, of side 2 r cos 45° minus a margin, cut to the volume.
 
     Args:
         shape: (nz, ny, nx).
         circle: centre (y, x) and radius in voxels.
-        margin: share of the side taken off at each of its ends, below 0.5.
+        margin: fraction of the side left out at each end, below 0.5.
 
     Raises:
         ValueError: the box is empty.
@@ -243,25 +247,33 @@ def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float
         for c, n in zip(centre, shape[1:], strict=True)
     )
     if y.start >= y.stop or x.start >= x.stop:
-        raise ValueError(f"the square in a circle of radius {radius:.3g} voxels at {centre} holds no voxel of {shape}")
+        raise ValueError(
+            f"no voxel of {shape} is in the square inside the circle of radius {radius:.3g} voxels at {centre}"
+        )
     return slice(0, shape[0]), y, x
 
 
 def parts_of(
     read: ReadSlices, scan: Path, count: int, warn: Callable[[str], None], tell: Callable[[int, int], None]
 ) -> list[F32]:
-    """The slices of a volume from each of `count` interleaved parts of the views of its scan, by its method.
+    """Reconstruct the slices of a volume from each of `count` interleaved parts of the projections, with its own
+    method.
 
-    The views, in the order of their angles, are dealt out as by error bars; corrections are the defaults of `recon`.
-    Of a parallel beam the rows of these slices, and some beside them, are read.
+    The projections are sorted by angle and dealt out in turn, as for error bars. Corrections are the defaults of
+    `recon`. For a parallel beam only the rows of these slices, and some next to them, are read.
 
     Raises:
-        DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method takes no such views, the
-            slices are not those of the scan's rows, or the volume does not state its axis.
+        DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method cannot use these
+            projections,
+            the slices are not those of the scan's rows, or the volume does not state its axis.
     """
     record, facts, at = read.record, read.record.parameters, read.slices
     if math.isnan(record.axis_col):
-        raise ValueError("it does not state the axis of its scan, about which halves are made: give --parts or --quick")
+        raise ValueError(
+            "give --parts or --quick, because the volume does not state the rotation axis, which is needed to "
+            "reconstruct the "
+            "halves"
+        )
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
@@ -272,15 +284,18 @@ def parts_of(
         if selected.cone is None:
             if (end - first) // side != read.n_slices:
                 raise ValueError(
-                    f"the volume has {read.n_slices} slices, but rows {first}:{end} of its scan give "
-                    f"{(end - first) // side}: give --parts or --quick"
+                    f"give --parts or --quick, because the volume has {read.n_slices} slices, but rows {first}:{end} "
+                    "of its "
+                    f"scan give {(end - first) // side}"
                 )
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
             selection = replace(selection, rows=(first + low * side, first + high * side))
             at = slice(at.start - low, at.stop - low)
         elif read.limit_sentence:
             raise ValueError(
-                "halves of a cone's views are reconstructed whole, which memory does not hold: give --quick or --parts"
+                "give --quick or --parts, because halves of cone-beam projections must be reconstructed whole, and do "
+                "not fit "
+                "the memory"
             )
         prepared = prepare_projections(source, selection, warn)
     views, order = prepared.views, np.argsort(np.mod(prepared.geometry.angles, prepared.geometry.period), kind="stable")

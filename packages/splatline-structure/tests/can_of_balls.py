@@ -1,4 +1,4 @@
-"""A can with balls in known places: what a count of particles has to find."""
+"""A can with balls at known positions, to test the count of particles."""
 
 from __future__ import annotations
 

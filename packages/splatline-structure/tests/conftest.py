@@ -1,4 +1,4 @@
-"""What stands beside the tests is imported by its name."""
+"""Lets tests import the modules next to them by name."""
 
 import sys
 from pathlib import Path

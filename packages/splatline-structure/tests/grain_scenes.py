@@ -1,5 +1,5 @@
-"""Thirty scenes with a truth: grains packed in a matrix, and the simulator's cathode; twenty to build on, ten to look
-at once.
+"""Thirty scenes with a ground truth: grains packed in a matrix, and the simulator's cathode. Twenty are for
+development, ten were looked at only once.
 """
 
 from __future__ import annotations

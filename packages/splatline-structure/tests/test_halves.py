@@ -1,4 +1,4 @@
-"""A scan's volume from each half of its views, and numbers against the number of views."""
+"""Volumes from each half of the projections of a scan, and numbers against the number of projections."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_thirty_views_of_a_thousand_photons_across_256_columns_determine_nothing
         for part in (views, views[::2], views[1::2])
     ]
     intervals = found_in(of_views[0], of_views[1:], 2, (1, 1, 1), replace(RULES, side=0)).intervals
-    assert all("more views or photons" in each.why_not for each in intervals.values())
+    assert all("more projections or photons" in each.why_not for each in intervals.values())
 
 
 @pytest.mark.slow
@@ -141,7 +141,7 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 def test_a_scan_is_refused_and_what_is_to_be_done_is_named(here: Path) -> None:
     result = beamline("structure", "scan.h5", "--voxel-um", "2")
     assert result.exit_code == 5
-    assert "is a scan (/exchange/data (Data Exchange)): reconstruct it with `beamline recon`" in result.stderr
+    assert "with `beamline recon` first: it is a scan (/exchange/data (Data Exchange))" in result.stderr
     assert left(here) == {"scan.h5"}
 
 
@@ -150,7 +150,7 @@ def test_a_volume_that_is_laid_out_as_a_scan_is_read_by_its_name(here: Path) -> 
         file["exchange/data"] = np.zeros((9, 10, 11), np.float32)
     read = read_volume(here / "volume.h5", "exchange/data", (2, 2, 2), None, 10**9, "square")
     assert read.record.grid.shape == (9, 10, 11)
-    with pytest.raises(DataError, match="if it is a volume, give --dataset"):
+    with pytest.raises(DataError, match="If it does hold a volume, give --dataset"):
         read_volume(here / "volume.h5", None, (2, 2, 2), None, 10**9, "square")
 
 
@@ -158,16 +158,17 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
     np.save(here / "v.npy", np.random.default_rng(0).random((10, 48, 48), np.float32))
     read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, "square")
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
-    with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: give --parts or --quick"):
+    with pytest.raises(
+        ValueError,
+        match=r"give --parts or --quick, because the volume has 10 slices, but rows 0:16 of its scan give 16",
+    ):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 
 
 def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((16, 48, 48), np.float32))
     result = beamline("structure", "v.npy", "--voxel-um", "2", "--scan", "scan.h5")
-    words = (
-        "v.npy cannot be measured: it does not state the axis of its scan, about which halves are made: give --parts"
-    )
+    words = "v.npy cannot be measured: give --parts or --quick, because the volume does not state the rotation axis"
     assert result.exit_code == 5 and words in result.stderr
     assert left(here) == {"scan.h5", "v.npy"}
 
@@ -176,7 +177,7 @@ def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Pat
 def test_views_that_cannot_be_parted_are_refused(here: Path, views: str) -> None:
     result = beamline("study", "structure", "scan.h5", "--views", views)
     assert result.exit_code == 2
-    assert f"'{views}': expected numbers such as 45,90,180, of 16 views or more" in result.stderr
+    assert f"'{views}': expected numbers such as 45,90,180, each 16 or more" in result.stderr
     assert left(here) == {"scan.h5"}
 
 

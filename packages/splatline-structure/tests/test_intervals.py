@@ -1,4 +1,4 @@
-"""Intervals of sizes, by the particles that are there; of all slices, by those of the middle; of a change."""
+"""Intervals: of sizes, from the number of particles; of all slices, from the measured slices; of a change."""
 
 from __future__ import annotations
 
@@ -45,9 +45,12 @@ def test_other_numbers_and_a_field_without_whole_particles_have_none_of_it() -> 
 
 def test_words_name_no_cause_where_none_moves_a_number() -> None:
     assert Interval(1, 0.999, 1, 0, views=0, levels=0, voxels=0, particles=0).words == (
-        "no cause changes this number; the interval is the narrowest that is given (0.1 % to a side)"
+        "no cause changes this number, so the interval has the smallest width (0.1 % to each side)"
     )
-    assert Interval(1, 0.99, 1, 0, views=0, levels=0.01, voxels=0).words == "the threshold decides this, not the views"
+    assert (
+        Interval(1, 0.99, 1, 0, views=0, levels=0.01, voxels=0).words
+        == "the threshold limits this; more projections would not help"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -119,4 +122,4 @@ def test_a_change_has_the_causes_of_both_states() -> None:
     change = difference(one, other)
     assert change.moves == pytest.approx(0.02)
     assert (change.views, change.levels, change.voxels) == pytest.approx((0.05, 0.05, 0.04))
-    assert change.words == "more views would narrow this"
+    assert change.words == "more projections would narrow the interval"

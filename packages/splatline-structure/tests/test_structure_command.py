@@ -1,4 +1,4 @@
-"""`beamline structure`: files, numbers, the words of intervals, two states, and refusals."""
+"""`beamline structure`: files, numbers, explanations of intervals, two states, errors."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def test_a_volume_gets_a_folder_of_numbers_particles_labels_and_a_page(here: Pat
     rows = {row["number"]: row for row in _rows(here / "can_structure/numbers.csv")}
     size = rows["size_50"]
     assert float(size["low"]) < float(size["value"]) < float(size["high"]) and size["unit"] == "µm"
-    assert size["decides"] == "more whole particles would narrow this: a larger field"  # of six balls
+    assert size["decides"] == "more whole particles (a larger field of view) would narrow the interval"  # of six balls
     assert rows["fraction_2"]["decides"] in (
-        "the threshold decides this, not the views",
-        "the size of a voxel decides this, not the views",
+        "the threshold limits this; more projections would not help",
+        "the voxel size limits this; more projections would not help",
     )
     assert facts["numbers"]["fraction_2"]["value"] == pytest.approx(float(rows["fraction_2"]["value"]), rel=1e-3)
     particles = _rows(here / "can_structure/particles.csv")
@@ -108,7 +108,7 @@ def test_two_states_are_told_apart_or_not(here: Path) -> None:
     same = beamline("structure", "can.npy", "can.npy", *common, "-o", "d")
     assert same.exit_code == 0
     assert {row["decides"] for row in _rows(here / "d/numbers.csv") if row["value"] == "not determined"} >= {
-        "no change is told from none"
+        "the change is smaller than its uncertainty"
     }
     assert len(json.loads((here / "d/structure.json").read_text(encoding="utf-8"))["states"]) == 2
 
@@ -135,8 +135,8 @@ def test_several_volumes_of_which_memory_does_not_hold_one_are_refused_before_an
     result = beamline("structure", "short.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M")
     assert result.exit_code == 5
     assert (
-        "can.npy: 40 slices of 72 x 72 voxels take 22.2 MB, and 13.3 MB may be used for each of several volumes. "
-        "Free memory, give more --memory, fewer --slices, or measure a part" in result.stderr
+        "can.npy: not enough memory. 40 slices of 72 x 72 voxels need 22.2 MB, and 13.3 MB are allowed for each of "
+        "several volumes. Free memory, give more --memory, fewer --slices, or measure a part" in result.stderr
     )
     result = beamline("structure", "can.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M", "--crop", "none")
     assert "fewer --slices, --crop square, or" in result.stderr and left(here) == before
@@ -158,7 +158,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
     np.save(here / "can.npy", volume)
     common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
     result = beamline(*common)
-    words = "the rarer one; only slices 14:26, which memory holds, were looked at: give more --memory, or others by"
+    words = "the rarer level; only slices 14:26 fit the memory and were measured: give more --memory, or choose other"
     assert result.exit_code == 5 and words in result.stderr
     assert "views" not in result.stderr and "--materials" not in result.stderr
     assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr
@@ -199,7 +199,7 @@ def test_of_a_volume_larger_than_the_memory_the_middle_is_looked_at_and_all_for_
     common = ("structure", "can.npy", *VOXEL_UM, "--side", "0", "--parts", "half.npy", "half.npy")
     result = beamline(*common, "--memory", "13.3M", "-o", "part")
     assert result.exit_code == 0, result.output
-    words = "13.3 MB of memory hold 17 of 40 slices: numbers are of slices 11:28, in the middle"
+    words = "Only 17 of 40 slices fit into 13.3 MB of memory. Numbers are measured in the slices 11:28, in the middle"
     assert words in result.stderr and words in result.stdout
     assert words in (here / "part/report.html").read_text(encoding="utf-8")
     rows = {row["number"]: row for row in _rows(here / "part/numbers.csv")}
@@ -240,7 +240,7 @@ for n, memory in ((16, "1G"), (120, "30M")):
     result = CliRunner().invoke(main, [*words, "--parts", "h.npy", "h.npy"])
     assert result.exit_code == 0, result.output
     peaks.append(peak_memory())
-assert "30 MB of memory hold 78 of 120 slices" in result.output
+assert "Only 78 of 120 slices fit into 30 MB" in result.output
 print(peaks[1] - peaks[0])
 """
     ran = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -250,27 +250,27 @@ print(peaks[1] - peaks[0])
 
 REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
-    (("noise.npy", *VOXEL_UM), 5, "near the rarer one; reconstruct from more views. Nothing"),
-    (("can.npy",), 5, "does not state the size of a voxel: give --voxel-um"),
+    (("noise.npy", *VOXEL_UM), 5, "near the rarer level; reconstruct from more projections. Nothing"),
+    (("can.npy",), 5, "does not state the voxel size. Nothing was written"),
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
-    (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice are squares"),
-    (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "which are labels, not grey values"),
-    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "unpacks to 830 kB, and 10 kB may be used"),
-    (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
-    (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
+    (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice must be squares"),
+    (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "so they are labels and not grey values"),
+    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "Unpacked it has 830 kB, and 10 kB are allowed"),
+    (("holes.npy", *VOXEL_UM), 5, "holes.npy are not finite"),
+    (("small.npy", *VOXEL_UM), 5, "expected 8 or more along each side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
-    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels take 9.75 MB, and 4 MB may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels need 9.75 MB, and 4 MB are allowed"),
     (("can.npy", *VOXEL_UM, "--memory", "some"), 2, "'some' is not a size"),
-    (("can.npy", *VOXEL_UM, "--memory", "0.0001K"), 5, "and 0 B may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "0.0001K"), 5, "and 0 B are allowed"),
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "(`recon --roi`, then --parts or --quick)"),
     (("can.npy", *VOXEL_UM, "--scan", "nosuch.h5"), 2, "'nosuch.h5' does not exist"),
-    (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
-    (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
-    (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
+    (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "There is no material 3"),
+    (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare needs two volumes"),
+    (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts needs exactly one volume"),
     (
         ("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"),
         5,
-        "half of its views has the shape (4, 12, 12), not (40, 72, 72): give --parts of these voxels, or --quick",
+        "half of the projections has the shape (4, 12, 12), not (40, 72, 72): give --parts with the same voxels, or",
     ),
 ]
 
@@ -298,7 +298,10 @@ def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> N
     np.save(here / "plate.npy", volume.astype(np.float32))
     result = beamline("structure", "plate.npy", *VOXEL_UM, "--quick", "--crop", "none", "--side", "20")
     assert result.exit_code == 0, result.output
-    assert "there is no whole particle in the field" in result.stdout and "nothing connects the faces" in result.stdout
+    assert (
+        "no particle is completely in the measured box" in result.stdout
+        and "nothing connects the faces" in result.stdout
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -307,8 +310,8 @@ def test_labels_edges_and_options_are_said_back(here: Path) -> None:
     words = ("structure", "three.npz", "--voxel-um", "10", "--quick", "--crop", "none", "--side", "1", "-o", "o")
     result = beamline(*words)
     assert result.exit_code == 0, result.output
-    assert "states voxels of 30 x 10 x 10 µm" in result.stderr
-    assert "is taken as labels, not as grey values: the value 0 is material 1, 1 is material 2." in result.stderr
+    assert "states voxels with edges of 30 x 10 x 10 µm" in result.stderr and "used instead: 10 x 10" in result.stderr
+    assert "read as labels and not as grey values: 0 is material 1, 1 is material 2." in result.stderr
     settings = json.loads((here / "o/structure.json").read_text(encoding="utf-8"))
     assert " ".join(words) in json.dumps(settings)
 
@@ -324,5 +327,5 @@ def test_the_former_name_says_what_to_use(here: Path) -> None:
 
 def test_a_scan_that_is_not_there_is_a_warning(here: Path, undrawn: None) -> None:
     result = beamline("structure", "can.npy", *VOXEL_UM, "--side", "0")
-    assert result.exit_code == 0 and "its scan is not there" in result.stderr
+    assert result.exit_code == 0 and "because its scan" in result.stderr
     assert command.structure.name == "structure"

@@ -1,4 +1,4 @@
-"""What is read of a file, and the box in it; balls in a can are found with number, size and place."""
+"""Which slices are read, and the box in them; balls in a can are found with number, size and position."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted
     read = read_volume(path, None, (10, 10, 10), slices, 13_300_000, "square")
     first, end = slices or (0, 40)
     assert (read.slices, read.asked, read.n_slices) == (read_slices, slice(first, end), 40)
-    assert "Free memory or give more --memory to measure more slices." in read.limit_sentence
+    assert "free memory or give more --memory." in read.limit_sentence
     box = box_in(read.record.volume.data, "square")
     slabs = list(slabs_of(path, None, read, box, lambda n, of: counted.append((n, of))))
     own = [slabs[0], *(slab[1:] for slab in slabs[1:])]
@@ -82,12 +82,12 @@ def test_a_volume_that_is_not_finite_outside_a_circle_is_measured_inside_it(tmp_
     volume[:, np.hypot(y, x) > 35] = np.nan
     np.save(tmp_path / "v.npy", volume)
     for crop in ("square", "none"):
-        with pytest.raises(DataError, match=r"not finite, 2\d\.\d+% .*--crop finite"):
+        with pytest.raises(DataError, match=r"2\d\.\d+% of the voxels of .* are not finite\. .*--crop finite"):
             read_volume(tmp_path / "v.npy", None, (1, 1, 1), None, 10**9, crop)
     read = read_volume(tmp_path / "v.npy", None, (1, 1, 1), None, 10**9, "finite")
     box = box_in(read.record.volume.data, "finite")
     assert np.isfinite(volume[box]).all() and box[1] == box[2] and box[1].stop - box[1].start in range(47, 52)
     volume[3, 36, 36] = np.inf
-    with pytest.raises(ValueError, match="not those outside a circle"):
+    with pytest.raises(ValueError, match="not all of these are outside a circle"):
         box_in(volume, "finite")
     np.testing.assert_equal(box_in(np.nan_to_num(volume), "finite"), box_in(np.nan_to_num(volume), "square"))

@@ -1,1 +1,1 @@
-"""The running scan as a Tango device."""
+"""Serves the running scan as a Tango device."""

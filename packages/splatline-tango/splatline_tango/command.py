@@ -1,4 +1,4 @@
-"""`beamline tango`: the running scan as a Tango device."""
+"""`beamline tango`: serves the running scan as a Tango device."""
 
 from __future__ import annotations
 
@@ -10,34 +10,39 @@ import click
 
 def _device_name(ctx: click.Context, param: click.Parameter, value: str) -> str:
     if not re.fullmatch(r"[\w.-]+(/[\w.-]+){2}", value):
-        raise click.BadParameter(f"{value!r} is no name of a device; expected DOMAIN/FAMILY/MEMBER.")
+        raise click.BadParameter(f"{value!r} is not a device name; expected DOMAIN/FAMILY/MEMBER.")
     return value
 
 
 @click.command()
 @click.argument("runs", required=False, default="runs", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--device", default="splatline/scan/1", show_default=True, callback=_device_name, metavar="NAME",
-              help="Its name.")  # fmt: skip
+              help="Name of the device.")  # fmt: skip
 @click.option("--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS",
-              help="Address to listen at; 0.0.0.0: all.")  # fmt: skip
+              help="Network address on which clients may connect; 0.0.0.0: any.")  # fmt: skip
 @click.option("--port", default=10100, show_default=True, type=click.IntRange(1024, 65535),
-              help="TCP port to listen at.")  # fmt: skip
+              help="TCP port on which clients connect.")  # fmt: skip
 @click.option(
     "--instance", metavar="NAME",
-    help="Serve the devices that the database at TANGO_HOST holds for the server splatline/NAME; --device is not used.",
+    help="Serve the devices that the database at TANGO_HOST lists for the server splatline/NAME, instead of --device.",
 )  # fmt: skip
 @click.option(
-    "--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan, and choose what is next."
+    "--control",
+    is_flag=True,
+    help="Let clients pause, resume, stop and abort the scan, and decide what it measures next.",
 )
 def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, control: bool) -> None:
-    """Serve the running scan as a Tango device: the newest run of the folder RUNS (default ./runs).
+    """Serve the running scan as a Tango device.
 
-    It only reads the run's files, so that it cannot slow a scan down. Tango has no passwords: with --control everybody
-    who reaches the address may end a scan.
+    The device is the newest run of the folder RUNS (default ./runs). The command only reads the files of the run, so
+    it cannot slow a scan down. Tango has no passwords: with --control, everybody who reaches the address can end a
+    scan.
 
-    Exit code: 0 ended by Ctrl-C, 5 the address cannot be listened at, or the database does not answer.
+    Exit codes: 0 ended by Ctrl-C, 5 the address cannot be used, or the database does not answer.
+
+    Example: beamline tango runs --device id19/tomo/scan --bind 0.0.0.0
     """
     from splatline_tango.device import ServerPlace, serve
 
     place = ServerPlace(bind, port, device, instance)
-    serve(runs, place, control, lambda: click.echo(f"{place}. Ctrl-C ends this, not the scan."))
+    serve(runs, place, control, lambda: click.echo(f"{place}. Ctrl-C ends the Tango device, not the scan."))

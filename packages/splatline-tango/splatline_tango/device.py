@@ -1,4 +1,4 @@
-"""The Tango device of a run, and what clients may ask the scan for."""
+"""The Tango device of a run, with the commands by which clients control the scan."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from beamline.scan.control import State, Verb, ask
 from beamline.scan.runs import newest
 
 ATTRIBUTES = [each for each in fields(RunValues) if each.name not in ("data_rate", "residual", "skipped")]
-"""The values of a run that are attributes of the device; `metadata` has their names, meanings and units."""
+"""The values of a run that are attributes of the device. `metadata` has their names, meanings and units."""
 _CLASS = "SplatlineScan"
-_CHECKS = 64  # of the monitor, or options of what is next, at most
+_CHECKS = 64  # largest number of checks of the monitor, or of options for the next pass
 _TYPES: dict[str, dict[str, Any]] = {
     "str": {"dtype": str},
     "int": {"dtype": int},
@@ -40,14 +40,14 @@ _STATES: dict[str, str] = {
 
 
 def device_state(values: RunValues) -> tango.DevState:
-    """RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused or asks, ON when none runs, FAULT
-    after one that failed.
+    """State of the device: RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused or waits for a
+    decision, ON while no scan is running, FAULT after a scan that failed.
     """
     return getattr(tango.DevState, _STATES.get(values.state, "ALARM" if values.alarms else "RUNNING"))
 
 
 def reading(stamped: StampedValues, name: str) -> tuple[Any, float, tango.AttrQuality]:
-    """A value, its time in s since the Unix epoch, and its quality: INVALID if it is unknown or old."""
+    """A value, its time in s since the Unix epoch, and its quality: INVALID if the value is unknown or old."""
     value, stamp = getattr(stamped.values, name), stamped.stamp(name)
     quality = _RAISED.get(name, tango.AttrQuality.ATTR_VALID) if value else tango.AttrQuality.ATTR_VALID
     if stamp.severity is Severity.INVALID:
@@ -57,7 +57,7 @@ def reading(stamped: StampedValues, name: str) -> tuple[Any, float, tango.AttrQu
 
 
 def latin(value: Any) -> Any:
-    """A text with "?" for each character that Tango's strings, which are Latin-1, lack; another value as it is."""
+    """A text with "?" for each character that is not Latin-1, as Tango needs it; any other value unchanged."""
     return value.encode("latin-1", "replace").decode("latin-1") if isinstance(value, str) else value
 
 
@@ -66,9 +66,9 @@ class ServerPlace:
     """Where a device is served.
 
     Attributes:
-        address, port: to listen at.
-        device: its name, without a database.
-        instance: of the server `splatline` in the database, which names the device; None: without a database.
+        address, port: where clients connect.
+        device: name of the device, without a database.
+        instance: instance of the server `splatline` in the database, which names the device; None: no database.
     """
 
     address: str
@@ -93,7 +93,7 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     """The class of the device.
 
     Args:
-        control: verbs are commands of it.
+        control: clients can send commands to the scan.
     """
 
     def reader(name: str) -> Callable[[Any], tuple[Any, float, Any]]:
@@ -121,19 +121,19 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
 
 
 def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
-    """The command of the device that sends a verb to the run, and returns at once."""
+    """The command of the device that sends a command to the run, and returns at once."""
 
     def send(device: Any) -> None:
         _send(run, lambda: verb, send.__name__)
 
     send.__name__ = verb.value.capitalize()
-    send.__doc__ = f"What `beamline {verb}` does. Returns at once; the state says when it is done."
+    send.__doc__ = f"Same as `beamline {verb}`. Returns at once; the state says when it is done."
     return send
 
 
 def _decider(run: FollowedRun) -> Callable[[Any, str], None]:
     def Decide(device: Any, choice: str) -> None:  # noqa: N802 - the name of the command
-        """What `beamline decide` does. Returns at once."""
+        """Same as `beamline decide`. Returns at once."""
         _send(run, lambda: choice_of(run.stamped.values, choice), "Decide")
 
     return Decide
@@ -150,11 +150,11 @@ def serve(runs: Path, place: ServerPlace, control: bool, ready: Callable[[], Non
     """Serve the newest run of a folder, and each one that begins later, until SIGINT or SIGTERM.
 
     Args:
-        control: verbs are taken, from everybody who reaches the address.
+        control: everybody who reaches the address can send commands to the scan.
         ready: is called when clients can connect.
 
     Raises:
-        DataError: the address cannot be listened at, or the database does not answer.
+        DataError: the address cannot be used, or the database does not answer.
     """
     started = False
 
@@ -176,10 +176,14 @@ def serve(runs: Path, place: ServerPlace, control: bool, ready: Callable[[], Non
         try:
             run_server([device_class(run, control)], args=place.arguments, event_loop=look, post_init_callback=start,
                        raises=True, verbose=False)  # fmt: skip
-        except (tango.DevFailed, RuntimeError) as error:  # RuntimeError: of omniORB, where another one has the port
+        except (tango.DevFailed, RuntimeError) as error:  # omniORB raises RuntimeError if the port is taken
             if started:
                 raise
-            why = error.args[0].desc if isinstance(error, tango.DevFailed) else "the port is taken, or not this host's"
+            why = (
+                error.args[0].desc
+                if isinstance(error, tango.DevFailed)
+                else "another program uses the port, or the address is not one of this computer"
+            )
             raise DataError(f"{place} cannot be served: {why}. Nothing was started.") from error
 
 

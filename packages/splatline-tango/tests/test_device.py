@@ -1,4 +1,4 @@
-"""A client of Tango reads a run, its pictures and its end, and ends it where it may."""
+"""A Tango client reads a run, its pictures and its end, and ends it if it is allowed to."""
 
 from __future__ import annotations
 
@@ -201,6 +201,6 @@ def test_a_simulated_scan_is_paused_resumed_and_stopped_beside_a_real_server(tmp
             assert scanning.wait(WITHIN) == 4
         until(lambda: device.ScanStatus == "stopped")
         second = subprocess.run(server, capture_output=True, text=True, timeout=WITHIN)  # an ORB of its own
-        assert second.returncode == 5 and "the port is taken" in second.stderr
+        assert second.returncode == 5 and "another program uses the port" in second.stderr
         serving.terminate() if sys.platform == "win32" else serving.send_signal(2)
         assert serving.wait(WITHIN) == 0

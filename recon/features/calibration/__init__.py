@@ -1,1 +1,1 @@
-"""Calibration: what a scan does not state of its geometry, learnt from its views together with the volume."""
+"""Calibration: measures the geometry and the pixel sensitivities from the projections, together with the volume."""

@@ -1,10 +1,11 @@
-"""Gains of pixels, learnt with the volume: a constant of each pixel in all views, which makes a ring.
+"""Pixel sensitivities (gains), measured together with the volume. A wrong sensitivity makes a ring.
 
-A few sweeps of FISTA-TV and the median of the residual over the views alternate, see `ring_offsets`. Total variation
-keeps rings out of the volume, and bodies in it. Without stripes, see `recon.base.stripes`, nothing is learnt:
-what few sweeps leave at edges would count as gains. Three sorts of gain stay in the views. A gain near the axis looks
-like a body on the axis. What pixels on both sides of the axis have in common looks like the wall of a can. A slow
-change along a row looks like density.
+A gain is a constant offset of a pixel's line integrals in all projections. A few iterations of FISTA-TV alternate with
+the median of the residual over the projections, see `ring_offsets`. Total variation keeps rings out of the volume, and
+bodies in it. If there are no stripes (`recon.base.stripes`), nothing is measured, because the residual of a few
+iterations at edges would count as gains. Three kinds of gain are not removed. A gain near the axis looks like a body on
+the axis. A gain that pixels on both sides of the axis share looks like the wall of a can. A slow change along a row
+looks like density.
 """
 
 from __future__ import annotations
@@ -31,24 +32,25 @@ from recon.voxels.voxel_problem import Buffers, bytes_of
 LEAST_VIEWS, LEAST_COLS = 40, NARROWEST
 NEAR_AXIS = AT_AXIS
 
-_BAND, _HALO = 16, 4  # rows at a time; rows beside them that tell a stripe of all rows
-_ONE_IN = 6  # views held out
-_TV_WEIGHT = 1e-3  # three times as much takes a sixth of a ball on the axis
+_BAND, _HALO = 16, 4  # rows at a time; additional rows on each side, which show whether a stripe is in all rows
+_ONE_IN = 6  # one in this many projections is held out
+_TV_WEIGHT = 1e-3  # three times this weight removes a sixth of a ball on the axis
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
-_BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `exceeds_standard_error`
-_LOOKED_AT = 8  # rows
+# the mean square in held-out projections must fall to this share; see `exceeds_standard_error`
+_BETTER, _SURE = 0.99, 3.0
+_LOOKED_AT = 8  # number of rows that are examined
 _BUFFERS = Buffers(8.5, 7.0, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
 class LearntGains:
-    """Gains of all pixels, as offsets of line integrals.
+    """Sensitivities of all pixels, as offsets of line integrals.
 
     Attributes:
-        pixels: float32 [row, col]; 0 where the views held out do not confirm them.
-        without, left: root mean square that volumes leave of views held out, in the rows with most matter; 0 where no
-            stripes were seen, so that nothing was learnt.
-        confirmed: by the views held out.
+        pixels: float32 [row, col]; 0 if held-out projections do not confirm them.
+        without, left: root mean square residual in held-out projections without and with the gains, in the rows with
+            most material. 0: no stripes were found, so nothing was measured.
+        confirmed: True if held-out projections confirm the gains.
     """
 
     pixels: F32
@@ -63,22 +65,25 @@ def learn_gains(
     measured: Mask | None = None,
     progress: Callable[[int, int], object] = lambda n, of: None,
 ) -> LearntGains:
-    """Find the gains of the pixels, as far as held-out views confirm them; see `gains_memory`.
+    """Measure the pixel sensitivities, as far as held-out projections confirm them; memory: see `gains_memory`.
 
-    Rows of a parallel beam are taken in bands of 16; those with most matter come first, and judge. The time is that of
-    FISTA-TV with its weight given, and 24 sweeps.
+    Rows of a parallel beam are processed in bands of 16. The bands with most material come first and decide. The time
+    is that of FISTA-TV with a given weight plus 24 iterations.
 
     Args:
         projections: line integrals [view, row, col], finite.
         measured: bool [row, col]; None: all pixels.
-        progress: takes bands done and bands in all; what it raises ends the search.
+        progress: function called with the bands done and the number of bands; an exception in it ends the search.
 
     Raises:
-        ValueError: fewer than 40 views or 64 columns.
+        ValueError: there are fewer than 40 projections or 64 columns.
     """
     (rows, cols), n = geometry.detector_shape, geometry.n_views
     if n < LEAST_VIEWS or cols < LEAST_COLS:
-        raise ValueError(f"{n} views of {cols} columns are too few; {LEAST_VIEWS} of {LEAST_COLS} are needed")
+        raise ValueError(
+            f"too few data to measure pixel sensitivities: {n} projections of {cols} columns; at least {LEAST_VIEWS} "
+            f"projections of {LEAST_COLS} columns are needed"
+        )
     seen, unseen = split_views(geometry, _ONE_IN)
     gains, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start
@@ -105,7 +110,7 @@ def learn_gains(
 
 
 def gains_memory(geometry: Geometry) -> int:
-    """Approximate peak memory of `learn_gains` in bytes, without the views."""
+    """Approximate peak memory of `learn_gains` in bytes, without the projections."""
     rows, cols = geometry.detector_shape
     outer = min(_height(geometry) + 2 * _HALO, rows)
     band = geometry if outer == rows else geometry.rows(0, outer)
@@ -113,7 +118,7 @@ def gains_memory(geometry: Geometry) -> int:
 
 
 def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
-    """Whether pixels of some rows [view, row, col] answer unequally, as far as the sample lets it be seen."""
+    """Whether some rows [view, row, col] show unequal pixel sensitivities, as far as the sample allows."""
     views = np.argsort(geometry.angles, kind="stable")
     rows = np.arange(0, projections.shape[1], max(1, projections.shape[1] // _LOOKED_AT))
     steady = steadiness(projections[np.ix_(views, rows)], geometry.axis_col)
@@ -121,7 +126,7 @@ def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
 
 
 def _height(geometry: Geometry) -> int:
-    """Rows at a time: all, where rows do not see the same slice in all views."""
+    """Number of rows at a time; all rows if a row does not show the same slice in all projections."""
     rows = geometry.detector_shape[0]
     return min(_BAND, rows) if geometry.rows_show_slices else rows
 
@@ -132,7 +137,7 @@ def _root(squares: F64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Band:
-    """Views [view, row, col] of some rows; `known` bool [row, col], None: all."""
+    """Some rows of the projections [view, row, col]; `known`: bool [row, col], None: all."""
 
     data: F32
     geometry: Geometry
@@ -146,7 +151,7 @@ class _Band:
         return cls(np.ascontiguousarray(projections[:, rows]), views, known)
 
     def learn(self, seen: NDArray[np.intp], gains: bool = True) -> tuple[Volume, F32]:
-        """The volume of some views, and the gains [row, col] that it leaves."""
+        """The volume from some projections, and the gains [row, col] from its residual."""
         views = self.geometry.select(seen)
         projector = Projector(views, Grid.matching(self.geometry))
         weight = None if self.known is None else np.broadcast_to(self.known, projector.projection_shape).astype("f4")
@@ -163,13 +168,13 @@ class _Band:
         return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
-        """[view] mean square residual of views held out, by volume and gains, in some rows."""
+        """[view] mean square residual of held-out projections for a volume and gains, in some rows."""
         left = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
         known = None if self.known is None else np.broadcast_to(self.known, left.shape)[:, rows]
         return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))
 
     def _told_apart(self) -> F32:
-        """Weights [col]: 1 where a gain cannot be mistaken for a body on the axis, which stays in a column."""
+        """Weights [col]: 1 in columns in which a gain cannot be confused with a body on the axis."""
         off = np.abs(np.arange(self.data.shape[2]) - self.geometry.axis_col)
         still = np.ptp(self.geometry.shifts[:, 0]) < 2 * NEAR_AXIS
         return np.asarray((off > NEAR_AXIS) | (not still), np.float32)

@@ -1,11 +1,12 @@
-"""Joint steps: the volume and the geometry together, by least squares on the views.
+"""Joint fit of the volume and the geometry, by least squares on the projections.
 
     min over (y, c)  ‖ p - A(g) x - A(g) y - J c ‖²_W        J: what a change c of the geometry does to the images of x
 
-An alternation of volume and geometry would be slow where the volume can hide an error: a slow drift looks like a
-slightly blurred sample. Here both are unknowns of one system, which conjugate gradients solve (Gauss-Newton; the
-geometry's part of bundle adjustment). W is the ramp of filtered back-projection along the columns, so that AᵀWA is near
-the identity and ten steps suffice. CG starts from no change. So it does not move along what the views cannot tell.
+Alternating between volume and geometry would be slow if the volume can hide an error: for example, a slow drift looks
+like a slightly blurred sample. Here both are unknowns of one system, which conjugate gradients solve (Gauss-Newton; the
+geometry part of bundle adjustment). W is the ramp filter of FBP along the columns, so that AᵀWA is near the identity
+and ten steps suffice. CG starts from zero change, so it does not move in directions that the projections do not
+determine.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from recon.voxels.fbp import ramp
 from recon.voxels.projector import Projector, projection_lines
 
 TERMS = "axis", "roll", "tilt", "shifts"
-"""The column of the axis; the axis leaning in the detector's plane; along the beam; each view's place (col, row)."""
+"""Column of the axis; in-plane tilt of the axis; its tilt along the beam; position (col, row) of each projection."""
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryChange:
-    """A change of a geometry, in its pixels and radians.
+    """A change of a geometry, in pixels and radians.
 
     Attributes:
         axis: columns.
@@ -49,7 +50,7 @@ class GeometryChange:
 
     @classmethod
     def between(cls, before: Geometry, after: Geometry) -> GeometryChange:
-        """The change from one geometry to another one of the same views."""
+        """The change from one geometry to another one of the same projections."""
         return cls(
             after.axis_col - before.axis_col,
             float((after.roll - before.roll).mean()),
@@ -58,14 +59,14 @@ class GeometryChange:
         )
 
     def of(self, terms: frozenset[str]) -> GeometryChange:
-        """The change of these terms only."""
+        """The change with only these terms."""
         return GeometryChange(
             self.axis * ("axis" in terms), self.roll * ("roll" in terms), self.tilt * ("tilt" in terms),
             self.shifts * ("shifts" in terms),
         )  # fmt: skip
 
     def scaled(self, factor: float) -> GeometryChange:
-        """The same in pixels that are smaller by this factor."""
+        """The same change in pixels that are smaller by this factor."""
         return replace(self, axis=self.axis * factor, shifts=self.shifts * factor)
 
     def applied(self, geometry: Geometry) -> Geometry:
@@ -80,7 +81,7 @@ class GeometryChange:
 
 
 def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
-    """Shifts [view, 2] without the part that nobody can know, and their mean along the columns: the axis' part."""
+    """Shifts [view, 2] without the part that data cannot determine, and their mean along the columns (the axis)."""
     place = np.stack((np.ones_like(angles), np.cos(angles), np.sin(angles)), axis=1)
     solution = np.linalg.lstsq(place, shifts[:, 0], rcond=None)[0]
     rest = np.stack((shifts[:, 0] - place @ solution, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
@@ -88,14 +89,14 @@ def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
-    """The derivative of images [view, col, row] by each quantity, per step of a pixel (of angles: at an image's edge).
+    """Derivatives of images [view, col, row] by each quantity, per step of a pixel (for angles: at the image's edge).
 
     Args:
-        tilted: the derivative by tilt, a radian; None: not wanted.
+        tilted: derivative by tilt, per radian; None: not needed.
     """
     across, down = -np.gradient(images, axis=1), -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
     by_term: dict[str, F32] = {}
-    if "axis" in terms:  # beside shifts, too: their mean then comes in one step
+    if "axis" in terms:  # also if there are shifts, so that their mean is found in one step
         by_term["axis"] = across
     if "shifts" in terms:
         by_term |= {"col": across, "row": down}
@@ -111,12 +112,13 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
 
 
 def edge_motion(geometry: Geometry) -> float:
-    """Displacement of an image's edge by roll or tilt, in pixels a radian."""
+    """Displacement of the image's edge by roll or tilt, in pixels per radian."""
     return max(geometry.detector_shape) / 2
 
 
 def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: float) -> Geometry:
-    """The geometry after steps along `slopes`, of at most `farthest` pixels; what nobody can know is left out."""
+    """The geometry after steps along `slopes` of at most `farthest` pixels, without parts that data cannot
+    determine."""
     limited = {name: np.clip(step, -farthest, farthest) for name, step in steps.items()}
     shifts, axis = geometry.shifts.copy(), geometry.axis_col
     if "col" in limited:
@@ -136,21 +138,21 @@ def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: f
     )
 
 
-_TRIAL = 0.25  # pixels at an image's edge, for the derivative by tilt
-_MARGIN = 3  # slices beyond the rows at either end
-_FLOOR = 0.05  # of the typical view's information: a view without matter does not move
+_TRIAL = 0.25  # pixels at the image's edge, for the derivative by tilt
+_MARGIN = 3  # additional slices at either end
+_FLOOR = 0.05  # share of the information in a typical projection; a projection without material is not moved
 
 
 @dataclass(eq=False)
 class JointFit:
-    """A volume [y, x, z] and the geometry of some views, improved together step by step.
+    """A volume [y, x, z] and the geometry of some projections, improved together in steps.
 
     Attributes:
         data: [view, col, row], line integrals.
-        known: [view, col, row] weights of rays; None: one for all.
-        terms: of `TERMS`, which may change.
-        volume: the best so far.
-        turned: the data as a detector without roll would have taken them.
+        known: [view, col, row] weights of rays; None: 1 for all.
+        terms: those of `TERMS` that may change.
+        volume: the best volume so far.
+        turned: the data as a detector without roll would have measured them.
     """
 
     data: F32
@@ -168,23 +170,23 @@ class JointFit:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None) -> JointFit:
-        """The fit of views [view, row, col]."""
+        """A fit to projections [view, row, col]."""
         tall = taller(Grid.matching(geometry))
         rays = None if known is None else projection_lines(known)
         return cls(projection_lines(data), geometry, terms, tall, rays)
 
     def weighed(self, images: F32) -> F32:
-        """Images times W, see the module."""
+        """W applied to images, see the module."""
         if self.known is None:
             return _ramp(images)
         return self.known * _ramp(self.known * images)
 
     def step(self, rounds: int, farthest: float) -> None:
-        """One step of Gauss-Newton on the volume, and on the geometry where the volume is not zero.
+        """One Gauss-Newton step for the volume, and for the geometry if the volume is not zero.
 
         Args:
-            rounds: of conjugate gradients.
-            farthest: pixels that anything may move.
+            rounds: number of conjugate-gradient iterations.
+            farthest: largest move of anything, in pixels.
         """
         model = _Model(self.geometry, self.grid)
         images, free = model.forward(self.volume), dict[str, F32]()
@@ -201,15 +203,15 @@ class JointFit:
 
 
 def taller(grid: Grid) -> Grid:
-    """The grid with more slices at either end, for rays of views that lean or are shifted."""
+    """The grid with more slices at either end, for tilted or shifted projections."""
     return replace(grid, shape=(grid.shape[0] + 2 * _MARGIN, *grid.shape[1:]))
 
 
 class _Model:
-    """Images [view, col, row] of a volume [y, x, z] without roll, and the transpose.
+    """Projection of a volume [y, x, z] to images [view, col, row] without roll, and the transpose.
 
-    A tilt of a parallel beam is taken to first order: it displaces what a voxel adds to an image along the rows by the
-    voxel's depth times the tilt. So images of the volume times x and times y suffice.
+    A tilt in a parallel beam is approximated to first order: it displaces the contribution of a voxel along the rows by
+    the voxel's depth times the tilt. So images of the volume times x and times y suffice.
     """
 
     def __init__(self, geometry: Geometry, grid: Grid) -> None:
@@ -236,7 +238,7 @@ class _Model:
         return volume
 
     def by_tilt(self, volume: F32) -> F32:
-        """The derivative of the images by tilt, a radian."""
+        """The derivative of the images by tilt, per radian."""
         if self.geometry.is_cone:
             trial = _TRIAL / max(self.geometry.detector_shape)
             there, back = (
@@ -249,7 +251,7 @@ class _Model:
 
 
 def _along_rows(images: F32) -> F32:
-    """Slopes along the rows by central differences of fourth order; 0 beyond them."""
+    """Slopes along the rows (central differences of fourth order); 0 outside."""
     out = np.zeros_like(images)
     for reach, share in ((1, 8 / 12), (2, -1 / 12)):
         out[..., :-reach] += np.float32(share) * images[..., reach:]
@@ -258,7 +260,7 @@ def _along_rows(images: F32) -> F32:
 
 
 def _turned_back(data: F32, geometry: Geometry) -> F32:
-    """Views [view, col, row] as a detector without roll would have taken them (cubic)."""
+    """Projections [view, col, row] as a detector without roll would have measured them (cubic interpolation)."""
     out = np.empty_like(data)
     for view in range(len(data)):
         c, s = math.cos(geometry.roll[view]), math.sin(geometry.roll[view])
@@ -278,15 +280,19 @@ def _ramp(images: F32) -> F32:
 def _solved(
     model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], left: F32, rounds: int
 ) -> tuple[F32, dict[str, F64]]:
-    """The change of the volume, and of each free quantity: [view] for the places of views, [1] for the others."""
+    """The change of the volume and of each free quantity: [view] for positions of projections, [1] for others."""
     first = model.adjoint(weighed(left))
     seen = model.forward(first)
     typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
     scale: dict[str, NDArray[np.float64]] = {}
     for name, slope in free.items():
-        told = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
-        told = np.maximum(told, _FLOOR * np.median(told)) if name in ("col", "row") else told.sum(keepdims=True)
-        scale[name] = np.sqrt(typical / np.maximum(told, 1e-30))
+        information = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
+        information = (
+            np.maximum(information, _FLOOR * np.median(information))
+            if name in ("col", "row")
+            else information.sum(keepdims=True)
+        )
+        scale[name] = np.sqrt(typical / np.maximum(information, 1e-30))
 
     def back(images: F32) -> tuple[F32, dict[str, F64]]:
         values = {}

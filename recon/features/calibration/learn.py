@@ -1,8 +1,8 @@
-"""learn_geometry: a better geometry from line integrals, from coarse to fine pixels, confirmed by views held out.
+"""learn_geometry: calibrates the geometry from the projections, coarse to fine, confirmed by held-out projections.
 
-To confirm it, a volume of the other views predicts those held out. Its method and projector are not those of the search
-(FISTA-TV with exact rays). Each view held out may first be put where it fits best, for either geometry. So its own
-place, which was fitted to it as well, is no advantage: the volumes alone are compared.
+For the confirmation, a volume from the other projections predicts the held-out ones. It uses another method and
+projector than the search (FISTA-TV with exact rays). Each held-out projection may first be shifted to where it fits
+best, for both geometries. So its own position, which was fitted to it, is no advantage: only the volumes are compared.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.held_out import predicted_views
 from recon.voxels.methods import EarlyTv
 
-_ONE_IN = 4  # views held out
+_ONE_IN = 4  # one in this many projections is held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
-_EDGE = 1  # row at either end, in which rays of leaning views leave the slices seen
+_EDGE = 1  # rows at either end, in which rays of tilted projections leave the reconstructed slices
 _SMOOTH = 4.0  # pixels
-_LEAST = 0.002  # share of the squared deviation that a better geometry takes away
+_LEAST = 0.002  # a better geometry must lower the squared deviation by at least this share
 _SURE = 2.0  # see `exceeds_standard_error`
 
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Measures how well a geometry predicts held-out views.
+    """Measures how well a geometry predicts held-out projections.
 
     Attributes:
         views: float32 [view, row, col], line integrals.
-        grid: of all volumes.
-        known: [row, col] weights of pixels; None: one for all.
-        placed: each view held out is first put where it fits best.
+        grid: grid of all volumes.
+        known: [row, col] weights of pixels; None: 1 for all.
+        placed: True: each held-out projection is first shifted to where it fits best.
     """
 
     views: F32
@@ -49,7 +49,7 @@ class Judge:
     placed: bool
 
     def deviations(self, geometry: Geometry) -> F64:
-        """[held-out view] root mean square residual of a volume from the other views in this geometry."""
+        """[held-out projection] root mean square residual for a volume from the other projections in this geometry."""
         method, rows = EarlyTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
         weights = None if self.known is None else np.broadcast_to(self.known, self.views.shape)
         unseen, images = predicted_views(method, Views(self.views, geometry, weights), self.grid, _ONE_IN)
@@ -61,7 +61,7 @@ class Judge:
         )
 
     def _left(self, left: F32, image: F32, known: F32) -> float:
-        """Root mean square of what is left of a view, after it was put where it fits best."""
+        """Root mean square residual of a projection after it was shifted to where it fits best."""
         rays = _without_smooth(left)[known > 0]
         if self.placed:
             ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
@@ -71,35 +71,36 @@ class Judge:
 
 
 def _without_smooth(image: F32) -> F64:
-    """Differences from the surroundings: air that is not zero and matter beyond the field are smooth."""
+    """Differences from the surroundings; this removes an air level or material outside the field, which are smooth."""
     return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
 
 
 def better(one: F64, other: F64) -> bool:
-    """Whether the first deviations [view] are significantly less than the second, given the scatter from view to
-    view."""
+    """Whether the first deviations [view] are significantly smaller than the second, given their scatter."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
     return bool(share.mean() > _LEAST) and exceeds_standard_error(share, _SURE)
 
 
-COLS, ROWS = 320, 96  # Pixels that show the geometry; more cost time
+COLS, ROWS = 320, 96  # this many pixels suffice for the geometry; more would take longer
 LEAST_VIEWS = 12
-_FEWEST = 20  # columns of the coarsest pixels
-_AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
-_STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
-_ROUNDS = 16  # of conjugate gradients in each
-_FARTHEST = 2.0  # binned pixels that anything moves in a step
-_NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller changes are dropped
+_FEWEST = 20  # fewest columns at the coarsest level
+# the axis is fitted alone first; if it is far off, single projections would move instead
+_AXIS_STEPS, _AXIS_ROUNDS = 4, 8
+_STEPS = 6, 4, 3  # Gauss-Newton steps per level, from coarse to fine
+_ROUNDS = 16  # conjugate-gradient iterations in each step
+_FARTHEST = 2.0  # largest move in a step, in binned pixels
+_NOTHING = 0.03  # pixels of the given projections, at the image's edge; smaller changes are dropped
 
 
 @dataclass(frozen=True, eq=False)
 class LearntGeometry:
-    """The calibrated change of a geometry, as far as it is confirmed.
+    """The change of a geometry by the calibration, as far as it is confirmed.
 
     Attributes:
-        change: in pixels of the views; what was not confirmed is zero.
+        change: change in pixels of the projections; terms that were not confirmed are zero.
         confirmed, dropped: names of terms.
-        before, after: median deviation of views held out, by volumes of the others.
+        before, after: median deviation of held-out projections from volumes of the others, before and after the
+            calibration.
     """
 
     change: GeometryChange
@@ -110,17 +111,20 @@ class LearntGeometry:
 
     def in_words(self, binning: int = 1) -> str:
         """The result as a sentence, in unbinned pixels."""
-        told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        changes = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
-            return "Geometry: the views show no error of it that matters; it is left as it was."
-        kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
-        if not told:
+            return "Geometry: unchanged, because the projections show no error that matters."
+        kept = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
+        if not changes:
             return f"Geometry: {kept}"
-        first = f"Geometry learnt: {told}. Views held out deviate by {self.after:.4g} in place of {self.before:.4g}."
+        first = (
+            f"Geometry calibrated: {changes}. The deviation of held-out projections fell from {self.before:.4g} to "
+            f"{self.after:.4g}."
+        )
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
-        """Values for the file of a volume, by name, in unbinned pixels."""
+        """The values for the file of a volume, by name, in unbinned pixels."""
         return {
             "calibrate_confirmed": ",".join(self.confirmed) or "none",
             "calibrate_axis_change_px": self.change.axis * binning,
@@ -138,21 +142,23 @@ def learn_geometry(
     progress: Callable[[int, int], None] = lambda n, total: None,
     known: F32 | None = None,
 ) -> LearntGeometry:
-    """Find the geometry in which a volume explains the views best, as far as held-out views confirm it.
+    """Find the geometry in which a volume explains the projections best, as far as held-out projections confirm it.
 
     Args:
-        projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
-        terms: what may change, of `joint.TERMS`.
-        progress: steps done, and steps at most.
+        projections: [view, row, col], line integrals; `COLS` columns and `ROWS` rows are enough.
+        terms: those of `joint.TERMS` that may change.
+        progress: function called with the steps done and the largest number of steps.
         known: [row, col] weights of pixels; None: one for all.
 
     Raises:
-        ValueError: fewer than twelve views, or views without matter.
+        ValueError: there are fewer than twelve projections, or they show no material.
     """
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few; {LEAST_VIEWS} are needed")
+        raise ValueError(
+            f"too few projections to calibrate the geometry: {geometry.n_views}; at least {LEAST_VIEWS} are needed"
+        )
     if not projections.any():
-        raise ValueError("no absorbing sample in the views: all line integrals are 0")
+        raise ValueError("the projections show no absorbing sample: all line integrals are 0")
     factors = _factors(*geometry.detector_shape)
     steps = _STEPS[: len(factors)]
     total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0
@@ -182,8 +188,9 @@ def learn_geometry(
 
 
 def _factors(rows: int, cols: int) -> list[int]:
-    """Binning of the levels, from coarse to fine."""
-    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1  # a pixel is not needed for a hundredth of it
+    """Binning factors of the levels, from coarse to fine."""
+    # the finest pixels are not needed to find a hundredth of a pixel
+    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1
     factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
     return factors[-len(_STEPS) :] or [1]
 
@@ -202,7 +209,7 @@ def _confirmed(
     factor: int,
     tick: Callable[[], None],
 ) -> LearntGeometry:
-    """The part of a change that views held out confirm: the whole against none, then each term of it."""
+    """The part of a change that held-out projections confirm: first the whole change, then each term of it."""
     small, data = geometry.binned(factor), bin_views(projections, factor)
     edge = edge_motion(geometry)
     sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
@@ -239,7 +246,7 @@ def _confirmed(
 
 
 def _groups(terms: list[str]) -> list[list[str]]:
-    """Terms that are confirmed together: shifts and axis are one, since the axis is their mean."""
+    """Groups of terms that are confirmed together; axis and shifts are one, because the axis is the mean shift."""
     places = [term for term in terms if term in ("axis", "shifts")]
     return [group for group in (places, *([term] for term in terms if term not in places)) if group]
 
@@ -248,5 +255,5 @@ def _text(change: GeometryChange, term: str, binning: int) -> str:
     if term == "axis":
         return f"the axis moves by {change.axis * binning:+.2f} px"
     if term == "shifts":
-        return f"views by up to {np.abs(change.shifts).max() * binning:.2f} px"
+        return f"projections shift by up to {np.abs(change.shifts).max() * binning:.2f} px"
     return f"{term} {math.degrees(getattr(change, term)):+.3f}°"

@@ -1,4 +1,4 @@
-"""Discrete tomography with partial voxels: a prior of few materials, where views held out prefer it."""
+"""Discrete tomography with partial voxels: used if held-out projections show that it is better."""
 
 from recon.base.registry import Lengths, MethodEntry
 

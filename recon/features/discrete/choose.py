@@ -1,4 +1,4 @@
-"""Which few materials, and how strong a pull to them: by views held out, and none where they do not tell."""
+"""Chooses the discrete levels and the strength of the pull to them, with held-out projections; or no levels."""
 
 from __future__ import annotations
 
@@ -17,34 +17,35 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
 PULLS = (0.02, 0.005)
-"""c, from strong to weak: the strong one takes 2 to 4 dB from smooth matter, and is refused there."""
+"""Factors c of the pull, from strong to weak. The strong one costs 2 to 4 dB in smooth samples; there it is
+rejected."""
 COUNTS = (2, 3)
-"""Numbers of materials, air among them or not; four are tried where three are best."""
-_LEAST_SHARE = 1 / 16  # of the weight of total variation
+"""Numbers of levels that are tried (air may be one of them); four are tried if three are best."""
+_LEAST_SHARE = 1 / 16  # smallest share of the weight of total variation
 _HEAVIER = 2.0
-"""Times the share of total variation that predicts views held out best. Of volumes that stand still (packed grains,
-cracks and polyhedra of 192 columns, 30 and 45 views) that share is best by the truth: 1.6 to 2.4 times, within 0.1 dB.
-Without: -0.4 to -1.6 dB."""
+"""Factor on the share of total variation that predicts the held-out projections best. The ground truth prefers 1.6 to
+2.4 times that share (finished volumes of packed grains, cracks and polyhedra; 192 columns; 30 and 45 projections).
+Without it: -0.4 to -1.6 dB."""
 
 
 def in_field(problem: VoxelProblem) -> NDArray[np.bool_]:
-    """[y, x, z] voxels that some view sees in each turn: those beyond have no rays enough to tell materials."""
+    """[y, x, z] voxels inside the field of view of a 360° scan; outside, too few rays distinguish the levels."""
     _, y, x = problem.projector.grid.coordinates()
     field = np.hypot(y[:, None], x) < problem.projector.geometry.reach
     return np.repeat(field[:, :, None], problem.projector.grid.shape[0], axis=2)
 
 
 class MaterialTrial:
-    """Volumes pulled to a few materials, made of the views of a trial and judged by those held out.
+    """Test reconstructions with discrete levels, compared in held-out projections.
 
     Attributes:
-        smooth: residuals [view] of total variation alone.
-        best, materials: the least residuals, and the materials of that volume; those of total variation, and none,
-            where few materials do not predict significantly better.
+        smooth: residuals [view] with total variation alone.
+        best, materials: smallest residuals, and the levels of that volume. If no levels predict significantly better:
+            the residuals with total variation, and None.
     """
 
     def __init__(self, trial: Trial, weight: float, sweeps: int, levels: Sequence[float] | None) -> None:
-        """For the weight of total variation of all views; `levels` in the units of the trial, None: by EM."""
+        """`weight`: of total variation for all projections. `levels`: in the units of the test, None: found by EM."""
         self._trial, self._sweeps, self._levels = trial, sweeps, levels
         self._weight = weight / math.sqrt(ONE_IN / (ONE_IN - 1))  # see `choose_weight`
         self._start = trial.volume_of_weight(self._weight) if trial.smooth is None else trial.smooth
@@ -53,11 +54,12 @@ class MaterialTrial:
         self.best, self.materials = self.smooth, MaterialPrior()
 
     def choose(self) -> None:
-        """Choose number of materials, share of total variation and pull.
+        """Choose the number of levels, the share of total variation and the pull.
 
-        If `Trial.wide`, at least all of total variation is kept. Views held out also contain what lies beside the
-        field, and prefer an eighth to a half of it: of packed balls in a can 1.5, 2 and 3 times as wide as the field
-        that would cost 0.5, 0.8 and 0.7 dB. Of one 1.06 times as wide they rightly prefer twice as much, by 1.1 dB.
+        If the sample is wider than the field of view (`Trial.wide`), the weight of total variation is not lowered.
+        Held-out projections then also contain the sample outside the field of view, and prefer an eighth to a half of
+        the weight. For packed balls in a can 1.5, 2 and 3 times as wide as the field, this would cost 0.5, 0.8 and 0.7
+        dB. For a can 1.06 times as wide they rightly prefer twice the weight, which gains 1.1 dB.
         """
         least_share = 1.0 if self._trial.wide else _LEAST_SHARE
         first, *others = COUNTS if self._levels is None else (len(self._levels),)
@@ -65,7 +67,8 @@ class MaterialTrial:
         best, chosen = self._tried(first, share, PULLS[0])
         for count in others:
             best, chosen = self._better(best, chosen, count, share)
-        # Of a tooth and of a rod with a pin of metal the best is 0.3 and 1 % worse here, of packed grains 4 % better.
+        # For a tooth and a rod with a metal pin, the best is 0.3 and 1 % worse here; for packed grains it is 4 %
+        # better.
         if not chosen.levels or np.square(best).sum() >= np.square(self.smooth).sum():
             return
         if self._levels is None and len(chosen.levels) == COUNTS[-1]:
@@ -76,7 +79,8 @@ class MaterialTrial:
             best, chosen = self._better(best, chosen, count, chosen.tv_share, pull)
         if not significantly_better(best, self.smooth, LEAST_GAIN):
             return
-        if self._trial.settings.early:  # as many sweeps more of total variation predict smooth matter better, too
+        # For a fit, the same number of further iterations of total variation also predicts smooth samples better.
+        if self._trial.settings.early:
             continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
             if not significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
                 return
@@ -85,11 +89,11 @@ class MaterialTrial:
     def _share_of_smoothing(
         self, best: F64, chosen: MaterialPrior, least_share: float
     ) -> tuple[F64, MaterialPrior, float]:
-        """Residuals and materials of the share of total variation that predicts best in octaves, and the share chosen.
+        """Choose the share of total variation; returns its residuals and levels, and the share.
 
-        Octaves are tried from 1 down to `least_share` while half the share predicts better by `LEAST_GAIN`. The vertex
-        of the parabola through the best and its neighbours is taken, and `_HEAVIER` times it is chosen. Of a sample
-        wider than the field the octave itself is.
+        The share is halved from 1 down to `least_share` as long as half the share predicts better by `LEAST_GAIN`. Then
+        the vertex of the parabola through the best share and its neighbours is taken. The result is `_HEAVIER` times
+        that vertex. If the sample is wider than the field of view, it is the best share itself.
         """
         count, tried = len(chosen.levels), {chosen.tv_share: (best, chosen)}
 
@@ -109,14 +113,14 @@ class MaterialTrial:
     def _better(
         self, best: F64, chosen: MaterialPrior, count: int, tv_share: float, pull: float = PULLS[0]
     ) -> tuple[F64, MaterialPrior]:
-        """The best so far, or this one if it predicts significantly better."""
+        """This candidate if it predicts significantly better, otherwise the best one so far."""
         residuals, materials = self._tried(count, tv_share, pull)
         if significantly_better(residuals, best, LEAST_GAIN):
             return residuals, materials
         return best, chosen
 
     def _tried(self, count: int, tv_share: float, pull: float) -> tuple[F64, MaterialPrior]:
-        """Residuals [view] of a volume, and its materials; infinite, and none, where there are not so many levels."""
+        """Residuals [view] of a test reconstruction, and its levels; infinite and None if there are fewer levels."""
         levels, weights = (
             fitted_levels(self._start[self._where], count)
             if self._levels is None

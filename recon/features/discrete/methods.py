@@ -1,4 +1,4 @@
-"""Discrete tomography with partial voxels: total variation, then a pull to few materials where these predict views."""
+"""Discrete tomography with partial voxels: total variation, then a pull to discrete levels if these predict better."""
 
 from __future__ import annotations
 
@@ -28,24 +28,29 @@ from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
-"""Names of the decisions on the materials, in the units of the scan, and on the expected share of voxels on the wrong
-side of half way between two; and how settings end that state the materials."""
-_TRIALS = 6  # trials of materials, as a rule
+"""Names of two decisions, and the end of the names of settings for the levels.
+
+The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
+of the middle between two levels).
+"""
+_TRIALS = 6  # usual number of test reconstructions with levels
 
 
 @dataclass(frozen=True)
 class Discrete(VoxelMethod):
-    """FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0, where φ pulls voxels to a few materials and leaves
-    partial voxels between them; see `recon.features.discrete.mixture`. Memory: as `FistaTv`, and 2 volumes.
+    """Discrete tomography: FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0.
 
-    Views held out choose the number of materials, their levels, what remains of μ, and β. Where few materials do not
-    predict them significantly better, and where none can be held out, the volume is that of FISTA-TV. From a first
-    volume it goes on by total variation alone.
+    φ pulls voxels to a few discrete levels, and leaves partial voxels between them; see
+    `recon.features.discrete.mixture`. Memory: as `FistaTv`, plus 2 volumes.
+
+    Held-out projections choose the number of levels, their values, the share of μ, and β. The result is the FISTA-TV
+    volume if discrete levels do not predict the held-out projections significantly better, or if there are too few
+    projections to hold any out. If it starts from a first volume, it uses total variation alone.
 
     Attributes:
-        iterations: passes over all views after those of FISTA-TV, at most.
-        levels: densities of the materials in 1/mm, ascending; None: by EM. Where no views can be held out, voxels are
-            pulled weakly to levels that are given.
+        iterations: largest number of iterations over all projections after those of FISTA-TV.
+        levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
+            voxels are pulled weakly to given levels.
     """
 
     name: ClassVar[str] = "discrete"
@@ -63,22 +68,25 @@ class Discrete(VoxelMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
-            raise ValueError(f"levels are {self.levels}: expected two or more, each above the one before")
+            raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps for the weight of total variation, and with materials."""
+        """Iterations of the test reconstructions for the weight of total variation and for the levels."""
         return CHOICE_SWEEPS + _TRIALS * min(self.iterations, USUAL_SWEEPS)
 
     @property
     def refused_sweeps(self) -> int:
-        """Sweeps of the trials after which few materials are refused and patches may be tried, as a rule."""
+        """Usual number of test iterations after which discrete levels are rejected and PnP-DCT may be tried."""
         return len(COUNTS) * min(self.iterations, USUAL_SWEEPS)
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
-        """[material, z, y, x] probability that a voxel is of one material, in ascending order; None: the volume, which
-        has these settings, was not pulled to few materials. What is missing to 1 is that of a partial voxel."""
+        """[material, z, y, x] probability that a voxel belongs to a material, in ascending order of the levels.
+
+        The probability that is missing to 1 is that of a partial voxel. None: the volume with these settings was not
+        pulled to discrete levels.
+        """
         given: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
         if not len(given[0]):
             return None
@@ -87,21 +95,23 @@ class Discrete(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """None: levels need the sweeps of the trials."""
+        """Empty, because the levels need the iterations of the test reconstructions."""
         return {}
 
     def toy(self) -> Self:
         return replace(self, iterations=1, levels=(0.0, 1.0))
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction of the best few materials, or else that of total variation."""
+        """How well the best discrete levels predict held-out projections, or otherwise total variation."""
         if trial.weight is None:
-            return Prediction(self.name, remark=f"{self.name}: no weight of total variation could be chosen")
+            return Prediction(
+                self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"
+            )
         found = self._choice(trial, trial.weight)
         return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        if x.any():  # a pull would hide the noise that refits for error bars show
+        if x.any():  # a pull would hide the noise that the refits for error bars must show
             return FistaTv(iterations=self.iterations).iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
@@ -113,11 +123,11 @@ class Discrete(VoxelMethod):
     def materials(
         self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None]
     ) -> MaterialPrior | None:
-        """In the units of the problem; None where few materials do not predict the views held out. Decided once.
+        """The levels in the units of the problem; None if they do not predict held-out projections. Decided once.
 
         Args:
-            weight: of total variation.
-            trial: of the problem.
+            weight: weight of total variation.
+            trial: function that returns the test reconstruction of the problem.
         """
         density = problem.units.density
         kept: list[Any] = problem.decide(
@@ -130,8 +140,8 @@ class Discrete(VoxelMethod):
         self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int,
         damped: bool = True,
     ) -> F32:  # fmt: skip
-        """The volume x [y, x, z] after `iterations` passes with a pull to the materials, `done` passes before; `damped`
-        as of `Subsets.of`."""
+        """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
+        `damped` as in `Subsets.of`."""
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
@@ -146,7 +156,7 @@ class Discrete(VoxelMethod):
         return x
 
     def _materials(self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Trial | None) -> MaterialPrior:
-        """In the units of the problem; without levels where few materials do not predict the views held out."""
+        """The levels in the units of the problem; empty if they do not predict held-out projections better."""
         if problem.prior is not None:
             return problem.prior.materials or MaterialPrior()
         if trial is None or isinstance(weight, NoiseBalance):

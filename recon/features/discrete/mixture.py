@@ -1,12 +1,12 @@
-"""A mixture of a few materials and of partial voxels between them: its levels by EM, and each voxel's posterior mean.
+"""Mixture model of discrete levels and partial voxels: finds the levels by EM, and the posterior mean of each voxel.
 
-A voxel's value is y = t + noise. Its true density t is that of material k, m_k with a spread s, or of a partial voxel,
-any value alike. By Tweedie's formula (Robbins 1956; Efron 2011, J. Am. Stat. Assoc. 106, 1602) the posterior mean
-E[t | y] is y minus the gradient of φ(y) = -σ² log p(y), so that a pull towards it descends φ, for probabilities that
-stay. These follow from the neighbours, see `recon.kernels.cpu.materials`.
+A voxel's value is y = t + noise. Its true density t is either that of a material k (m_k with a spread s), or that of a
+partial voxel (any value equally likely). By Tweedie's formula (Robbins 1956; Efron 2011, J. Am. Stat. Assoc. 106, 1602)
+the posterior mean E[t | y] is y minus the gradient of φ(y) = -σ² log p(y), so that a pull towards it descends φ, as
+long as the probabilities stay the same. The probabilities come from the neighbours, see `recon.kernels.cpu.materials`.
 
 Batenburg & Sijbers 2011, IEEE Trans. Image Process. 20, 2542 (DART) set voxels away from edges to their levels. Here
-every voxel is pulled as far as it is likely to be of one material.
+every voxel is pulled in proportion to the probability that it belongs to one material.
 """
 
 from __future__ import annotations
@@ -25,77 +25,93 @@ from recon.base.decisions import MaterialPrior
 from recon.kernels.cpu.materials import MaterialTable, posterior_mean
 
 NOISE, LEAST_NOISE, SPREAD = 0.2, 0.08, 0.06
-"""Noise of a voxel that is pulled, and in a trial and of the volume made, and spread of a material, over the gap of
-levels. 0.08 for 0.2 costs 0.2 dB at 60 views of 192 columns. Views held out prefer 0.08 there, by 1.4 %, and with 0.2
-they refuse few materials at 90 views of 256 columns: trials take 0.08 over the root of the share of total variation."""
+"""Noise of a voxel (in the final volume; smallest value in test reconstructions) and spread of a material.
+
+All are divided by the gap between levels. 0.08 instead of 0.2 costs 0.2 dB with 60 projections of 192 columns. Held-out
+projections prefer 0.08 there, by 1.4 %, and with 0.2 they reject discrete levels for 90 projections of 256 columns. So
+test reconstructions use 0.08 divided by the square root of the share of total variation.
+"""
 DOUBT = 0.16
-"""Error of a voxel near half way between two levels, over their gap, for `undecided_share`. Set on packed grains of 36
-views, before levels were drawn apart. Since, expected and wrong: packed grains from 60 views 2.1 and 2.1 %, from 36 2.5
-and 2.9 %; a cathode from 45 views 2.4 and 2.3 %; ellipsoids from 36 1.1 and 1.0 %. Of voxels that are wrong with an
-expected probability of 10 to 20 %, 13 to 19 % are; of 40 % and more, 45 %; of less than 1 %, as 84 to 93 % of all, up
-to 0.1 %."""
+"""Error of a voxel near the middle between two levels, divided by their gap, for `undecided_share`.
+
+It was set on packed grains from 36 projections, before `APART` was introduced. Since then, expected and actual shares
+of misclassified voxels are: packed grains from 60 projections 2.1 and 2.1 %, from 36 projections 2.5 and 2.9 %; a
+cathode from 45 projections 2.4 and 2.3 %; ellipsoids from 36 projections 1.1 and 1.0 %. Of the voxels with an expected
+probability of 10 to 20 % to be misclassified, 13 to 19 % are; with 40 % and more, 45 %; with less than 1 % (84 to 93 %
+of all voxels), up to 0.1 %.
+"""
 THIN = 0.2
-"""Over the gap of levels: what is one or two voxels thick and stands out by more before the pull is not pulled towards
-what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total
-variation (60 views of 192 columns). On a packing it was not found on they keep 0.69 from 60 views, and 0.36 from 36;
-total variation 0.63 and 0.20."""
+"""A part one or two voxels thick that differs by more than this share of the gap is not pulled towards its
+surroundings.
+
+The difference is measured before the pull. Without this rule, cracks of half a voxel to one voxel keep 0.90 instead of
+0.97 of the depth that total variation gives them (60 projections of 192 columns). On a packing that was not used for
+tuning they keep 0.69 of their depth from 60 projections and 0.36 from 36; with total variation 0.63 and 0.20.
+"""
 APART = 1.1
-"""Distance of the levels that a volume is pulled to, over that of its materials: total variation draws voxels together.
-One, of 10⁴ photons: -0.1 dB on packed grains of 36 and 45 views and -0.3 on a cathode of 45, and cracks of half a voxel
-to one keep 0.61 of their depth from 60 views in place of 0.65; 1.16 takes as much dB as it brings. With the share of
-total variation between octaves, four packings that neither was found on gain 0.4 to 0.8 dB from 36 views, and 0.2 and
-0.5 from 60, where cracks keep 0.69 for 0.65; ellipsoids in a cone lose 0.1."""
+"""Factor by which the levels of the pull are farther apart than those of the volume.
+
+The reason: total variation draws voxels together. With a factor of 1 and 10⁴ photons: -0.1 dB on packed grains from 36
+and 45 projections, -0.3 dB on a cathode from 45. Cracks of half a voxel to one voxel keep 0.61 instead of 0.65 of their
+depth from 60 projections. A factor of 1.16 loses as much as it gains. Together with the share of total variation
+interpolated between factors of two, four packings that were not used for tuning gain 0.4 to 0.8 dB from 36 projections,
+and 0.2 and 0.5 dB from 60, where cracks keep 0.69 instead of 0.65. Ellipsoids in a cone lose 0.1 dB.
+"""
 PARTIAL = (0.5, 0.9)
-"""Probabilities of a partial voxel, within a material and where two meet."""
+"""Probability of a partial voxel inside a material, and at the border of two materials."""
 EMPTY = 0.02
-"""Of a typical high density: voxels below do not take part in the fit of levels."""
+"""Share of a typical high density; voxels below it are not used in the fit of levels."""
 LEAST_GAP = 0.1
-"""Between neighbouring levels by EM, over that between the outer ones. The air of a walnut from 50 views, in two levels
-0.03 apart, left 3 % less of views held out, changed its volume by 0.03 dB, and kept patches and a fit from being tried.
-The matrix of packed grains is parted so at 0.02 and 0.04, bone at 0.06. On scans it was not found on (a walnut of twice
-the columns from 60 views; pores, polyhedra of two densities, cracks) levels part at 0.01 to 0.04, and no volume
-changes: views held out refused the third level there, and 16 sweeps are saved."""
-_ROWS, _REACH = 4096, 6.0  # of the tables, and standard deviations beyond the outer levels
+"""Smallest gap between neighbouring levels from EM, divided by the distance of the outer levels.
+
+The air of a walnut from 50 projections was divided into two levels 0.03 apart. These lowered the residual in held-out
+projections by 3 %, changed the volume by 0.03 dB, and prevented PnP-DCT and a Gaussian fit from being tried. The matrix
+of packed grains is divided in the same way at 0.02 and 0.04, bone at 0.06. On scans that were not used for tuning (a
+walnut with twice the columns from 60 projections; pores, polyhedra of two densities, cracks), levels are divided at
+0.01 to 0.04, and no volume changes: held-out projections rejected the third level there, and 16 iterations are saved.
+"""
+_ROWS, _REACH = 4096, 6.0  # rows of the tables; their reach beyond the outer levels in standard deviations
 _BINS, _ROUNDS, _LOOKED_AT = 400, 60, 300_007
 
 
 def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
-    """Levels [count] of values in ascending order, and their weights, by EM on the histogram.
+    """Levels [count] of the values in ascending order, and their weights, found by EM on the histogram.
 
-    Classes are normal, and a flat one between the outer levels takes partial voxels. Voxels of almost nothing, such as
-    air around a sample, do not count: at 90 views they took the lower of two levels from 0.28 to 0.24 of the upper one.
+    Classes have normal distributions; a flat class between the outer levels takes partial voxels. Voxels near zero,
+    such as air around a sample, do not count. With 90 projections they moved the lower of two levels from 0.28 to 0.24
+    of the upper one.
     """
     few = some_values(values, _LOOKED_AT)
     few = few[few >= EMPTY * np.percentile(few, 99.5)]
     counts, edges = np.histogram(few, _BINS, range=tuple(np.percentile(few, (0.05, 99.95))))
-    at, quantiles = (edges[1:] + edges[:-1]) / 2, (np.arange(count) + 0.5) / count
+    middles, quantiles = (edges[1:] + edges[:-1]) / 2, (np.arange(count) + 0.5) / count
     mean = np.quantile(few, quantiles if count > 2 else (0.1, 0.9)).astype(float)
-    span, weight = float(np.ptp(at)), np.full(count + 1, 1 / (count + 1))
+    span, weight = float(np.ptp(middles)), np.full(count + 1, 1 / (count + 1))
     deviation = np.full(count, span / 6)
     for _ in range(_ROUNDS):
-        z = (at - mean[:, None]) / deviation[:, None]
+        z = (middles - mean[:, None]) / deviation[:, None]
         normal = weight[:count, None] / deviation[:, None] * np.exp(-0.5 * z**2)
-        inside = (at > mean.min()) & (at < mean.max())
+        inside = (middles > mean.min()) & (middles < mean.max())
         flat = weight[count] * math.sqrt(2 * math.pi) * inside / (np.ptp(mean) + 1e-6 * span) + 1e-12 / span
         share = np.vstack((normal, flat))
         share *= counts / share.sum(0)
         n = share.sum(1) + 1e-9
-        weight, mean = n / n.sum(), share[:count] @ at / n[:count]
-        deviation = np.sqrt((share[:count] * (at - mean[:, None]) ** 2).sum(1) / n[:count])
+        weight, mean = n / n.sum(), share[:count] @ middles / n[:count]
+        deviation = np.sqrt((share[:count] * (middles - mean[:, None]) ** 2).sum(1) / n[:count])
         deviation = deviation.clip(1e-3 * span, max(0.15 * float(np.ptp(mean)), 1e-3 * span))
     order = np.argsort(mean)
     return mean[order], weight[:count][order] / weight[:count].sum()
 
 
 def undecided_share(x: F32, materials: MaterialPrior) -> float:
-    """Expected share of voxels on the wrong side of half way between two levels; it is of some values of x."""
+    """Expected share of misclassified voxels (wrong side of the middle between two levels), from a sample of x."""
     few, levels = some_values(x, _LOOKED_AT), materials.levels
     off = [np.abs(few - (high + low) / 2) / (high - low) for low, high in pairwise(levels)]
     return float(ndtr(-np.min(off, axis=0) / DOUBT).mean())
 
 
 def are_apart(levels: F64) -> bool:
-    """Whether levels by EM are of different materials; of a volume of fewer, two may be one."""
+    """Whether levels from EM belong to different materials. In a volume with fewer materials, two levels may be one."""
     return bool(np.diff(levels).min() > LEAST_GAP * np.ptp(levels))
 
 
@@ -105,16 +121,16 @@ def gap_of(materials: MaterialPrior) -> float:
 
 
 def drawn_apart(materials: MaterialPrior) -> MaterialPrior:
-    """The materials with levels `APART` as far from the middle between the outer ones."""
+    """The materials with levels moved apart by the factor `APART`, from the middle between the outer levels."""
     levels = np.array(materials.levels)
     middle = (levels[0] + levels[-1]) / 2
     return materials._replace(levels=tuple((middle + APART * (levels - middle)).tolist()))
 
 
 def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
-    """1 in what is one or two voxels thick and less dense than both sides of it, -1 in what is denser, else 0.
+    """Parts that are one or two voxels thick: 1 if less dense than both sides, -1 if denser, otherwise 0.
 
-    Memory: four volumes of x [y, x, z], for a moment.
+    Memory: briefly four volumes of x [y, x, z].
     """
     less, more = grey_closing(x, 3) - x, x - grey_opening(x, 3)
     thin = np.sign(less - more).astype(np.int8)
@@ -123,7 +139,7 @@ def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
 
 
 def table_of(materials: MaterialPrior, noise: float) -> MaterialTable:
-    """What the kernel knows of these materials; `noise` over the gap of levels."""
+    """The table of these materials for the kernel; `noise` is divided by the gap between levels."""
     m, weight = np.array(materials.levels), np.array(materials.weights)
     gaps, spread = np.diff(m), SPREAD * gap_of(materials)
     variance = (noise * gap_of(materials)) ** 2 + spread**2
@@ -146,13 +162,13 @@ def table_of(materials: MaterialPrior, noise: float) -> MaterialTable:
 
 @dataclass(frozen=True, eq=False)
 class MaterialPull:
-    """The pull of voxels towards a few materials; a `recon.voxels.priors.Pull`.
+    """The pull of voxels towards discrete levels; a `recon.voxels.priors.Pull`.
 
     Attributes:
         where: [y, x, z] voxels that are pulled.
         thin: [y, x, z], see `thin_parts`.
-        noise: of a voxel, over the gap of levels.
-        follows: levels are fitted anew to each volume.
+        noise: noise of a voxel, divided by the gap between levels.
+        follows: True: levels are fitted again to each volume.
     """
 
     materials: MaterialPrior
@@ -166,7 +182,7 @@ class MaterialPull:
         return self.materials.pull
 
     def materials_in(self, x: F32) -> MaterialPrior:
-        """The materials, their levels fitted to a volume if they follow it and stay apart."""
+        """The materials; if `follows`, with levels fitted to the volume, unless these are not apart."""
         if not self.follows:
             return self.materials
         levels, weights = fitted_levels(x[self.where], len(self.materials.levels))
@@ -183,9 +199,11 @@ class MaterialPull:
 
 
 def probabilities(x: F32, materials: MaterialPrior) -> F32:
-    """[material, ...] posterior probability that a voxel of x [a, b, c] is of one material; the rest is that of a
-    partial voxel. Cautious: of voxels with a half and more, over 99 % are within a quarter of the gap of that material.
-    Memory: as many volumes as materials, and one."""
+    """[material, ...] posterior probability that a voxel of x [a, b, c] belongs to a material.
+
+    The rest is the probability of a partial voxel. The values are cautious: of the voxels with a half and more, over 99
+    % are within a quarter of the gap from that material. Memory: one volume per material, plus one.
+    """
     found = np.empty((len(materials.levels), *x.shape), np.float32)
     posterior_mean(x, table_of(materials, LEAST_NOISE), np.empty_like(x), found)
     return found

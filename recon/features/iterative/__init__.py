@@ -1,4 +1,4 @@
-"""Iterative methods that others are compared with: SIRT, SART, CGLS and ASD-POCS."""
+"""Classical iterative methods for comparison: SIRT, SART, CGLS and ASD-POCS."""
 
 from recon.base.registry import Lengths, MethodEntry
 

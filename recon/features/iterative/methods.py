@@ -1,4 +1,4 @@
-"""SIRT, SART, CGLS and ASD-POCS."""
+"""Classical iterative reconstruction methods: SIRT, SART, CGLS and ASD-POCS."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Sirt(VoxelMethod):
 
 @dataclass(frozen=True)
 class Sart(VoxelMethod):
-    """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
+    """Simultaneous algebraic reconstruction, one projection per step in random order (Andersen & Kak 1984).
 
-    The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
+    The relaxation is multiplied by `decay` in each iteration. Memory: 3 volumes, 3 x the projections.
     """
 
     name: ClassVar[str] = "sart"
@@ -68,10 +68,10 @@ class Sart(VoxelMethod):
 
 @dataclass(frozen=True)
 class Cgls(VoxelMethod):
-    """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); its early end is its regularisation.
+    """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); stopping early is its regularisation.
 
-    Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations. From
-    there on the residual lags one iteration behind. Memory: 3 volumes, 3 x the projections.
+    Negative values are clipped at the end. In float32, the directions are no longer conjugate after about eight
+    iterations. From then on the residual is one iteration behind. Memory: 3 volumes, 3 x the projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -83,12 +83,12 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """None: more iterations come no nearer."""
+        """Empty, because more iterations do not improve the volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector = problem.projector
-        # The directions would not be conjugate for other rays or weights.
+        # With other rays or weights, the directions would not be conjugate.
         decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
@@ -117,16 +117,18 @@ class Cgls(VoxelMethod):
 
 @dataclass(frozen=True)
 class AsdPocs(VoxelMethod):
-    """Adaptive steepest descent of TV between projections onto the data (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
+    """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
-    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep. Steps
-    shrink by `alpha_decay` if they undo more than `ratio` of the sweep and the residual is still above `goal`.
+    Each iteration is one of SART, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times as long as
+    the change of the first SART iteration. The steps are multiplied by `alpha_decay` if they undo more than `ratio` of
+    the SART iteration and the residual is still above `goal`.
     Memory: 5 volumes, 3 x the projections.
 
     Attributes:
-        goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
-        cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. It has about the same
-        residual: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
+        goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 of that of filtered back-projection (FBP or
+            FDK). For a short cone scan, which FDK cannot reconstruct, it is 0.15 of that of one iteration of
+            ordered-subset SIRT. Both have about the same residual: 0.085 to 0.12, and FDK 0.075 to 0.11 (a box in a
+            box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"
@@ -162,7 +164,7 @@ class AsdPocs(VoxelMethod):
             if k == 0:
                 step = self.alpha * swept
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:
-                break  # the last step fits the data, as published
+                break  # end after the step that fits the data, as published
             before[...] = x
             smoothing = 1e-4 * decide("unit", partial(density_unit, x))
             for _ in range(self.tv_steps if smoothing > 0 else 0):
@@ -183,7 +185,7 @@ def _share(step: float, norm: float) -> float:
 
 
 def _baseline(problem: VoxelProblem) -> float:
-    """Relative residual of filtered back-projection, or of a sweep if FBP and FDK do not apply."""
+    """Relative residual of filtered back-projection, or of one iteration if FBP and FDK do not apply."""
     projector, volume = problem.projector, problem.filtered("ram-lak")
     if volume is None:
         nz, ny, nx = projector.grid.shape

@@ -1,4 +1,4 @@
-"""Several volumes that all views determine together: at times of a scan of a sample that changes, or of materials."""
+"""Joint reconstruction of several volumes from all projections: a sample at several times, or one per material."""
 
 from recon.base.registry import MethodEntry
 

@@ -1,4 +1,4 @@
-"""Steps of the one fit of `spectral` and `series`. Each view sees a sum of volumes with its own shares."""
+"""The steps of the joint fits in `spectral` and `series`. Each projection sees its own weighted sum of volumes."""
 
 from __future__ import annotations
 
@@ -24,38 +24,40 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
-_ROUNDS = 6  # of power iteration
-_LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
-_NOTHING = 1e-20  # singular value of materials that attenuate nothing
+_ROUNDS = 6  # power iterations
+_LEAST_SINGULAR = 1e-4  # share of the largest singular value; below it, the energies do not separate the materials
+_NOTHING = 1e-20  # largest singular value of materials that do not attenuate
 
 
 def refuse_alike(cross_sections: F64) -> None:
-    """Raise ValueError if cross sections [energy, material] are not finite, or do not distinguish the materials."""
+    """Raise ValueError if cross sections [energy, material] are not finite or cannot separate the materials."""
     n, materials = cross_sections.shape
     if not np.isfinite(cross_sections).all():
         raise ValueError("cross_sections must be finite")
     values = np.linalg.svd(cross_sections, compute_uv=False)
     if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
         raise ValueError(
-            f"views of {n} energies cannot distinguish {materials} materials: give more energies, or fewer materials"
+            f"cannot separate {materials} materials with {n} {'energy' if n == 1 else 'energies'}: use more energies, "
+            "energies at which the materials differ more, or fewer materials"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyViews:
-    """Views of one sample, each of a mixture of volumes: with the attenuation of each material at its energy.
+    """Projections of one sample at several energies; each sees the materials with their attenuation at its energy.
 
-    A series in time is the same: each moment counts as an energy, each volume as a material.
+    A series in time has the same form: each moment is an energy, each volume a material.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
-        geometry: of all views.
-        energy: [view], index of the energy of each view.
+        geometry: geometry of all projections.
+        energy: [view], index of the energy of each projection.
         cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
-        weight: of each ray [view, row, col]; None: one.
+        weight: weight of each ray [view, row, col]; None: 1.
 
     Raises:
-        ValueError: shapes or indices do not fit, values are not finite, or the energies do not tell materials apart.
+        ValueError: shapes or indices do not match, values are not finite, or the energies do not separate the
+            materials.
     """
 
     projections: F32
@@ -70,26 +72,29 @@ class EnergyViews:
         if self.weight is not None:
             require_views(self.geometry, self.weight, "weights")
         if not np.isfinite(self.projections).all():
-            raise ValueError("projections must be finite: give rays that were not measured the weight 0 and any value")
+            raise ValueError(
+                "projections must be finite. Give rays that were not measured any finite value and the weight 0"
+            )
         if self.cross_sections.ndim != 2:
             raise ValueError(f"cross_sections must be [energy, material], got shape {self.cross_sections.shape}")
         n = len(self.cross_sections)
         views = self.geometry.n_views
         if self.energy.shape != (views,) or self.energy.min() < 0 or self.energy.max() >= n:
-            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {views} views")
+            raise ValueError(f"energy must be an index from 0 to {n - 1} for each of the {views} projections")
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
-        """Some views, and neighbouring rows of them."""
+        """Some projections, and a range of their rows."""
         first, stop, _ = rows.indices(self.projections.shape[1])
         weight = None if self.weight is None else self.weight[views, rows]
         geometry = self.geometry.select(views).rows(first, stop)
         return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
 
     def parted(self, n: int) -> NDArray[np.intp]:
-        """The part 0 ... n - 1 of each view: each part has views of all energies, and directions all around.
+        """Divide the projections into n parts with all energies and directions: the part, 0 to n - 1, of each
+        projection.
 
-        Of more energies than a part has views, neighbours count as one.
+        If there are more energies than projections in a part, neighbouring energies count as one.
         """
         views, energies = self.geometry.n_views, len(self.cross_sections)
         groups = min(energies, max(n, views // n))
@@ -102,7 +107,7 @@ class EnergyViews:
 
 
 def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid]:
-    """The rows with most matter, for trials, and their slices; all rows if rows do not show slices."""
+    """The rows with most material, for test reconstructions, and their slices; all rows if rows do not show slices."""
     if not views.geometry.rows_show_slices:
         return slice(None), grid
     rows = busiest_rows(views.projections, height)
@@ -114,7 +119,7 @@ class StoppedError(Exception):
 
 
 class _Part(NamedTuple):
-    """Views of one energy in one subset: data and weight as lines [view, col, row]."""
+    """Projections of one energy in one subset: data and weight as [view, col, row]."""
 
     energy: int
     projector: Projector
@@ -127,13 +132,13 @@ class EnergyFit:
     """The volumes of `fit_materials`, and the steps of the fit.
 
     Attributes:
-        motion: of the volume at each energy; None: it does not move.
+        motion: motion of the volume at each energy; None: it does not move.
         z: float32 [component, y, x, z].
-        subsets: of the views; each has all energies.
-        _to, _back: from densities to components, and back.
+        subsets: subsets of the projections; each contains all energies.
+        _to, _back: conversion from densities to components and back.
         _u: U [energy, component].
-        step: 1 / L. L bounds the curvature of a subset: the largest eigenvalue of AᵀWA where a view of energy e weighs
-            |U[e]|². That is a bound since A has no negative entry, so |A Σ U z| <= |U| A |z|.
+        step: 1 / L. L is a bound on the curvature of a subset: the largest eigenvalue of AᵀWA in which a projection of
+            energy e has the weight |U[e]|². It is a bound because A has no negative entry, so |A Σ U z| <= |U| A |z|.
     """
 
     views: EnergyViews
@@ -156,7 +161,7 @@ class EnergyFit:
         self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
-        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # views of nothing leave nothing
+        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # empty projections have the residual 0
         subset = views.parted(subsets_of(views.geometry, _SUBSETS, damped=False))
         self.subsets = []
         for number in range(subset.max() + 1):
@@ -183,7 +188,7 @@ class EnergyFit:
         self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
 
     def _curvature(self, subset: list[_Part]) -> float:
-        """`largest_eigenvalue` for a volume that moves."""
+        """`largest_eigenvalue` for a moving volume."""
         x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
         for _ in range(_ROUNDS):
             product = np.zeros_like(x)
@@ -201,10 +206,10 @@ class EnergyFit:
         return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
-        """Write minus the gradient of the views of a subset at z into `out`. Returns their weighted sum of squares.
+        """Write minus the gradient of a subset at z to `out`. Returns the weighted sum of squares of its residual.
 
         Raises:
-            StoppedError: `stop` said so.
+            StoppedError: `stop` returned True.
         """
         out[...] = 0
         squares, image = 0.0, np.empty(self.z.shape[1:], np.float32)
@@ -224,8 +229,10 @@ class EnergyFit:
         return squares
 
     def sweeps(self, weights: F64, n: int) -> Iterator[float]:
-        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. After a
-        stop z is that before the step that it interrupts."""
+        """n iterations from z, each of about nine steps that use all projections equally often; yields their residuals.
+
+        If a step is stopped, z is that before this step.
+        """
         _, ny, nx, nz = self.z.shape
         differences, count = difference_weights(self.grid), len(self.subsets)
         prox = [TotalVariationProx((ny, nx, nz), differences, False, _TV_STEPS) for _ in self.z]
@@ -237,7 +244,7 @@ class EnergyFit:
                 try:
                     squares += self.descent(self.subsets[number], descent)
                 except StoppedError:
-                    nonnegative_mix(self.z, self._back, self._to)  # momentum may have gone below 0
+                    nonnegative_mix(self.z, self._back, self._to)  # momentum may have made values negative
                     return
                 self._begun = True
                 combine(1.0, self.z, self.step, descent, self.z)
@@ -252,7 +259,7 @@ class EnergyFit:
                 ahead(self.z)
 
     def residual_of(self, densities: F32) -> float:
-        """Residual of all views by densities [material, z, y, x], over the norm of the views."""
+        """Norm of the residual for densities [material, z, y, x], divided by the norm of all projections."""
         self.z = np.ascontiguousarray(np.einsum("km,mzyx->kyxz", self._to.astype(np.float32), densities))
         out = np.empty_like(self.z)
         return math.sqrt(sum(self.descent(subset, out) for subset in self.subsets)) / self._norm
@@ -271,7 +278,7 @@ class EnergyFit:
 
 
 def fitted(fit: EnergyFit, weights: F64, sweeps: int, go_on: Callable[[int, float], bool]) -> tuple[F32, float]:
-    """Densities and residual after `sweeps` sweeps, or when `go_on` ends them."""
+    """Densities and residual after `sweeps` iterations, or earlier if `go_on` ends them."""
     residual = 1.0
     for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
         if not go_on(sweep, residual):

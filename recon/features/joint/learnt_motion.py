@@ -1,7 +1,7 @@
-"""The motion of a sample while it is scanned, learnt from coarse to fine voxels.
+"""The motion of a sample during the scan, estimated from coarse to fine voxels.
 
-One volume, displaced, explains all views of a sample that only moves. So volume and motion improve each other in turns,
-first on voxels so coarse that the motion is short.
+If a sample only moves, one displaced volume explains all projections. So volume and motion are improved alternately,
+first on voxels so coarse that the motion is only a few of them.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from recon.voxels.displacement import Displacement, displaced, displacements, ju
 from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 
-_COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
-_FINE = 96  # pixels across up to which the last level has a voxel a pixel; of more, one for two
-_TURNS = 6, 4, 2  # of the first levels; later ones have the last number
-SWEEPS_OF_TURN = 6  # of a turn, which go on from the last one
-_KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
-_HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
-JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
-_BLOCKS, _ONE_BLOCK_IN = 32, 4  # of the scan's time, and one of so many held out: eight
+_COARSEST = 12  # least number of voxels across at the first level; in each following level, voxels are half as wide
+_FINE = 96  # up to this many pixels across, the last level has one voxel per pixel; beyond, one per two pixels
+_TURNS = 6, 4, 2  # turns at the first levels; later levels have the last number
+SWEEPS_OF_TURN = 6  # iterations in a turn; they continue from the previous turn
+_KNOTS, _CONTROLS = 3, 3  # control points of the motion: in time, and along each axis
+_HEAVIER = 2.0  # factor on the weight of total variation, because one volume for all times has less detail
+JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of the test volumes that decide about motion, and their iterations
+_BLOCKS, _ONE_BLOCK_IN = 32, 4  # blocks in time; one in this many is held out (eight blocks)
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
-    """Voxel size in pixels, and number of turns, of each resolution level for `cols` pixels across."""
+    """Voxel size in pixels and number of turns for each resolution level, for `cols` pixels across."""
     last = 1 if cols <= _FINE else 2
     widths = [last]
     while cols // (2 * widths[0]) >= _COARSEST:
@@ -44,12 +44,12 @@ def levels(cols: int) -> list[tuple[int, int]]:
 
 
 class OfMoments(NamedTuple):
-    """Views of a changing sample, each assigned to one of some moments.
+    """Projections of a changing sample, each assigned to a moment.
 
     Attributes:
-        views: each `energy` is a moment, each material a knot of the densities.
-        times: [moment] within the scan, 0 ... 1.
-        weights: of total variation of the densities' components.
+        views: each `energy` is a moment, each material a volume (knot in time).
+        times: [moment] time within the scan, 0 to 1.
+        weights: weights of total variation for the components of the densities.
     """
 
     views: EnergyViews
@@ -60,16 +60,18 @@ class OfMoments(NamedTuple):
 def unseen_squares(
     coarse: OfMoments, fine: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> F64 | None:
-    """Residual of held-out views for volumes without and with motion: squares [2, block], relative to the mean of the
-    views' own; None if stopped.
+    """Squared residual of held-out projections for volumes without and with motion: [2, block]; None if stopped.
 
-    Views that follow each other are held out in blocks. Where angles rise with time, volumes in time predict a single
-    view from those before and after it, even of a sample that moves. The motion is learnt from `coarse` moments of the
-    other views; volumes of coarse voxels are fitted to `fine` ones, within which the sample hardly moves.
+    It is relative to the mean of the projections' own squares.
+
+    Successive projections are held out in blocks. If angles rise with time, volumes in time could predict a single
+    projection from those before and after it, even for a moving sample. The motion is estimated from the other
+    projections in `coarse` moments. Volumes of coarse voxels are fitted to them in `fine` moments, within which the
+    sample hardly moves.
 
     Args:
-        coarse, fine: the same views.
-        go_on, stop: as of `learnt_motion`.
+        coarse, fine: the same projections, in few and in many moments.
+        go_on, stop: as in `learnt_motion`.
     """
     block = fine.views.energy * _BLOCKS // len(fine.views.cross_sections)
     held_out = block % _ONE_BLOCK_IN == _ONE_BLOCK_IN // 2
@@ -97,7 +99,7 @@ def unseen_squares(
 
 
 def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
-    """[view] weighted squared residual by densities [knot, z, y, x]."""
+    """[view] weighted squared residual for densities [knot, z, y, x]."""
     projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
     weight = None if views.weight is None else projection_lines(views.weight)
     squares = np.empty(len(data))
@@ -112,11 +114,11 @@ def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, gri
 def learnt_motion(
     of_moments: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> Motion | None:
-    """Find the motion on the voxels of `Grid.matching`; None if stopped.
+    """Estimate the motion on the voxels of `Grid.matching`; None if stopped.
 
     Args:
-        go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
-        stop: asked many times within a sweep; True ends it.
+        go_on: called with (-n, residual) after each iteration; n is the number that remain. False ends it.
+        stop: called many times within an iteration; True ends it.
     """
     views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]
@@ -145,7 +147,7 @@ def learnt_motion(
 
 
 def _binned(views: EnergyViews, n: int) -> EnergyViews:
-    """Mean of n x n pixels; of their weights, too."""
+    """Projections binned by n x n pixels (mean values and mean weights)."""
     n = max(1, min(n, *views.geometry.detector_shape))
     geometry = views.geometry.binned(n)
     if views.weight is None:
@@ -165,30 +167,31 @@ def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
     ]
 
 
-_LEVELS = ((64, 2), (160, 4), (320, 2))  # columns, at most, and volumes of all views
-_ROWS = 32  # binned rows looked at
-_VIEWS = 60  # looked at, of each energy
-_MOVES = 0.1  # columns by which a magnification moves the outermost pixel: less is none, and no view is interpolated
-_HELPS = 0.995  # of the deviation of views held out: a registration that leaves more is none
+_LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, and volumes from all projections
+_ROWS = 32  # number of binned rows examined
+_VIEWS = 60  # number of projections examined per energy
+# columns by which a magnification moves the outermost pixel; a smaller one is ignored, so that nothing is interpolated
+_MOVES = 0.1
+_HELPS = 0.995  # a registration must lower the deviation of held-out projections to this share
 STEPS = sum(rounds for _, rounds in _LEVELS) + 1
 
 
 def register_energies(
     views: EnergyViews, progress: Callable[[int, int], None] = lambda n, most: None
 ) -> tuple[EnergyViews, tuple[Displacement, ...]]:
-    """Align the scans of all energies, correcting the views for the sample's position and the optics; a parallel beam.
+    """Align the scans at all energies: correct for the position of the sample and for the optics (parallel beam).
 
-    The energy with the most views is the reference. A volume of it predicts the others, each scaled by what it absorbs
-    in the mean. The sample is shifted along x, y and z and turned about the axis. The image is shifted along the rows
-    and magnified. These six explain the differences (see `recon.voxels.displacement`). Edges tell it, so a material
-    that absorbs unlike at two energies does no harm.
+    The energy with the most projections is the reference. A volume at this energy predicts the others, scaled by their
+    mean absorption. Six parameters explain the differences (see `recon.voxels.displacement`): the sample is shifted
+    along x, y and z and rotated about the axis; the image is shifted along the rows and magnified. The edges determine
+    these parameters, so a material whose absorption differs between two energies does no harm.
 
     Returns:
-        The views, interpolated where their magnification differs, and the displacement of each energy. None is
-        displaced where that predicts views held out no better.
+        The projections (interpolated if their magnification differs), and the displacement at each energy. Nothing is
+        displaced if that does not predict held-out projections better.
 
     Raises:
-        ValueError: a cone, whose rays a shift of the sample turns.
+        ValueError: the beam is a cone, in which a shift of the sample changes the directions of its rays.
     """
     check_arguments(register_energies, locals())
     moves: list[Displacement] | None = None
@@ -222,7 +225,7 @@ def register_energies(
 
 
 def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tuple[float, float]) -> EnergyViews:
-    """All views at the magnification of the reference; pixels that were not measured weigh nothing."""
+    """All projections at the magnification of the reference; pixels without data get weight 0."""
     if all(move.magnification == 1 for move in moves):
         return views
     data, weight = views.projections.copy(), np.ones_like(views.projections)
@@ -239,13 +242,13 @@ def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tupl
 
 
 def _strengths(views: EnergyViews) -> F64:
-    """[energy] factor that makes the mean of its views that of the first energy's."""
+    """[energy] factor that makes the mean of its projections equal to that of the first energy."""
     energies = range(len(views.cross_sections))
     means = np.array([views.projections[views.energy == e].mean(dtype=np.float64) for e in energies])
     return np.divide(means[0], means, out=np.ones_like(means), where=means > 0)
 
 
 def _spread(energy: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Indices of views that are evenly spread, at most `_VIEWS` of each energy."""
+    """Indices of evenly spread projections, at most `_VIEWS` per energy."""
     own = (np.flatnonzero(energy == e) for e in np.unique(energy))
     return np.sort(np.concatenate([spread(at, _VIEWS) for at in own]))

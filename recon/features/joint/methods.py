@@ -1,4 +1,4 @@
-"""Methods of several volumes that all views determine together: at times of a scan, or of each material."""
+"""TimeSeries: the reconstruction method for several volumes at different times, from all projections together."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from recon.base.setting import Count, NonNegative, Setting
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
 
-_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
-_COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: per volume of the result; for displacements and displaced volumes
+# copies of the line integrals: lines, a held-out part, moments, binned projections, weights, and their copy
+_COPIES = 6
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,11 @@ class TimeSeries(Series):
     """Volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
-        volumes: 2 or more, from the first view to the last; each needs twelve views or more.
-        moves: matter moves, and not only its density changes; None: what views held out prefer.
-        sweeps: of the fit.
-        weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
+        volumes: number of volumes, 2 or more, from the first projection to the last; each needs at least twelve
+            projections.
+        moves: True: the sample also moves; False: only densities change. None: held-out projections decide.
+        sweeps: number of iterations of the fit.
+        weight: weight of total variation, `tv_weight` of `fit_series`; None: held-out projections decide.
 
     Raises:
         ValueError: other values.
@@ -46,7 +48,7 @@ class TimeSeries(Series):
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if problem.grid != Grid.matching(problem.geometry):
-            raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
+            raise ValueError("a series is reconstructed on the grid of its projections; do not give a grid")
         n, times = problem.geometry.n_views, problem.use.times
         times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
@@ -80,7 +82,7 @@ class TimeSeries(Series):
 
 @dataclass
 class _History:
-    """Progress of a fit: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
+    """Progress of a fit: iterations of tests, which count down to 0, and iterations of the fit, which are recorded."""
 
     sweeps: int
     n_views: int
@@ -102,7 +104,7 @@ class _History:
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
-        """Record and report a sweep of the fit."""
+        """Record and report an iteration of the fit."""
         seconds = self.control.now() - self.began
         reached = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
         self.of_sweeps = (*self.of_sweeps, reached)
@@ -112,16 +114,16 @@ class _History:
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
     ) -> Reconstruction:
         """The reconstruction with this history."""
-        if not self.of_sweeps:  # it was stopped before
+        if not self.of_sweeps:  # it was stopped before the first iteration
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
 
 
 def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
-    """Line integrals [view, row, col], 0 and without weight where nothing was measured; and the weights, of one shape.
+    """Line integrals [view, row, col] and weights of the same shape; pixels without data have value 0 and weight 0.
 
     Raises:
-        ValueError: no line integral that was measured is above 0.
+        ValueError: no measured line integral is above 0.
     """
     data, weights = problem.views.data, problem.views.weights
     if not (finite := np.isfinite(data)).all():
@@ -129,13 +131,17 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     if weights is not None:
         data = np.where(weights > 0, data, np.float32(0))
     if not data.max() > 0:
-        raise ValueError("no line integral that is finite and has a weight is above 0: these views show no matter")
+        raise ValueError(
+            "these projections show no material: no line integral that is finite and has a weight is above 0"
+        )
     return data, weights
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
-    """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
-    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    """Text on how held-out projections chose between rest and motion, with advice if they hardly differ."""
+    judged = f"the residual in held-out projections is {still:.4g} without motion and {moved:.4g} with motion"
     if moves or moved >= still:
-        return f"{'motion' if moves else 'no motion'}, as {judged}"
-    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+        return f"{'motion' if moves else 'no motion'}, because {judged}"
+    return (
+        f"no motion: {judged}, which is lower, but not by enough to be sure. If the sample moved, compare with --moves"
+    )

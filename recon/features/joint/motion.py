@@ -1,10 +1,11 @@
-"""Motion: how matter moves while a sample is scanned, smooth in space and time, learnt from the views themselves.
+"""Motion: the motion of a sample during the scan, smooth in space and time, estimated from the projections.
 
     x(r, t) = Σ_k h_k(t) d_k(r + u(r, t)),    u(r, t) = Σ_m s_m(t) Σ_c B_c(r) a_mc
 
-h_k are hats in time, s_m and B_c natural cubic splines through a few knots. u is 0 in the middle of the scan: there d
-is where it is. The control points a follow from Gauss-Newton steps. In each, the projected slopes of the volume along u
-explain what it leaves of the views. (Zang et al. 2018, ACM Trans. Graph. 37, 138, take optical flow between volumes.)
+h_k are hat functions in time; s_m and B_c are natural cubic splines through a few knots. u is 0 in the middle of the
+scan, so d is the sample at that time. The control points a come from Gauss-Newton steps. In each step, the projected
+gradients of the volume along u are fitted to the residual of the projections. (Zang et al. 2018, ACM Trans. Graph. 37,
+138, use optical flow between volumes.)
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from recon.voxels.projector import Projector
 
 A = TypeVar("A", F32, F64)
 
-MIDDLE = 0.5  # of the scan: u is 0
-_STEPS = 8  # of conjugate gradients
-_SMOOTH = 0.03  # weight of differences between neighbouring control points, over the typical curvature of one
-_SMALL = 1e-3  # likewise of the control points themselves
+MIDDLE = 0.5  # the time within the scan at which u is 0
+_STEPS = 8  # conjugate-gradient iterations
+# weight of differences between neighbouring control points, divided by the typical curvature of a control point
+_SMOOTH = 0.03
+_SMALL = 1e-3  # the same for the control points themselves
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,8 @@ class Motion:
     """Displacements of a volume [y, x, z] at some times.
 
     Attributes:
-        shape: of the volume.
-        times: [time] within the scan, 0 ... 1.
+        shape: shape of the volume.
+        times: [time] within the scan, 0 to 1.
         control: a, float64 [knot in time, 3, control y, x, z], in voxels along y, x, z.
     """
 
@@ -44,7 +46,7 @@ class Motion:
 
     @classmethod
     def none(cls, shape: tuple[int, int, int], times: F64, knots: int, controls: int) -> Motion:
-        """No motion, with `knots` knots in time, and `controls` control points along each axis."""
+        """Zero motion, with `knots` knots in time and `controls` control points along each axis."""
         return cls(shape, times, np.zeros((knots, 3, *(min(controls, n) for n in shape))))
 
     def on(self, shape: tuple[int, int, int], times: F64) -> Motion:
@@ -62,7 +64,7 @@ class Motion:
         return _spline(self.times, knots) - _spline(np.array([MIDDLE]), knots)
 
     def at(self, time: int, control: F64 | None = None) -> F32:
-        """u [3, y, x, z] at a time, from other control points if given."""
+        """The displacement u [3, y, x, z] at a time; `control`: other control points, if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
         some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
         wide = np.einsum("yp,dpqr->dyqr", y, some)
@@ -78,20 +80,23 @@ class Motion:
 
 
 def _spline(at: F64, knots: int) -> F64:
-    """Natural cubic splines through `knots` even knots in 0 ... 1, [place, knot]; straight lines for two, 1 for one."""
+    """Natural cubic splines through `knots` evenly spaced knots in 0 to 1, [place, knot].
+
+    For two knots they are straight lines, for one knot the constant 1.
+    """
     if knots == 1:
         return np.ones((at.size, 1))
     even = np.linspace(0, 1, knots)
     if knots == 2:
         return np.stack([1 - at, at], 1)
-    from scipy.interpolate import CubicSpline  # half a second
+    from scipy.interpolate import CubicSpline  # loading takes half a second
 
     return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(at))
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Views at one time, as lines [view, col, row]; `weight` None: all weights 1."""
+    """Projections at one time, as [view, col, row]; `weight` None: all weights 1."""
 
     time: int
     projector: Projector
@@ -100,9 +105,7 @@ class Seen:
 
 
 def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
-    """Minus the gradient of half the weighted squares by the control points, and the derivatives of W x by u at each
-    time.
-    """
+    """Minus the gradient of half the weighted squares by the control points, and the derivatives of W x by u."""
     right, slope = np.zeros_like(motion.control), list[F32]()
     for part in seen:
         u, x = motion.at(part.time), image(part.time)
@@ -114,10 +117,10 @@ def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -
 
 
 def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
-    """The motion after a Gauss-Newton step on the views, with differences between control points kept small.
+    """The motion after a Gauss-Newton step on the projections, with differences between control points kept small.
 
     Args:
-        image: the volume [y, x, z] at a time, before it moves.
+        image: function that returns the volume [y, x, z] at a time, before it is displaced.
     """
     right, slope = descent(motion, seen, image)
 
@@ -135,7 +138,7 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
     def normal(control: F64) -> F64:
         return curved(control) + typical * _rough(control)
 
-    step = np.zeros_like(right)  # a few steps find the large motions first
+    step = np.zeros_like(right)  # few iterations find large motions first
     conjugate_gradients(normal, right - typical * _rough(motion.control), step, _STEPS)
     return Motion(motion.shape, motion.times, motion.control + step)
 
@@ -146,7 +149,7 @@ def weighed(lines: F32, weight: F32 | None) -> F32:
 
 
 def _rough(control: F64) -> F64:
-    """Gradient of half the weighed squares of differences between neighbours in space, and of the values."""
+    """Gradient of half the weighted squares of the differences between neighbours in space, and of the values."""
     out = _SMALL * control
     for axis in (2, 3, 4):
         wide = [(0, 0)] * 5
@@ -158,11 +161,11 @@ def _rough(control: F64) -> F64:
 def conjugate_gradients(
     normal: Callable[[A], A], left: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
 ) -> None:
-    """Steps of conjugate gradients (Hestenes & Stiefel 1952) that improve `found` in place.
+    """Conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve `found` in place.
 
     Args:
-        left: the right side less `normal` of what was found so far; overwritten.
-        go_on: asked before each step. False ends it.
+        left: the right side minus `normal` of the solution so far; overwritten.
+        go_on: called before each iteration; False ends it.
     """
     of_kind = found.dtype.type
     towards, squares = left.copy(), float(np.vdot(left, left))
@@ -178,7 +181,7 @@ def conjugate_gradients(
 
 
 def moved(x: F32, u: F32 | None) -> F32:
-    """W x (see `recon.kernels.cpu.warp`); x itself without motion."""
+    """The displaced volume W x (see `recon.kernels.cpu.warp`); x itself if there is no motion."""
     if u is None:
         return x
     out = np.empty_like(x)
@@ -187,7 +190,7 @@ def moved(x: F32, u: F32 | None) -> F32:
 
 
 def moved_back(y: F32, u: F32 | None) -> F32:
-    """Wᵀ y; y itself without motion."""
+    """The transpose Wᵀ y; y itself if there is no motion."""
     if u is None:
         return y
     out = np.empty_like(y)

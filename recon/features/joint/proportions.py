@@ -1,10 +1,11 @@
-"""Proportions: densities that differ from a known one by factors which are smooth within matter, by least squares.
+"""Proportions: least-squares fit of densities that are a known density times smooth factors.
 
     min over s of ½ Σ_v w_v |A_v f Σ_k c[e(v), k] s_k - q_v|²
                   + λ/2 Σ_k (Σ_ij f_i f_j (s_ki - s_kj)² + τ Σ_i f_i² (s_ki - s_k+1,i)²)
 
-f is a known density, A_v a view, c the share of each s_k in views of a kind e, such as an energy or a moment, and i, j
-are neighbours. Nothing is smoothed across places without matter, so bodies that do not touch keep their own factors.
+f is a known density and A_v a projection. c is the share of each s_k in projections of a kind e, such as an energy or a
+moment. i, j are neighbouring voxels. Nothing is smoothed across empty regions, so bodies that do not touch have
+independent factors.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ from recon.features.joint.motion import conjugate_gradients
 from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
-_HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9  # first λ over the mean curvature of the views; its ratio to the next
+# first λ, divided by the mean curvature of the projections; ratio to the next λ; number of tests
+_HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
 _IN_TIME = 0.03  # τ
-SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # of conjugate gradients
+SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # conjugate-gradient iterations of the solution and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
-"""Steps of all trials, at most."""
+"""Largest number of iterations of all tests."""
 
 
 @dataclass
 class Countdown:
-    """Tells a listener how many steps may remain, and records whether it stopped them."""
+    """Reports to a listener how many steps may remain, and records whether the listener ended them."""
 
     go_on: Callable[[int], bool]
     left: int
@@ -49,23 +51,23 @@ class Countdown:
         return self.going
 
     def end(self) -> None:
-        """Tell the listener that no step follows."""
+        """Report to the listener that no step follows."""
         if self.going and self.left > 0:
             self.left, self.going = 0, self.go_on(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Proportions:
-    """The least-squares problem above. Volumes are [y, x, z], factors [k, y, x, z], views lines [view, col, row].
+    """The least-squares problem of this module. Volumes [y, x, z], factors [k, y, x, z], projections [view, col, row].
 
     Attributes:
-        projector: of all views.
+        projector: projector of all projections.
         kind: e, [view].
         shares: c [kind, k].
         matter: f.
         data: q.
         weight: w.
-        stop: asked many times in each step. True ends it with the factors before the step.
+        stop: called many times in each step; True ends it with the factors before the step.
     """
 
     projector: Projector
@@ -77,7 +79,7 @@ class Proportions:
     stop: Callable[[], bool] = lambda: False
 
     def select(self, views: NDArray[np.intp]) -> Proportions:
-        """The problem restricted to some views."""
+        """The problem with only some projections."""
         return replace(
             self, projector=self.projector.subset(views), kind=self.kind[views], data=self.data[views],
             weight=self.weight[views],
@@ -85,7 +87,7 @@ class Proportions:
 
     @cached_property
     def _kinds(self) -> list[tuple[Projector, NDArray[np.intp], F64]]:
-        """Projector, views and shares of each kind."""
+        """Projector, projections and shares of each kind."""
         owns = [(kind, np.flatnonzero(self.kind == kind)) for kind in np.unique(self.kind)]
         return [(self.projector.subset(own), own, self.shares[kind]) for kind, own in owns]
 
@@ -96,7 +98,7 @@ class Proportions:
             yield kind
 
     def shown(self, factors: F32) -> F32:
-        """Views [view, col, row] predicted by these factors: A f Σ c s."""
+        """The projections [view, col, row] that these factors predict: A f Σ c s."""
         out = np.empty_like(self.data)
         for projector, own, shares in self._each_kind():
             out[own] = projector.forward_lines(self.matter * np.tensordot(shares.astype(np.float32), factors, 1))
@@ -117,7 +119,7 @@ class Proportions:
         return np.einsum("vij,vij,vij->v", self.weight, residual, residual, dtype=np.float64)
 
     def rough(self, factors: F32) -> F32:
-        """Gradient of half the weighed squares of differences, without λ."""
+        """Gradient of half the weighted squares of differences, without λ."""
         out = np.zeros_like(factors)
         flow = np.float32(_IN_TIME) * self.matter**2 * np.diff(factors, axis=0)
         out[:-1] -= flow
@@ -136,11 +138,11 @@ class Proportions:
         return np.ones((self.shares.shape[1], *self.matter.shape), np.float32)
 
     def solved(self, smooth: float, factors: F32, go_on: Callable[[], bool], steps: int = SOLUTION_STEPS) -> F32:
-        """Steps of conjugate gradients from first factors.
+        """Conjugate-gradient iterations, starting from given factors.
 
         Args:
-            smooth: λ over the mean curvature of the views.
-            go_on: asked before each step. False ends it.
+            smooth: λ divided by the mean curvature of the projections.
+            go_on: called before each iteration; False ends it.
         """
         found = factors.copy()
         with suppress(StoppedError):
@@ -155,13 +157,14 @@ class Proportions:
 
 
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
-    """The `smooth` of `solved` for which the views of `fit` predict those of `judge` best, and the residual of these.
+    """The `smooth` for which the projections of `fit` predict those of `judge` best, and the residual in these.
 
-    Made lighter from a heavy one until it predicts worse twice. The heaviest that predicts as well as the best is
-    taken: to one standard error of the difference over the views of `judge` (Breiman et al. 1984, section 3.4.3).
+    It starts with a large value and is reduced until the prediction is worse twice. The largest value that predicts as
+    well as the best one (within one standard error of the difference over the projections of `judge`) is chosen
+    (Breiman et al. 1984, section 3.4.3).
 
     Args:
-        first: factors to begin with.
+        first: factors to start with.
     """
     factors, tried, worse = first, list[tuple[float, F64]](), 0
     best = np.full(judge.data.shape[0], np.inf)
@@ -180,7 +183,7 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
     return _HEAVIEST, math.inf
 
 
-_ROWS, _DEEPEST = 16, 7.0  # of trials; line integral from which on rays weigh alike
+_ROWS, _DEEPEST = 16, 7.0  # rows of test reconstructions; line integral from which on all rays have equal weight
 STEPS = TRIAL_STEPS + SOLUTION_STEPS
 
 
@@ -191,24 +194,25 @@ def fit_share(
     go_on: Callable[[int], bool] = lambda left: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
-    """Refit the densities of two states of one material: the same sum, with the fraction of each smooth within matter.
+    """Refit the densities of two states of one material: the sum stays, the fraction of each becomes smooth.
 
-    Views held out, one in eight of some rows, choose how smooth. Memory: ten volumes, six times the projections.
+    Held-out projections (one in eight, some rows) choose how smooth it is. Memory: ten volumes, six times the
+    projections.
 
     Args:
-        found: of `fit_materials`, from the same views.
+        found: result of `fit_materials` from the same projections.
         states: indices of the two materials.
-        go_on: called before each of `STEPS` steps at most, with how many may follow. False ends it, with the densities
-            found before.
-        stop: asked many times within a step. True ends it likewise.
+        go_on: called before each of at most `STEPS` steps with the number that may follow; False ends it with the
+            densities so far.
+        stop: called many times within a step; True also ends it with the densities so far.
 
     Raises:
-        ValueError: states that are no two materials.
+        ValueError: `states` are not two different materials.
     """
     check_arguments(fit_share, locals())
     count = len(found.densities)
     if len(set(states)) != 2 or not set(states) <= set(range(count)):
-        raise ValueError(f"states must be two of the materials 0 ... {count - 1}, got {states}")
+        raise ValueError(f"states must be two different materials from 0 to {count - 1}, got {states}")
     steps = Countdown(go_on, STEPS, stop)
     smooth = _smoothness(views, found, states, steps)
     steps.left = min(steps.left, SOLUTION_STEPS)
@@ -223,7 +227,7 @@ def fit_share(
 
 
 def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], grid: Grid) -> Proportions:
-    """Each ray is weighted by the photons that the densities let through, the inverse variance of its noise."""
+    """The `Proportions` problem, with rays weighted by the expected photons (the inverse variance of their noise)."""
     projector, sections = Projector(views.geometry, grid), views.cross_sections
     of_view = sections[views.energy].astype(np.float32)[:, :, None, None]
     data = projection_lines(views.projections)
@@ -240,7 +244,7 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
 
 
 def _even(problem: Proportions) -> F32:
-    """The one share for all matter that explains the mean of the views best."""
+    """The single share for the whole sample that explains the mean of the projections best."""
     one = problem.ones()
     all_explained = float(problem.explained(problem.shown(one)).sum(dtype=np.float64))
     mean = float(problem.explained(problem.data).sum(dtype=np.float64)) / (all_explained or 1)

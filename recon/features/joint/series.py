@@ -1,7 +1,8 @@
-"""One fit of a sample that changes while it is scanned: volumes at a few times, between which it changes linearly.
+"""Time series: joint fit of volumes at several times of a changing sample, with linear change in between.
 
-Views of a short time are too few for a volume, and one volume of all views shows a sample that never was. So all views
-determine the volumes of all times in one fit, with total variation of what they share and of how they differ.
+The projections of a short time are too few for a volume, and one volume from all projections shows a sample that never
+existed. So one fit determines the volumes of all times from all projections, with total variation of their common part
+and of their differences.
 """
 
 from __future__ import annotations
@@ -32,31 +33,32 @@ from recon.features.joint.spectral import weight_of, weights_by_views
 from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
-MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
-_MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
-_SURE = 2.0  # standard errors over eight blocks of views held out, see `exceeds_standard_error`: 4 % of false alarms
-_LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
-_ROWS = 16  # of the trial of factors
-_TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24 * 16 at most
-_TURN = 4  # sweeps that the steps of a motion take, beside its own
-_FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
+MOMENTS = 64  # largest number of moments between two knots; projections of one moment count as simultaneous
+_MOTION_MOMENTS = 16  # moments of the scan for estimating the motion, which is smooth in time
+_SURE = 2.0  # standard errors over eight held-out blocks, see `exceeds_standard_error`; 4 % false alarms
+_LESS = 0.95  # motion or factors are accepted if they lower the squared residual in held-out projections to this share
+_ROWS = 16  # rows in the test of factors
+_TRIALS = 24 * 13  # iterations for the weights on these rows; 24 * 11 for usual data, 24 * 16 at most
+_TURN = 4  # time of the steps of a motion in units of iterations, in addition to its own iterations
+_FACTORS = 120, 60  # time of factors in units of iterations: tests (in addition to the fit), and solution
 SWEEPS = 60
-LEAST_VIEWS = 12  # for each volume: views held out must see it, too
-_LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
+LEAST_VIEWS = 12  # projections per volume; held-out projections must also see it
+# fewest projections that are nearer to a volume than to any other (end volumes have projections on one side only)
+_LEAST_NEAR = 6
 
 
 @dataclass(frozen=True, eq=False)
 class TimedViews:
-    """Views of a changing sample.
+    """Projections of a changing sample, with their times.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
-        geometry: of all views.
-        times: float64 [view], when each was exposed; any unit and origin.
-        weight: of each ray [view, row, col]; None: one.
+        geometry: geometry of all projections.
+        times: float64 [view], time of each exposure; any unit and origin.
+        weight: weight of each ray [view, row, col]; None: 1.
 
     Raises:
-        ValueError: times that are not one a view, not finite, or all the same.
+        ValueError: there is not one time per projection, a time is not finite, or all are equal.
     """
 
     projections: F32
@@ -68,7 +70,7 @@ class TimedViews:
         check_settings(self)
         n = self.geometry.n_views
         if self.times.shape != (n,) or not np.isfinite(self.times).all() or np.ptp(self.times) == 0:
-            raise ValueError(f"times must be {n} finite numbers, one a view, that are not all the same")
+            raise ValueError(f"times must be {n} finite numbers, one for each projection, and not all equal")
 
     @property
     def span(self) -> tuple[float, float]:
@@ -78,19 +80,20 @@ class TimedViews:
 
 @dataclass(frozen=True, eq=False)
 class TimedVolumes:
-    """A changing volume, linear between knots in time, with motion.
+    """A changing volume: linear between knots in time, optionally with motion.
 
     Attributes:
-        times: float64 [knot], in the unit of the views' times, evenly from the first view to the last.
-        volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px where the pitch is 1), 0 or more; before it moves.
-            `at` has what is seen.
-        grid: of each volume.
-        residual: norm of what the volumes leave of the views, over the norm of the views.
-        motion: from where each place takes its value; None: nothing moves.
-        unseen_residuals: what coarse volumes without and with motion leave of views held out, as `residual`; None where
-            the motion was not chosen by them.
-        smooth: of the module `proportions`: each volume is the mean of all, times factors smooth within matter. None:
-            each is fitted by itself.
+        times: float64 [knot], in the unit of the projections' times, evenly spaced from the first projection to the
+            last.
+        volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px if the pitch is 1), 0 or more, before the motion is
+            applied. `at` gives the displaced volume.
+        grid: grid of each volume.
+        residual: norm of the residual of the projections, divided by the norm of the projections.
+        motion: displacement from which each voxel takes its value; None: nothing moves.
+        unseen_residuals: residuals in held-out projections of coarse volumes without and with motion; None if held-out
+            projections did not decide about motion.
+        smooth: smoothness of the factors (module `proportions`) if each volume is the mean of all times smooth factors.
+            None: each volume is fitted separately.
     """
 
     times: F64
@@ -112,7 +115,7 @@ class TimedVolumes:
 
 
 def hats(at: ArrayLike, knots: F64) -> F64:
-    """Weights [time, knot] of linear interpolation between evenly spaced knots; constant beyond the ends."""
+    """Weights [time, knot] for linear interpolation between evenly spaced knots; constant beyond the ends."""
     place = np.interp(np.atleast_1d(at), knots, np.arange(knots.size))
     return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
 
@@ -128,28 +131,29 @@ def fit_series(
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> TimedVolumes:
-    """Volumes at evenly spaced times that explain all views in one least-squares fit with total variation.
+    """Volumes at evenly spaced times, from one least-squares fit to all projections with total variation.
 
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
 
-    h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
-    middle of the scan (module `motion`). This is the problem of `fit_materials`, with knots for materials and the
-    hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
-    Where nothing moves, and views held out are predicted better so, the volumes become factors of their mean that are
-    smooth within matter: bodies that take up or lose something, each at its time.
-    Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
-    each count down to 0. After the sweeps, the steps of the
-    factors count down; if they are ended, the volumes are those without.
+    h_k are hat functions, so the volume is linear in time between knots. W displaces the volume, smoothly in space and
+    time, and is the identity in the middle of the scan (module `motion`). This is the problem of `fit_materials` with
+    knots in place of materials and hat functions in place of cross sections. z_j are the orthonormal components of all
+    x_k; the first one is their common part. If nothing moves, and if it predicts held-out projections better, the
+    volumes become the mean volume times smooth factors. This suits bodies that each take up or lose something at their
+    own time. Steps, memory, `go_on` and `stop` are as in `fit_materials`. The tests of weights, of whether the sample
+    moves, of the motion and of factors each count down to 0. After the iterations, the steps of the factors count down.
+    If they are ended early, the volumes are those without factors.
 
     Args:
-        knots: volumes, 2 or more.
-        motion: learn how the sample moves, too; None: where views held out are predicted better with it. It helps a
-            sample that settles; one that only changes its densities gets motions that are not there.
-        tv_weight: μ of all components, so that a sample that does not change has the weight of one volume of all views;
-            None: the one with which views held out are predicted best.
+        knots: number of volumes, 2 or more.
+        motion: True: also estimate the motion. None: only if it predicts held-out projections better. It helps for a
+            sample that settles. For a sample that only changes its densities, it finds motions that do not exist.
+        tv_weight: μ of all components, scaled so that for an unchanging sample it is the weight of one volume from all
+            projections. None: the weight that predicts held-out projections best.
 
     Raises:
-        ValueError: fewer than twelve views a volume, or fewer than six that are nearer to it than to any other.
+        ValueError: a volume has fewer than twelve projections, or fewer than six that are nearer to it than to any
+            other.
     """
     check_arguments(fit_series, locals())
     refuse_few(knots, views.geometry.n_views)
@@ -174,14 +178,14 @@ def fit_series(
 
 
 def _refuse_gaps(times: F64, knots: F64) -> None:
-    """ValueError where too few views are near one of the volumes."""
+    """Raise ValueError if too few projections are near one of the volumes."""
     near = (hats(times, knots) > 0.5).sum(0)
     if near.min() < _LEAST_NEAR:
         k = int(near.argmin())
         raise ValueError(
-            f"volume {k + 1} of {knots.size}, at time {knots[k]:g}, has {near[k]} views within "
-            f"{np.diff(knots)[0] / 2:g}, expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views "
-            "before and after a gap separately"
+            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {near[k]} within "
+            f"{np.diff(knots)[0] / 2:g}, and at least {_LEAST_NEAR} are needed. Ask for fewer volumes, or reconstruct "
+            "the projections before and after a gap separately"
         )
 
 
@@ -192,7 +196,7 @@ def _motion(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> tuple[Motion | None, tuple[float, float] | None]:
-    """The motion of the sample, and residuals of views held out without and with motion, where these chose."""
+    """The motion of the sample, and the residuals in held-out projections without and with motion, if these decided."""
     unseen = None
     if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
         wanted = _moves(*squares)
@@ -202,12 +206,12 @@ def _motion(
 
 
 def _moves(still: F64, moved: F64) -> bool:
-    """Whether matter moves, by squared residuals [block] of views held out without and with motion."""
+    """Whether the sample moves, from squared residuals [block] of held-out projections without and with motion."""
     return exceeds_standard_error(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
-    """The volumes as smooth factors of their mean; unchanged if a stop ends the steps to them."""
+    """The volumes as their mean times smooth factors; unchanged if the steps are stopped."""
     stop, problem = fit.stop, _of_factors(fit.views, made.volumes, made.grid, fit.stop)
     steps = Countdown(lambda after: go_on(-after, made.residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
@@ -219,7 +223,7 @@ def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callab
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
-    """Factors of the mean of the volumes; rays with little light behind the mean weigh less."""
+    """The problem of factors of the mean volume; rays with low intensity behind the mean have less weight."""
     projector, matter = Projector(views.geometry, grid), volume_lines(volumes.mean(0))
     weight = weight_of(np.exp(-projector.forward_lines(matter)))
     if views.weight is not None:
@@ -237,9 +241,9 @@ def smooth_factors(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> float | None:
-    """The best smoothness of factors of the mean; None if separate volumes predict held-out views as well.
+    """The best smoothness of the factors; None if separate volumes predict held-out projections as well.
 
-    Of some rows, from seven of eight views.
+    It is found on some rows, from seven of eight projections.
     """
     rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
@@ -260,22 +264,23 @@ def smooth_factors(
 
 
 def refuse_few(knots: int, n: int) -> None:
-    """Raise ValueError if `n` views are too few for `knots` volumes."""
+    """Raise ValueError if `n` projections are too few for `knots` volumes."""
     if not 2 <= knots <= n // LEAST_VIEWS:
         raise ValueError(
-            f"{knots} volumes of {n} views: expected 2 volumes or more, and {LEAST_VIEWS} views or more for each"
+            f"cannot make {knots} volumes from {n} projections: ask for at least 2 volumes, with at least "
+            f"{LEAST_VIEWS} projections for each"
         )
 
 
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
-    """The views in at most `most` moments of equally many views, and these moments within the scan, 0 ... 1."""
+    """The projections in at most `most` moments of equal size, and the times of these moments in the scan, 0 to 1."""
     n = views.geometry.n_views
     moments = min(most, n)
     moment = np.empty(n, np.intp)
     moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
-    at = np.bincount(moment, views.times) / np.bincount(moment)
+    middles = np.bincount(moment, views.times) / np.bincount(moment)
     shares = np.zeros((moments, times.size))
     np.add.at(shares, moment, hats(views.times, times))
     shares /= np.bincount(moment)[:, None]
-    past = (at - times[0]) / np.ptp(times)
+    past = (middles - times[0]) / np.ptp(times)
     return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past

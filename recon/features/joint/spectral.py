@@ -1,7 +1,7 @@
-"""One fit of several energies: the density of each material, from views that each see one energy.
+"""Spectral reconstruction: joint fit of the density of each material to projections at several energies.
 
-The attenuation at an energy is a sum over materials with known cross sections. So no energy needs a full set of views:
-all views of all energies determine the few volumes of the materials.
+The attenuation at an energy is a sum over materials with known cross sections. So no energy needs a complete set of
+projections: the projections of all energies together determine the few volumes of the materials.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 
-TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
-_LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray
-_AVERAGED = 1.5  # pixels, over which depth is averaged
-_FIRST = 0.1  # the first weight, over the largest gradient at zero
-ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
-_TRIALS = 12  # of one weight for all components, each half of the last one
-_HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
-_AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
+# rows and iterations of a test of weights, which starts with the volumes of the previous test
+TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8
+_LITTLE, _LEAST = 0.1, 0.1  # share of the open-beam intensity; smallest weight of a ray
+_AVERAGED = 1.5  # pixels over which line integrals are averaged
+_FIRST = 0.1  # the first weight, divided by the largest gradient at zero
+ALIKE_LONGER = 3  # factor on the iterations, because volumes at different times differ more than materials
+_TRIALS = 12  # tests of one weight for all components, each half of the previous one
+_HEAVIER = 4  # tests of a larger weight for all except the first component, each twice the previous one
+_AS_WELL = 1.01  # weights whose residual is within this factor of the smallest count as equally good
 MATERIAL_SWEEPS = 20
-TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # largest number for all tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +38,10 @@ class Materials:
     """Densities of materials.
 
     Attributes:
-        densities: float32 [material, z, y, x], in the unit of the cross sections' densities. 0 or more.
-        grid: of each volume.
-        weights: of total variation, one for each component (see `fit_materials`).
-        residual: norm of what the volumes leave of the views, over the norm of the views.
+        densities: float32 [material, z, y, x], 0 or more, in the density unit of the cross sections.
+        grid: grid of each volume.
+        weights: weights of total variation, one for each component (see `fit_materials`).
+        residual: norm of the residual of the projections, divided by the norm of the projections.
     """
 
     densities: F32
@@ -49,11 +50,11 @@ class Materials:
     residual: float
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
-        """The fraction [z, y, x] of a material in the summed density of itself and others, 0 ... 1, such as a state of
-        charge.
+        """The fraction [z, y, x], 0 to 1, of a material in the summed density of itself and others (e.g. state of
+        charge).
 
         Args:
-            least: summed density below which there is nothing to take a share of: NaN there.
+            least: voxels with a lower summed density get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)
@@ -70,25 +71,28 @@ def fit_materials(
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
-    """The densities that explain the views of all energies in one least-squares fit with total variation.
+    """The densities of the materials, from one least-squares fit to the projections of all energies with total
+    variation.
 
         min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0
 
-    U S Vᵀ is the singular value decomposition of the cross sections (each energy counted by its views). The densities
-    are V S⁻¹ z. The columns of U are orthonormal, so noise is the same in all components z_k, and the fit is as well
-    conditioned as that of one energy. A sweep costs as much as one over the same views at one energy. Steps are those
-    of `ordered_fista`; densities below 0 are clipped after each of them. (Long & Fessler 2014, IEEE Trans. Med. Imaging
-    33, 1614, fit materials to spectra in one step, too.)
-    Memory: seven volumes a material, three times the projections.
+    U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
+    projections). The densities are V S⁻¹ z. The columns of U are orthonormal, so the noise is the same in all
+    components z_k, and the fit is as well conditioned as one at a single energy. An iteration takes as long as one with
+    the same number of projections at a single energy. Steps are those of `ordered_fista`; after each step, densities
+    below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to spectra in one
+    step.)
+    Memory: seven volumes per material, three times the projections.
 
     Args:
-        grid: of the volumes; None: as the geometry has it.
-        tv_weight: of all components; None: the weights with which views held out are predicted best.
-        sweeps: of about nine steps each, which see all views equally often.
-        go_on: called with (sweep, residual) after each sweep, and with (-n, residual) after each sweep of trials of
-            weights, where n may follow. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
-        stop: asked many times within a sweep, from the second step on. True ends the fit with the volumes before the
-            step that it interrupts.
+        grid: grid of the volumes; None: that of the geometry.
+        tv_weight: weight for all components; None: the weights that predict held-out projections best.
+        sweeps: number of iterations, each of about nine steps that use all projections equally often.
+        go_on: called with (iteration, residual) after each iteration. During the test reconstructions for the weights
+            it is called with (-n, residual), with n the number that may still follow (`TRIAL_SWEEPS` at most). False
+            ends the fit with the volumes so far.
+        stop: called many times within an iteration, from the second step on. True ends the fit with the volumes before
+            the current step.
     """
     check_arguments(fit_materials, locals())
     warn_of_other_quantity(views.projections)
@@ -100,32 +104,33 @@ def fit_materials(
     return Materials(densities, grid, weights, residual)
 
 
-def weight_of(light: F32) -> F32:
-    """Weights of rays with this transmission, up to 1."""
-    return np.clip(light / _LITTLE, _LEAST, 1)
+def weight_of(transmission: F32) -> F32:
+    """Weights, up to 1, of rays with this transmission."""
+    return np.clip(transmission / _LITTLE, _LEAST, 1)
 
 
 def _weighed(views: EnergyViews) -> EnergyViews:
-    """Rays with less than a tenth of the light weigh less, by the mean depth around them, down to a tenth.
+    """The projections with lower weights (down to a tenth) for rays below a tenth of the open-beam intensity.
 
-    Their noise is larger, and the logarithm of few counts is biased. Of the weights given, those above a tenth of the
-    largest count as equal. Weights of a wider range would take more sweeps.
+    The reason: their noise is larger, and the logarithm of few counts is biased. The mean line integral around a ray
+    decides. Given weights above a tenth of the largest count as equal, because a wider range of weights would need more
+    iterations.
     """
     there = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
-    light = np.empty_like(there)
+    transmission = np.empty_like(there)
     for view, image in enumerate(views.projections):
         near = gaussian_filter(there[view], _AVERAGED)
-        light[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
-    weight = weight_of(light)
+        transmission[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
+    weight = weight_of(transmission)
     if views.weight is not None:
         weight *= np.minimum(1, views.weight / (_LITTLE * (float(views.weight.max()) or 1)))
     return replace(views, weight=weight.astype(np.float32))
 
 
 class _Trials:
-    """Trials of weights of total variation [component]: each begins with the volumes of the last one.
+    """Test reconstructions for the weights of total variation [component]; each starts with the previous volumes.
 
-    Attribute `going`: `go_on` and `stop` have ended none.
+    Attribute `going`: True as long as `go_on` and `stop` have not ended a test.
     """
 
     def __init__(
@@ -136,13 +141,13 @@ class _Trials:
         go_on: Callable[[int, float], bool],
         stop: Callable[[], bool],
     ) -> None:
-        """Take the views of a trial (`fit`) and those held out (`judge`)."""
+        """`fit`: projections for the test reconstructions; `judge`: held-out projections."""
         self.going = True
         self._fit, self._judge, self._sweeps = fit, judge, sweeps
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """Residual of the views held out, infinite if the trial was stopped; `after`: trials that may still follow."""
+        """Residual in held-out projections, infinite if the test was stopped; `after`: tests that may still follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
@@ -151,10 +156,11 @@ class _Trials:
         if self._stop():
             self.going = False
             return math.inf
-        return self._judge.residual_of(self._fit.densities())  # not z: an energy's share of the views is another one
+        # not z, because the share of an energy in these projections is different
+        return self._judge.residual_of(self._fit.densities())
 
     def common(self, after: int) -> F64:
-        """One weight for all components, halved until it predicts worse twice; the best so far if ended."""
+        """One weight for all components, halved until the prediction is worse twice; if stopped, the best so far."""
         weights = np.full(len(self._fit.z), _FIRST * self._fit.steepest())
         best, least, worse = weights, math.inf, 0
         for trial in range(1, 1 + _TRIALS):
@@ -168,7 +174,7 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """The heaviest weights, in powers of the factor, that predict as well as the best; `weights` if stopped."""
+        """The largest weights, in powers of `factor`, that predict as well as the best; `weights` if stopped."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:
@@ -186,13 +192,14 @@ def weights_by_views(
     *,
     alike: bool = False,
 ) -> F64:
-    """Weights of total variation [component], chosen with one view in eight held out.
+    """Weights of total variation [component], chosen with one in eight projections held out.
 
-    First one weight for all components, halved until it predicts worse. Those that hold differences then get the
-    heaviest that predicts within 1 % of the best: they have less structure, and the same noise.
+    First, one weight for all components is halved until the prediction gets worse. Then the components that contain
+    differences get the largest weight that predicts within 1 % of the best, because they have less structure and the
+    same noise.
 
     Args:
-        alike: all components keep one weight.
+        alike: True: all components keep the same weight.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     rows, grid = trial_rows(views, grid, TRIAL_ROWS)

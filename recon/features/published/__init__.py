@@ -1,4 +1,4 @@
-"""R²-Gaussian as published, beside our own. Its 30 000 steps would take a trade-off hours."""
+"""The published R²-Gaussian fit (`r2-published`). Trade-offs leave it out, because its 30 000 steps take hours."""
 
 from recon.base.registry import Lengths, MethodEntry
 

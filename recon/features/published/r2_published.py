@@ -1,4 +1,4 @@
-"""R2Published: R²-Gaussian with the published settings, beside our own (Zha et al. 2024, NeurIPS, and their code)."""
+"""R2Published: R²-Gaussian with the published settings, for comparison (Zha et al. 2024, NeurIPS, and their code)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ _STEPS = 30_000
 
 
 def published_fit() -> FitSettings:
-    """The published weights, rates and limits.
+    """The published weights, learning rates and limits.
 
-    Three departures stay. Widths are bounded in pixels from below, not by a sigmoid. Total variation leaves centres in
-    place, as in effect in the published code. A Gaussian ends at 3σ of its ellipse, not at a square of tiles.
+    Three differences remain. Widths have a lower bound in pixels instead of a sigmoid. Total variation does not move
+    centres (in the published code it has no effect on them either). A Gaussian ends at 3σ of its ellipse instead of a
+    square of tiles.
     """
     policy = DensityPolicy(
         start=500 / _STEPS, stop=0.5, every=100, threshold=5e-5, large=0.1, prune_below=1e-5, growth=10.0,
@@ -33,7 +34,10 @@ def published_fit() -> FitSettings:
 
 @dataclass(frozen=True, eq=False)
 class R2Published(R2):
-    """The published R²-Gaussian: 30 000 steps of one view, true Gaussians, no finish; attributes as of `R2`."""
+    """The published R²-Gaussian: 30 000 steps of one projection, true Gaussians, no voxel refinement.
+
+    Attributes: see `R2`.
+    """
 
     name: ClassVar[str] = "r2-published"
     label: ClassVar[str] = "R²-Gaussian as published"

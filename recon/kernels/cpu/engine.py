@@ -1,6 +1,6 @@
-"""The CPU kernels as an engine: views and boxes of Gaussians rendered, with their backward passes, on numpy arrays.
+"""The CPU kernels behind one interface: renders projections and voxel boxes of Gaussians, with backward passes.
 
-`recon.kernels.gpu.engine` is its counterpart.
+It works on numpy arrays. `recon.kernels.gpu.engine` is the counterpart for GPUs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Active:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients on the physical parameters; each projection or box of voxels adds to them."""
+    """Gradients of the physical parameters; each projection or voxel box adds to them."""
 
     means: F32
     log_scales: F32
@@ -58,14 +58,14 @@ class Gradients:
         return cls(*(np.zeros(shape, np.float32) for shape in shapes))
 
     def to_raw(self, quaternions: F32, raw: F32, unit: float) -> tuple[F32, F32, F32, F32]:
-        """Gradients on means, log scales, quaternions and raw densities."""
+        """Gradients of means, log scales, quaternions and raw densities."""
         d_quaternions, d_raw = np.empty_like(quaternions), np.empty_like(raw)
         activation_backward(quaternions, raw, unit, self.rotations, self.densities, d_quaternions, d_raw)
         return self.means, self.log_scales, d_quaternions, d_raw
 
 
 def camera(geometry: Geometry, view: int) -> RayCamera:
-    """One view of a geometry as a camera of the kernels."""
+    """One projection of a geometry as a camera for the kernels."""
     axes = geometry.axes(view).astype(np.float32)
     col, row = geometry.origin(view)
     width = geometry.width.variance, geometry.width.arc / math.sqrt(12)
@@ -76,16 +76,16 @@ def camera(geometry: Geometry, view: int) -> RayCamera:
 
 
 def seen_from(active: Active, geometry: Geometry, view: int) -> Active:
-    """The Gaussians about the view's centre, where its axes start."""
+    """The Gaussians relative to the centre of the projection, where its axes start."""
     centre = geometry.centres[view]
     return replace(active, means=active.means - centre.astype(np.float32)) if centre.any() else active
 
 
 @dataclass(frozen=True, eq=False)
 class Scratch:
-    """Scratch buffers for a view of n Gaussians; views rendered one after the other may share one.
+    """Scratch buffers for one projection of n Gaussians; projections rendered one after another may share them.
 
-    New ones for each view would allocate several MB a step for 50 000 Gaussians.
+    New buffers for each projection would allocate several MB per step for 50 000 Gaussians.
 
     Attributes:
         table: float32 [n, 8], the footprints.
@@ -104,16 +104,17 @@ class Scratch:
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """One rendered view with everything that its backward pass needs.
+    """One rendered projection with everything that its backward pass needs.
 
     Attributes:
         image: line integrals [row, col].
-        active: the Gaussians about the view's centre; neither they nor `scratch` may change before `backward`.
-        into: what `backward` adds to.
-        camera: the view.
+        active: the Gaussians relative to the centre of the projection; they and `scratch` must not change before
+            `backward`.
+        into: the gradients to which `backward` adds.
+        camera: the projection.
         length: see `RayModel.length`.
-        scratch: holds the table of footprints.
-        exact: indices of the Gaussians that are integrated ray by ray.
+        scratch: contains the table of footprints.
+        exact: indices of the Gaussians that are integrated along each ray.
         rays: their rays; None if there are none.
     """
 
@@ -127,7 +128,7 @@ class RenderedView:
     rays: CpuRays | None
 
     def backward(self, gradient: F32) -> F32:
-        """Add an image gradient [row, col] to `into`; returns the gradient on centres [n, 2] in pixels."""
+        """Back-propagate an image gradient [row, col] to `into`; returns the gradient of centres [n, 2] in pixels."""
         a, into, table = self.active, self.into, self.scratch.table
         centres = np.empty((len(into.densities), 2), np.float32)
         under = moments(table, gradient, self.scratch.moments, a.kernel)
@@ -162,9 +163,9 @@ def render_view(
     model: RayModel,
     scratch: Scratch,
 ) -> RenderedView:
-    """Render the line integrals of one view; `faint` in the same unit.
+    """Render the line integrals of one projection; `faint` has the same unit.
 
-    `scratch` is overwritten. A view that shares it must have run `backward` before the next one is rendered.
+    `scratch` is overwritten. If projections share it, call `backward` of one before the next is rendered.
     """
     shape, a = geometry.detector_shape, seen_from(active, geometry, view)
     picture = np.empty(shape, np.float32)

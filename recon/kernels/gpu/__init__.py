@@ -1,24 +1,24 @@
-"""Kernels for CUDA devices, in Triton and torch: the CPU kernels' operations; imported only if a GPU is used.
+"""Kernels for CUDA devices (Triton and torch) with the operations of the CPU kernels; imported only if a GPU is used.
 
-They work on contiguous float32 torch tensors. Sums are gathered, never scattered. An image tile or a brick of voxels
-sums the Gaussians on its list; a Gaussian sums the gradient under it. So there are no atomics, and the same input gives
-the same bits. With TRITON_INTERPRET=1 in the environment, before the first import, the same kernels run on the CPU,
-slowly, for tests.
+They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
+sums the Gaussians in its list, and a Gaussian sums the gradient in its footprint. So there are no atomics, and the same
+input gives bit-identical results. If TRITON_INTERPRET=1 is set in the environment before the first import, the same
+kernels run slowly on the CPU, for tests.
 """
 
 from __future__ import annotations
 
 import os
 
-# Triton 3.9 warns unless this is set, since its default will change; the kernels use fused multiply-adds.
+# Triton 3.9 warns if this is not set, because its default will change; the kernels use fused multiply-adds.
 os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")
 
 try:
     import triton
 except ImportError as error:
     raise ImportError(
-        f"the GPU kernels need triton, which cannot be loaded here ({error}); install splatline[gpu] (Linux), or fit "
-        "on the cpu"
+        f"the GPU kernels need triton, which cannot be loaded ({error}). Install splatline[gpu] (Linux), or use "
+        "device cpu"
     ) from error
 
 import torch
@@ -40,21 +40,21 @@ def require(device: str | torch.device) -> torch.device:
     if interpreted():
         return torch.device("cpu")
     if wanted.type != "cuda":
-        raise ValueError(f"the GPU kernels run on cuda devices, got {wanted}; take the CPU kernels for it")
+        raise ValueError(f"the GPU kernels run on cuda devices, got {wanted}; use the CPU kernels for it")
     if not torch.cuda.is_available():
         raise RuntimeError(
-            f"device {wanted} was asked for, but torch {torch.__version__} sees no CUDA device: check the driver and "
-            "that this torch is a CUDA build, or fit on the cpu"
+            f"cannot use device {wanted}: torch {torch.__version__} finds no CUDA device. Check the driver and that "
+            "this torch is a CUDA build, or use device cpu"
         )
     current, count = torch.cuda.current_device(), torch.cuda.device_count()
     if wanted.index is not None and not 0 <= wanted.index < count:
         raise ValueError(
-            f"device {device} was asked for, and torch sees {count} CUDA device{'' if count == 1 else 's'}, counted "
-            f"from 0: ask for cuda, which is cuda:{current}, or fit on the cpu"
+            f"there is no device {device}: torch finds {count} CUDA device{'' if count == 1 else 's'}, counted from "
+            f"0. Use cuda, which is cuda:{current}, or cpu"
         )
     if wanted.index not in (None, current):
         raise ValueError(
-            f"device {wanted} was requested, but GPU kernels run only on the current one, cuda:{current}: start Python "
-            f"with CUDA_VISIBLE_DEVICES={wanted.index} and ask for cuda"
+            f"cannot use device {wanted}: the GPU kernels run only on the current device, cuda:{current}. Start "
+            f"Python with CUDA_VISIBLE_DEVICES={wanted.index} and use cuda"
         )
     return wanted

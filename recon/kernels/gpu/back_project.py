@@ -1,10 +1,10 @@
-"""FDK of views in any pose, of a cone or a parallel beam: the filter (torch) and the back-projection (Triton).
+"""FDK for projections in any pose, cone or parallel beam: the filter (torch) and the back-projection (Triton).
 
     depth = D + Dx i + Dy j + Dz k,   col = (C + Cx i + Cy j + Cz k) / depth,   row likewise
 
-Voxels (i, j, k) are counted from [ny // 2, nx // 2, nz // 2], columns and rows from [cols // 2, rows // 2]: at 2048
-voxels a float32 then places a voxel to 2e-4 of a pixel. Depth is 1 at the axis, and everywhere of a parallel beam.
-Each voxel sums over the views in their order, so the same input gives the same bits.
+Voxels (i, j, k) are counted from [ny // 2, nx // 2, nz // 2], columns and rows from [cols // 2, rows // 2]. With 2048
+voxels, float32 then gives positions within 2e-4 of a pixel. Depth is 1 at the axis, and everywhere in a parallel beam.
+Each voxel sums over the projections in their order, so the same input gives bit-identical results.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _back_project(
     z = tile // (tiles_x * tiles_y) * DEEP + tl.arange(0, DEEP)
     live = ((x < nx) & (y < ny))[:, None] & (z < nz)[None, :]
     voxel = (y * nx + x).to(tl.int64)[:, None] * nz + z[None, :]
-    # Lanes past the end repeat the last voxel and store nothing.
+    # Lanes beyond the end repeat the last voxel and store nothing.
     i = (tl.minimum(x, nx - 1) - nx // 2).to(tl.float32)[:, None]
     j = (tl.minimum(y, ny - 1) - ny // 2).to(tl.float32)[:, None]
     k = (tl.minimum(z, nz - 1) - nz // 2).to(tl.float32)[None, :]
@@ -70,7 +70,7 @@ def _back_project(
 def filtered(
     views: F32, geometry: Geometry, weights: F64, zeros: tuple[int, int], responses: Iterable[tuple[Any, ...]]
 ) -> Tensor:
-    """Views [view, row, col], weighed and filtered as `recon.voxels.direct` does it: [view, col, row] on the GPU."""
+    """Projections [view, row, col], weighted and filtered as in `recon.voxels.direct`: [view, col, row] on the GPU."""
     (rows, cols), device = geometry.detector_shape, require("cuda")
     out = torch.empty((len(views), cols + sum(zeros), rows), dtype=torch.float32, device=device)
     col, row = (torch.arange(n, dtype=torch.float64, device=device) for n in (cols, rows))
@@ -95,7 +95,8 @@ def back_project(
 ) -> None:
     """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth.
 
-    A view gives nothing to voxels that it does not see. Half a pixel beyond the outer pixels' centres counts as them.
+    A projection adds nothing to voxels that it does not see. Up to half a pixel beyond the centres of the outer pixels,
+    their value is used.
 
     Args:
         axes: [view, 3, 3], along columns, rows and the beam. origins: [view, 2], pixel (col, row) of the axis.

@@ -1,4 +1,4 @@
-"""Gpu: the operations of a fit on a GPU, the Backend of `recon.splatting.backend` on torch tensors."""
+"""Gpu: the operations of a Gaussian fit on a GPU (a Backend of `recon.splatting.backend` on torch tensors)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recon.kernels.gpu.parameters import adam, adam_by, adam_rates, add_lengths
 from recon.kernels.gpu.passes import GpuBox, GpuPass, GpuView
 from recon.kernels.gpu.tiles import Room
 
-_QUEUE = 128  # steps after which the host looks whether the lists were long enough
+_QUEUE = 128  # number of steps after which the host checks whether the lists were long enough
 _RATES = 5
 
 
@@ -32,9 +32,10 @@ def _tally(
     sums, variation, tv_weight, counts, rooms, means, go, pixels, ssim, VIEWS: tl.constexpr, LISTS: tl.constexpr,
     BOXED: tl.constexpr,
 ):  # fmt: skip
-    """Whether all lists were long enough; if so, count the step and add it to the running means of loss and residual.
+    """Check whether all lists were long enough; if so, count the step and update the running means.
 
-    `sums` [view, 4] are those of the loss, `counts` the steps and then the pairs that each list needed.
+    The means are those of loss and residual. `sums` [view, 4] are the sums of the loss; `counts` contains the steps and
+    then the number of pairs that each list needed.
     """
     short = tl.load(counts) * 0
     for k in tl.static_range(LISTS):
@@ -56,10 +57,10 @@ def _tally(
 
 
 class GpuStep:
-    """Steps of one model by one plan, see `recon.kernels.fused_step.FusedStep`."""
+    """Steps of one model with one plan, see `recon.kernels.fused_step.FusedStep`."""
 
     def __init__(self, model: StepModel, plan: StepPlan, device: torch.device, earlier: GpuStep | None) -> None:
-        """`earlier` steps of a model before density control tell how long lists become."""
+        """`earlier`: steps of a model before density control; they show how long the lists become."""
         self.model, self.plan, self._device = model, plan, device
         lists, pixels = plan.views + (plan.box is not None), plan.geometry.detector_shape
         self._counts = torch.zeros(1 + lists, dtype=torch.int64, device=device)
@@ -78,7 +79,7 @@ class GpuStep:
         self._beams: tuple[Geometry, dict[int, F32]] = (plan.geometry, {})
 
     def lengths_for(self, model: StepModel, lists: int) -> list[int]:
-        """About the lengths of the lists of another number of Gaussians."""
+        """Estimated lengths of the lists for another number of Gaussians."""
         more = len(model.statistic) / max(1, len(self.model.statistic))
         return [math.ceil(more * (room.pairs or 0)) for room in self._rooms][:lists] + [0] * (lists - len(self._rooms))
 
@@ -90,7 +91,7 @@ class GpuStep:
             self.settle()
 
     def settle(self) -> None:
-        """Wait until the arrays of the model hold all steps."""
+        """Wait until the arrays of the model include all steps."""
         while self._queued:
             done, *needed = self._counts.tolist()
             self._counts.zero_()
@@ -104,13 +105,13 @@ class GpuStep:
                 self._issue(inputs)
 
     def _prepare(self) -> None:
-        """Lengths of the lists for the device; a graph of other lengths is of no use."""
+        """Set the lengths of the lists on the device. A graph with other lengths cannot be used any more."""
         self._lengths.copy_(torch.tensor([room.pairs or 0 for room in self._rooms]))
         self._graph = None
 
     def _issue(self, inputs: StepInputs) -> None:
         self._load(inputs)
-        if self._rooms[0].pairs is None:  # the first step counts the pairs, and compiles
+        if self._rooms[0].pairs is None:  # the first step counts the pairs and compiles the kernels
             self._work()
             for room, pairs in zip(self._rooms, self._expected, strict=True):
                 room.pairs = max(room.pairs or 0, pairs)
@@ -133,7 +134,7 @@ class GpuStep:
         return graph
 
     def _load(self, inputs: StepInputs) -> None:
-        """What differs from step to step, to where the graph reads it."""
+        """Copy the values that differ between steps to where the graph reads them."""
         plan = self.plan
         variation = inputs.tv_weight / max(1, neighbours(plan.box.shape)) if plan.box is not None else 0.0
         numbers = np.concatenate(
@@ -163,7 +164,7 @@ class GpuStep:
         return beams[view]
 
     def _work(self) -> None:
-        """The launches of a step."""
+        """Launch the kernels of a step."""
         plan, model, numbers, rooms = self.plan, self.model, self._numbers, self._rooms
         means, log_scales, quaternions, raw = model.parameters
         run, views = GpuPass(means, log_scales, quaternions, raw, plan.unit, plan.kernel), plan.views

@@ -1,8 +1,8 @@
-"""Footprints of Gaussians on the detector, and gradients back: parallel beam and affine cone (Triton).
+"""Footprints of Gaussians on the detector, and their gradients: parallel beam and affine cone (Triton).
 
-Formulas and symbols are those of `cpu.footprints`: products of a, b and h instead of determinants, and a gradient on
-deformations in the Gaussian's own axes, from moments along a footprint's own directions. Gaussians with a parameter
-that is not finite are hidden.
+Formulas and symbols are those of `cpu.footprints`. Products of a, b and h replace determinants. The gradient is with
+respect to deformations in the Gaussian's own axes, and is computed from moments along the directions of the footprint.
+Gaussians with a parameter that is not finite are not drawn.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from recon.base.kernel import Kernel
 from recon.kernels.cpu.footprints import HIDDEN, INEXACT, NEAREST
 
 _BLOCK = 128
-# A squared distance in standard deviations is taken times this: exp(-q / 2) = 2^x, and t = 1 + x of a compact kernel.
+# Factor on a squared distance in standard deviations: exp(-q / 2) = 2^x, and t = 1 + x for a compact kernel.
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
 _PER = tl.constexpr(-1 / Kernel.COMPACT.radius**2)
 _SHADOW_SLOPE = tl.constexpr(2 * (Kernel.COMPACT.exponent + 0.5) / Kernel.COMPACT.radius**2)
@@ -31,14 +31,14 @@ _HUGE = tl.constexpr(3.0e38)
 _HIDDEN, _INEXACT = tl.constexpr(HIDDEN), tl.constexpr(INEXACT)
 # Columns of the footprint table, as in `cpu.footprints`.
 U, V, K, SHEAR, KV, W, HU, HV = (tl.constexpr(column) for column in range(8))
-# Of a view's `beam`: nine numbers of its axes, then its origin (col, row) and its centre (x, y, z).
+# A projection's `beam`: nine numbers of its axes, then its origin (col, row) and its centre (x, y, z).
 ORIGIN, _CENTRE = tl.constexpr(9), tl.constexpr(11)
 BEAM = 14
 
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Footprints of Gaussians in one view.
+    """Footprints of Gaussians in one projection.
 
     Attributes:
         table: float32 [n, 8]: centre (col, row), k (1/px²), r, 1 / Σvv (1/px²), weight ρμ, half widths in px (two).
@@ -51,13 +51,13 @@ class Footprints:
 
 @triton.jit
 def scaled(k, COMPACT: tl.constexpr):
-    """A factor of the quadratic form, as `shadow` and `body` take it."""
+    """A factor of the quadratic form, scaled for `shadow` and `body`."""
     return k * _PER if COMPACT else k * _HALF_LOG2_E
 
 
 @triton.jit
 def shadow(x, COMPACT: tl.constexpr):
-    """G and D of `cpu.project` in an image, x the scaled quadratic form."""
+    """G and D of `cpu.project` in an image; x: the scaled quadratic form."""
     if COMPACT:
         t = tl.maximum(1.0 + x, 0.0)
         value, slope = t * t, t * _SHADOW_SLOPE
@@ -69,7 +69,7 @@ def shadow(x, COMPACT: tl.constexpr):
 
 @triton.jit
 def body(x, COMPACT: tl.constexpr):
-    """G and D in a volume, x the scaled quadratic form."""
+    """G and D in a volume; x: the scaled quadratic form."""
     if COMPACT:
         t = tl.maximum(1.0 + x, 0.0)
         root = tl.sqrt(t)
@@ -82,7 +82,7 @@ def body(x, COMPACT: tl.constexpr):
 
 @triton.jit
 def axes_of(beam):
-    """The view's axes u, v and d."""
+    """The axes u, v and d of the projection."""
     return (
         tl.load(beam), tl.load(beam + 1), tl.load(beam + 2), tl.load(beam + 3), tl.load(beam + 4), tl.load(beam + 5),
         tl.load(beam + 6), tl.load(beam + 7), tl.load(beam + 8),
@@ -91,7 +91,7 @@ def axes_of(beam):
 
 @triton.jit
 def along_ray(means, i, live, beam, focal, sod, CONE: tl.constexpr):
-    """Position of a Gaussian in the view and the ray through it: (across, up, px/mm, a, b, depth, length of ray)."""
+    """Position of a Gaussian in the projection, and its ray: (across, up, px/mm, a, b, depth, length of ray)."""
     ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
     x, y = tl.load(means + 3 * i, live, 0.0), tl.load(means + 3 * i + 1, live, 0.0)
     z = tl.load(means + 3 * i + 2, live, 0.0)
@@ -100,7 +100,7 @@ def along_ray(means, i, live, beam, focal, sod, CONE: tl.constexpr):
     across, up = ux * x + uy * y + uz * z, vx * x + vy * y + vz * z
     if CONE:
         depth = sod + (dx * x + dy * y + dz * z)
-        ahead = tl.where(depth > 0.0, depth, 1.0)  # the caller leaves out Gaussians behind the source
+        ahead = tl.where(depth > 0.0, depth, 1.0)  # the caller skips Gaussians behind the source
         a, b, per = across / ahead, up / ahead, focal / ahead
         norm = tl.sqrt(1.0 + a * a + b * b)
     else:
@@ -117,7 +117,7 @@ def turned(x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8):
 
 @triton.jit
 def shape_of(scales, rotations, i, live):
-    """The three scales and nine numbers of the rotation; unit scales and rotation where not `live`."""
+    """The three scales and nine numbers of the rotation; unit scales and rotation if not `live`."""
     s, r = scales + 3 * i, rotations + 9 * i
     return (
         tl.load(s, live, 1.0), tl.load(s + 1, live, 1.0), tl.load(s + 2, live, 1.0),
@@ -129,8 +129,8 @@ def shape_of(scales, rotations, i, live):
 
 @triton.jit
 def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):
-    """The pixels within hu, hv of (u, v): the whole image where not `bounded`, an empty box where not `hit`."""
-    # Clip as floats: a box far outside exceeds int32.
+    """Store the pixels within hu, hv of (u, v): the whole image if not `bounded`, an empty box if not `hit`."""
+    # Clip as floats, because a box far outside exceeds int32.
     row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
     col_low, col_high = tl.maximum(tl.ceil(u - hu), 0.0), tl.minimum(tl.floor(u + hu) + 1.0, cols * 1.0)
     row_low, row_high = tl.where(bounded, row_low, 0.0), tl.where(bounded, row_high, rows * 1.0)
@@ -153,11 +153,11 @@ def add_to(at, value, live):
 def add_shape(
     i, live, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations
 ):
-    """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's axes (`cpu.footprints`)."""
+    """Add the gradients that follow from T, the gradient of a deformation in the Gaussian's axes (`cpu.footprints`)."""
     add_to(d_log_scales + 3 * i, t00, live)
     add_to(d_log_scales + 3 * i + 1, t11, live)
     add_to(d_log_scales + 3 * i + 2, t22, live)
-    # Quotients of equal scales are equal to the bit: a sphere gets no gradient on its rotation.
+    # Quotients of equal scales are bit-identical, so a sphere gets no gradient for its rotation.
     x, y = 0.5 * t01 * (s1 / s0 - s0 / s1), 0.5 * t02 * (s2 / s0 - s0 / s2)
     z = 0.5 * t12 * (s2 / s1 - s1 / s2)
     g = d_rotations + 9 * i
@@ -194,15 +194,16 @@ def _footprints(
         if CONE:
             along_u += h / s * pu
             along_v += h / s * pv
-    within = 1.0 / tl.sqrt(hh)  # mm of the ray in one standard deviation
-    # g / sqrt(det Σ₂), by successive quotients: a product of three small scales would leave float32's range.
+    within = 1.0 / tl.sqrt(hh)  # mm along the ray per standard deviation
+    # g / sqrt(det Σ₂), by successive quotients, because a product of three small scales would leave the range of
+    # float32.
     scale = within / per / tl.load(scales + 3 * i) / tl.load(scales + 3 * i + 1) / tl.load(scales + 3 * i + 2)
     wide, high = tl.sqrt(uu), tl.sqrt(vv)
     steep, level = high * scale, 1.0 / (high * per)
     ka, kv = steep * steep, level * level
     weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, unit * norm * within)
     u, v = tl.load(beam + ORIGIN) + per * across, tl.load(beam + ORIGIN + 1) + per * up
-    # Comparisons with NaN are false, so Gaussians that are not finite are hidden.
+    # Comparisons with NaN are false, so Gaussians that are not finite are not drawn.
     seen = live & (weight > faint) & (weight < _HUGE) & (ka < _HUGE) & (kv < _HUGE) & (depth > near)
     if COMPACT:
         reach = cut * per
@@ -294,12 +295,12 @@ def _footprints_backward(
 
 
 def beam_of(geometry: Geometry, view: int) -> F32:
-    """What kernels read of one view, float32 [14]: its axes, its origin (col, row) in pixels, its centre in mm."""
+    """The values of one projection for the kernels, float32 [14]: axes, origin (col, row) in pixels, centre in mm."""
     return np.array([*geometry.axes(view).ravel(), *geometry.origin(view), *geometry.centres[view]], np.float32)
 
 
 def lens_of(geometry: Geometry) -> tuple[float, float]:
-    """What all views share: sdd in pixels (parallel beam: pixels per mm), and sod (parallel beam: 0)."""
+    """Values common to all projections: sdd in pixels (parallel beam: pixels per mm), and sod (parallel beam: 0)."""
     focal = (geometry.sdd if geometry.is_cone else 1.0) / geometry.pixel_pitch
     return focal, geometry.sod if geometry.is_cone else 0.0
 
@@ -308,11 +309,12 @@ def footprints(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, beam: Tensor,
     faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Footprints:  # fmt: skip
-    """Footprints of Gaussians in the view of `beam`, see `beam_of`, cut off below `faint` (units of the image) and at
-    `cut` σ, compact ones at their end.
+    """Footprints of Gaussians in the projection of `beam`, see `beam_of`.
 
-    A `length` (mm) other than 0 replaces μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
-    where a cone's ε is above `exact_above` (see `cpu.footprints`).
+    They are cut off below `faint` (units of the image) and at `cut` σ, compact ones at their end.
+
+    A `length` (mm) other than 0 replaces μ (the uncorrected factor). In a cone, Gaussians with ε above `exact_above`
+    get half widths INEXACT and empty boxes (see `cpu.footprints`).
     """
     n = densities.shape[0]
     seen = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
@@ -333,7 +335,7 @@ def footprints_backward(
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, d_centres: Tensor,
     length: float = 0.0, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> None:  # fmt: skip
-    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
+    """Add to the gradients of means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](

@@ -1,16 +1,18 @@
 """Projector through voxels and its exact transpose, for parallel, fan and cone beams (Triton).
 
-Joseph's interpolation, as in `cpu.joseph` and `cpu.cone`: a ray is sampled once in each plane across the axis closest
-to it, bilinearly between lines and slices. Volumes are [y, x, z], projections [view, col, row], the last index fastest.
+Joseph's interpolation, as in `cpu.joseph` and `cpu.cone`: a ray is sampled once in each plane perpendicular to the axis
+closest to it, bilinearly between lines and slices. Volumes are [y, x, z], projections [view, col, row]; the last index
+is the fastest.
 
     line(j) = AT + STEP j,   level(j, row) = HEIGHT + (RISE + CLIMB j) (row - MIDDLE)
     weight = max(0, 1 - |line(j) - line|) max(0, 1 - |level(j, row) - z|),   times the path from plane to plane
 
-For a parallel beam CLIMB is 0. Planes, lines and slices are counted from the voxel [ny // 2, nx // 2, nz // 2]: at 2048
-voxels a float32 then places a sample to 1e-4 of a voxel. Both directions take their weights from the same expressions,
-whose products and sums are fused alike, so each is the transpose of the other to the rounding of its sums.
+For a parallel beam CLIMB is 0. Planes, lines and slices are counted from the voxel [ny // 2, nx // 2, nz // 2]. With
+2048 voxels, float32 then gives positions within 1e-4 of a voxel. Both directions compute their weights with the same
+expressions, whose products and sums are fused in the same way. So each is the transpose of the other, up to the
+rounding of its sums.
 
-The transpose is gathered: a voxel looks at the few columns, and at the few rows of each, that may have weight on it.
+The transpose is gathered: for each voxel, it checks the few columns and rows whose rays may have weight on it.
 """
 
 from __future__ import annotations
@@ -29,33 +31,33 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu import cone, joseph
 
-# Columns of the table of rays, as in `cpu.joseph`, and 1 for a ray across planes of constant y, 0 of constant x.
+# Columns of the table of rays, as in `cpu.joseph`, and 1 for a ray across planes of constant y, 0 for constant x.
 AT, STEP, RISE, CLIMB, PATH, LEAN, STEEP = (tl.constexpr(column) for column in range(7))
 _WIDTH = tl.constexpr(8)
 # Columns of the table of views, as in `cpu.cone`.
 DEPTH, DEPTH_Y, DEPTH_X, SIDE, SIDE_Y, SIDE_X, MIDDLE_COL, MIDDLE, HEIGHT = (tl.constexpr(c) for c in range(9))
 _OF_VIEW = tl.constexpr(9)
 
-_LANES, _PLANES = 64, 4  # rays of a program, and planes that it samples at once
-_HIGH = 32  # neighbouring rows, at most: a cache line
-_DEEP = 64  # slices of a tile of voxels, at most
-_FLAT = tl.constexpr(1e-6)  # lines a plane: such a ray stays on its line to 1e-3 of 2048
-_LEAST = tl.constexpr(1e-6)  # slices a row: where a ray has less, or runs backwards, it is outside the box
-_EDGE = tl.constexpr(0.01)  # lines beyond the box that are looked at nevertheless: more than rounding moves a ray
-_MARGIN, _SCALE = 0.01, 1.001  # of columns and rows, against rounding
-_WHOLE = 1e-6  # slices: rows this close to slices lie on them
+_LANES, _PLANES = 64, 4  # rays per program; planes that it samples at once
+_HIGH = 32  # largest number of neighbouring rows: a cache line
+_DEEP = 64  # largest number of slices in a tile of voxels
+_FLAT = tl.constexpr(1e-6)  # lines per plane; such a ray stays on its line to 1e-3 of 2048
+_LEAST = tl.constexpr(1e-6)  # slices per row; a ray with less, or with the opposite direction, is outside the box
+_EDGE = tl.constexpr(0.01)  # lines beyond the box that are also checked; more than rounding can move a ray
+_MARGIN, _SCALE = 0.01, 1.001  # margin and factor for columns and rows, against rounding
+_WHOLE = 1e-6  # slices; rows this close to a slice count as lying on it
 
 
 @dataclass(frozen=True, eq=False)
 class JosephRays:
-    """The rays of straight views through a box of voxels, on the device.
+    """The rays of straight projections through a box of voxels, on the device.
 
     Attributes:
         table: float32 [view, col, 8], columns above.
-        views: float32 [view, 9], columns above: a voxel's place on the detector, as `cpu.cone.ray_table` says.
-        near: how many neighbouring columns, and rows, hold all rays that may have weight on one voxel.
-        is_cone: each column has a climb and a direction of its own.
-        on_slices: each row lies on one slice.
+        views: float32 [view, 9], columns above: position of a voxel on the detector, see `cpu.cone.ray_table`.
+        near: number of neighbouring columns and rows that contain all rays with possible weight on one voxel.
+        is_cone: True if each column has its own climb and direction.
+        on_slices: True if each row lies on one slice.
     """
 
     table: Tensor
@@ -66,14 +68,14 @@ class JosephRays:
 
     @classmethod
     def of(cls, geometry: Geometry, grid: Grid, device: str | torch.device) -> JosephRays:
-        """The rays of all views of `geometry`.
+        """The rays of all projections of `geometry`.
 
         Raises:
-            ValueError: for rolled, tilted or displaced views, or a box that reaches the source.
+            ValueError: a projection is rolled, tilted or has a centre, or the box reaches the source.
         """
         if not geometry.is_straight:
-            raise ValueError("these kernels project straight views only, without roll, tilt and centres")
-        with np.errstate(invalid="ignore"):  # a parallel beam's source is infinitely far
+            raise ValueError("these GPU kernels need straight projections, without roll, tilt and centres")
+        with np.errstate(invalid="ignore"):  # the source of a parallel beam is infinitely far away
             table, steep, views = cone.ray_table(geometry, grid)
         rise, (z, y, x) = geometry.pixel_pitch / grid.spacing[0], (n // 2 for n in grid.shape)
         if not geometry.is_cone:
@@ -86,7 +88,7 @@ class JosephRays:
         level = views[:, cone.HEIGHT] - rise * views[:, cone.MIDDLE]
         off = max(abs(rise - 1) * geometry.detector_shape[0], np.abs(level - np.rint(level)).max())
         on_slices = not geometry.is_cone and bool(off < _WHOLE)
-        if on_slices:  # exactly, so that no row has a weight of rounding on another slice
+        if on_slices:  # exactly, so that rounding gives no row a weight on another slice
             views[:, cone.HEIGHT], views[:, cone.MIDDLE], table[..., joseph.RISE] = np.rint(level), 0.0, 1.0
         near = _near(views, grid.shape)
         cols, rows = min(near[0], steep.shape[1]), min(1 if on_slices else near[1], geometry.detector_shape[0])
@@ -97,19 +99,20 @@ class JosephRays:
 
 
 def _near(views: F64, shape: tuple[int, int, int]) -> tuple[int, int]:
-    """How many neighbouring columns, and rows, hold all rays with weight on a voxel of a box of this shape.
+    """Number of neighbouring columns and rows that contain all rays with weight on a voxel of a box of this shape.
 
-    A ray with weight passes less than a voxel beside the centre: along x where it crosses planes of constant y, else
-    along y. On the way its column changes by the derivative of side / depth, at most. Depth is linear, and side / depth
-    has its extremes at corners, so the corners of the box, one voxel wider, bound it: to pitch and voxel, magnification
-    and perspective. On the ray, slices apart by 1 are 1 / depth rows apart.
+    A ray with weight passes the centre of the voxel at less than one voxel: along x if it crosses planes of constant y,
+    otherwise along y. Over this distance its column changes at most by the derivative of side / depth. Depth is linear,
+    and side / depth has its extremes at corners. So the corners of the box, widened by one voxel, give the bound,
+    including pitch and voxel size, magnification and perspective. On a ray, neighbouring slices are 1 / depth rows
+    apart.
     """
     y, x = (ends.ravel() for ends in np.meshgrid(*((-(n // 2) - 1, n - n // 2) for n in shape[1:])))
     depth, depth_y, depth_x, side, side_y, side_x = views.T[: cone.MIDDLE_COL, :, None]
     depths = depth + depth_y * y + depth_x * x  # [view, corner]
     places, least = (side + side_y * y + side_x * x) / depths, depths.min(1, keepdims=True)
     if least.min() <= 0:
-        raise ValueError("the box, with a voxel beyond it, reaches the source: give a smaller grid")
+        raise ValueError("the volume reaches the X-ray source (with a margin of one voxel); use a smaller grid")
     columns = np.maximum(np.abs(side_y - places * depth_y), np.abs(side_x - places * depth_x)) / least
     cols, rows = (2 * (float(most) * _SCALE + _MARGIN) for most in (columns.max(), 1 / least.min()))
     return int(cols) + 1, int(rows) + 1
@@ -122,13 +125,13 @@ def _weight(place, whole):
 
 @triton.jit
 def _level(climb, row, middle, height):
-    """The slice at which a row is at a sample."""
+    """The slice that a row hits at a sample."""
     return tl.fma(climb, row - middle, height)
 
 
 @triton.jit
 def _length(path, lean, row, middle):
-    """mm from plane to plane."""
+    """mm along the ray from plane to plane."""
     slope = (row - middle) * lean
     return path * tl.sqrt(slope * slope + 1.0)
 
@@ -144,7 +147,7 @@ def _forward(
     col, row = job % across * wide + lane // HIGH, job // (across * n_views) * HIGH + lane % HIGH
     live = (col < cols) & (row < rows)
     view = views + _OF_VIEW * (job // across % n_views)
-    # Lanes past the end repeat the last column and store nothing.
+    # Lanes beyond the end repeat the last column and store nothing.
     line = (job // across % n_views).to(tl.int64) * cols + tl.minimum(col, cols - 1)
     ray = rays + _WIDTH * line
     at, step, rise, climb = tl.load(ray + AT), tl.load(ray + STEP), tl.load(ray + RISE), tl.load(ray + CLIMB)
@@ -152,7 +155,7 @@ def _forward(
     middle, height = tl.load(view + MIDDLE), tl.load(view + HEIGHT)
     planes, lines = tl.where(steep, ny, nx), tl.where(steep, nx, ny)
     plane0, line0 = planes // 2, lines // 2
-    # Planes between which any of the rays is within the box, with one on either side.
+    # Range of planes in which any of the rays is within the box, plus one on either side.
     run = tl.where(tl.abs(step) > _FLAT, step, _FLAT)
     enter, leave = (-1.0 - _EDGE - line0 - at) / run, (lines + _EDGE - line0 - at) / run
     first = tl.floor(tl.minimum(enter, leave)) - 1.0 + plane0
@@ -187,7 +190,7 @@ def _adjoint(
     tile, lane = tl.program_id(0), tl.arange(0, EDGE * EDGE)
     x, y = tile % tiles_x * EDGE + lane % EDGE, tile // tiles_x % tiles_y * EDGE + lane // EDGE
     z = tile // (tiles_x * tiles_y) * DEEP + tl.arange(0, DEEP)
-    # Lanes past the end repeat the last voxel and store nothing.
+    # Lanes beyond the end repeat the last voxel and store nothing.
     x_off = (tl.minimum(x, nx - 1) - nx // 2).to(tl.float32)
     y_off = (tl.minimum(y, ny - 1) - ny // 2).to(tl.float32)
     level_of_z = (z - nz // 2).to(tl.float32)[None, :]
@@ -197,10 +200,10 @@ def _adjoint(
         middle, height = tl.load(view + MIDDLE), tl.load(view + HEIGHT)
         depth = tl.load(view + DEPTH) + tl.load(view + DEPTH_Y) * y_off + tl.load(view + DEPTH_X) * x_off
         side = tl.load(view + SIDE) + tl.load(view + SIDE_Y) * y_off + tl.load(view + SIDE_X) * x_off
-        # Of the columns from c - COLS / 2 to c + COLS / 2, moved onto the detector as a whole.
+        # The columns from c - COLS / 2 to c + COLS / 2, moved onto the detector as a whole.
         col = tl.ceil(tl.load(view + MIDDLE_COL) + side / depth - 0.5 * COLS)
         col = tl.minimum(tl.maximum(col, 0.0), cols - COLS * 1.0).to(tl.int32)
-        if not CONE:  # all columns are alike but for their place
+        if not CONE:  # columns differ only in their position
             first = rays + _WIDTH * line
             step, path, steep = tl.load(first + STEP), tl.load(first + PATH), tl.load(first + STEEP) > 0.0
             climb = tl.load(first + RISE)
@@ -229,7 +232,7 @@ def _adjoint(
 
 
 def forward(volume: Tensor, rays: JosephRays, out: Tensor) -> None:
-    """Line integrals of volume [y, x, z] into out [view, col, row], mm times the volume's unit."""
+    """Write line integrals of volume [y, x, z] to out [view, col, row], in mm times the volume's unit."""
     views, cols, rows = out.shape
     high = min(triton.next_power_of_2(rows), _HIGH)
     jobs = views * triton.cdiv(cols, _LANES // high) * triton.cdiv(rows, high)
@@ -241,7 +244,7 @@ def forward(volume: Tensor, rays: JosephRays, out: Tensor) -> None:
 
 
 def adjoint(projections: Tensor, rays: JosephRays, out: Tensor) -> None:
-    """The transpose of `forward`: projections [view, col, row] into out [y, x, z] (overwritten)."""
+    """The transpose of `forward`: from projections [view, col, row] to out [y, x, z] (overwritten)."""
     (edge, deep, jobs), (near_cols, near_rows) = tiles_of(out.shape), rays.near
     if jobs > 0:
         _adjoint[(jobs,)](
@@ -251,7 +254,7 @@ def adjoint(projections: Tensor, rays: JosephRays, out: Tensor) -> None:
 
 
 def tiles_of(shape: Sequence[int]) -> tuple[int, int, int]:
-    """Edge and slices of a tile of a volume [y, x, z], 256 voxels or more, and how many there are."""
+    """Edge and slices of a tile of a volume [y, x, z] (at least 256 voxels), and the number of tiles."""
     ny, nx, nz = shape
     deep = min(triton.next_power_of_2(nz), _DEEP)
     edge = 16 if deep <= 2 else 8 if deep <= 8 else 4

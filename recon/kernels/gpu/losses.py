@@ -1,4 +1,4 @@
-"""Fused losses on a GPU: data term, D-SSIM and total variation with their gradients (Triton)."""
+"""Fused losses on a GPU: data term, D-SSIM and total variation, with their gradients (Triton)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _BLOCK = 256
 _R = tl.constexpr(RADIUS)
 _L1, _L2 = tl.constexpr(L1), tl.constexpr(L2)
 _LARGEST = tl.constexpr(1.0e38)
-_C = 0.01**2, 0.03**2  # of SSIM, for images of values of about 1
+_C = 0.01**2, 0.03**2  # constants of SSIM for images with values of about 1
 
 
 @triton.jit
 def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: tl.constexpr):
-    """One axis of the window over each map [k, row, col], zeros outside; the map is the second axis of the grid."""
+    """Blur each map [k, row, col] along one axis of the window, with zeros outside; grid axis 2: the map."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
     first = tl.program_id(1).to(tl.int64) * pixels
@@ -74,7 +74,7 @@ def _ssim_terms(
         mxx += weight * tl.load(at + pixels, ok, 0.0)
         mxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
     my, myy = tl.load(target_maps + i, live, 0.0), tl.load(target_maps + pixels + i, live, 0.0)
-    # Clamp differences of squares: rounding must not make them negative or break Cauchy-Schwarz.
+    # Clamp differences of squares, because rounding must not make them negative or break Cauchy-Schwarz.
     vx = tl.minimum(tl.maximum(mxx - mx * mx, 0.0), _LARGEST)
     vy, vxy = tl.minimum(tl.maximum(myy - my * my, 0.0), _LARGEST), mxy - mx * my
     low1, low2 = 1.0 / (mx * mx + my * my + c1), 1.0 / (vx + vy + c2)
@@ -161,9 +161,9 @@ class GpuProjectionLoss:
     def __call__(
         self, image: Tensor, target: Tensor, target_maps: Tensor, weights: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The loss (float64 scalar on the device; reading it waits for the device) and its gradient.
+        """The loss (float64 scalar on the device; reading it waits for the device), and its gradient.
 
-        `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
+        `target_maps` must be made with the same weights. Image and target must be finite, also in pixels of weight 0.
         """
         gradient, sums = self.slope(image, target, target_maps, weights)
         return (sums[1] + self.ssim_weight * sums[0]) / self.pixels, gradient
@@ -195,7 +195,7 @@ class GpuProjectionLoss:
 
 @triton.jit
 def _slope(here, other, ok):
-    """|other - here| and its derivative by `here`; 0 without a neighbour."""
+    """|other - here| and its derivative by `here`; 0 if there is no neighbour."""
     step = other - here
     sign = tl.where(step > 0.0, 1.0, tl.where(step < 0.0, -1.0, 0.0))
     return tl.where(ok, tl.abs(step), 0.0), tl.where(ok, -sign, 0.0)
@@ -231,7 +231,7 @@ def total_variation(volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
 
 
 def neighbours(shape: Sequence[int]) -> int:
-    """Pairs of neighbours over the three axes of a volume [z, y, x]."""
+    """Number of pairs of neighbours along the three axes of a volume [z, y, x]."""
     nz, ny, nx = shape
     return (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
 

@@ -1,4 +1,4 @@
-"""Raw parameters to physical ones, gradients back, and Adam's update: the part of a step for each Gaussian (Triton)."""
+"""The part of a step for each Gaussian (Triton): raw to physical parameters, gradients, and Adam's update."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.kernels.cpu.adam import BETA1, BETA2
 
 _BLOCK = 128
 _WIDEST = torch.finfo(torch.float32).max
-_EPS = 1e-15  # of Adam
+_EPS = 1e-15  # epsilon of Adam
 _SHORTEST = tl.constexpr(1e-12)  # a shorter quaternion counts as the identity
 _FARTHEST = tl.constexpr(87.0)  # largest |x| for which e^x is a normal float32 number
 
@@ -39,7 +39,7 @@ def _sigmoid(r):
 def _unit_quaternion(quaternions, i, live):
     w, x = tl.load(quaternions + 4 * i, live, 1.0), tl.load(quaternions + 4 * i + 1, live, 0.0)
     y, z = tl.load(quaternions + 4 * i + 2, live, 0.0), tl.load(quaternions + 4 * i + 3, live, 0.0)
-    # Scale by the largest component first: the square of 1e-30 underflows in float32.
+    # Divide by the largest component first, because the square of 1e-30 underflows in float32.
     most = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = tl.where(most > 0.0, most, 1.0)
     w, x, y, z = w / scale, x / scale, y / scale, z / scale
@@ -99,7 +99,7 @@ def _activation_backward(
     gx = 2.0 * (y * (g1 + g3) + z * (g2 + g6) + w * (g7 - g5)) - 4.0 * x * (g4 + g8)
     gy = 2.0 * (x * (g1 + g3) + z * (g5 + g7) + w * (g2 - g6)) - 4.0 * y * (g0 + g8)
     gz = 2.0 * (x * (g2 + g6) + y * (g5 + g7) + w * (g3 - g1)) - 4.0 * z * (g0 + g4)
-    # Only the part orthogonal to the unit quaternion rotates; the part along it would change its length.
+    # Only the part orthogonal to the unit quaternion rotates; the part along it would change the length.
     along = gw * w + gx * x + gy * y + gz * z
     per = tl.where(turned, 1.0 / tl.where(turned, norm, 1.0), 0.0)
     tl.store(d_quaternions + 4 * i, per * (gw - along * w), live)
@@ -111,7 +111,7 @@ def _activation_backward(
 def activation_backward(
     quaternions: Tensor, raw: Tensor, unit: float, d_rotations: Tensor, d_densities: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Gradients on quaternions [n, 4] and raw densities [n] from those on rotations [n, 9] and densities [n]."""
+    """Gradients of quaternions [n, 4] and raw densities [n] from those of rotations [n, 9] and densities [n]."""
     n = raw.shape[0]
     d_quaternions, d_raw = torch.empty_like(quaternions), torch.empty_like(raw)
     if n > 0:
@@ -140,7 +140,7 @@ def _adam(
     p2, g2, m2, v2, low2, high2, size2, p3, g3, m3, v3, low3, high3, size3,
     rates, go, eps, b1, b2, GUARDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    # One launch for all four arrays: the second axis of the grid says which.
+    # One launch for all four arrays; the second axis of the grid selects the array.
     which = tl.program_id(1)
     rate, scale2 = tl.load(rates + which), tl.load(rates + 4)
     if GUARDED:
@@ -157,8 +157,10 @@ def _adam(
 
 
 def adam_rates(rates: Sequence[float], step: int) -> list[float]:
-    """What `adam_by` reads: the rates with the correction of the first moment at this step, from 1 on, and that of the
-    second."""
+    """Input of `adam_by`: the rates with the correction of the first moment, and the correction of the second.
+
+    Steps count from 1.
+    """
     return [*(rate / (1 - BETA1**step) for rate in rates), 1 / (1 - BETA2**step)]
 
 
@@ -188,7 +190,7 @@ def adam_by(
     bounds: Sequence[tuple[float, float] | None],
     go: Tensor | None = None,
 ) -> None:
-    """`adam` with the five numbers of `adam_rates` on the device; it changes nothing where `go` is 0."""
+    """`adam` with the five numbers of `adam_rates` on the device; if `go` is 0, nothing changes."""
     arguments: list[Tensor | float | int] = []
     for p, g, m, v, within in zip(parameters, gradients, first, second, bounds, strict=True):
         low, high = (-_WIDEST, _WIDEST) if within is None else within

@@ -1,4 +1,4 @@
-"""GpuPass: one pass over a model on a GPU: its views and boxes of voxels, and the gradients that they add."""
+"""GpuPass: one pass over a model on a GPU: projections, voxel boxes, and the sum of their gradients."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from recon.kernels.gpu.rays import GpuRays
 from recon.kernels.gpu.tiles import Room, tile_lists
 from recon.kernels.gpu.voxels import fill, fill_backward, place
 
-_EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, and larger tiles would evaluate more pixels outside them
-_GROUP = 8  # Gaussians that a tile processes at once
-_MANY = 64  # footprints in one partial sum: adding many small numbers one by one to a large sum loses accuracy
-_BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
+_EDGE = 8  # pixels; footprints are mostly 9 to 15 pixels wide, and larger tiles would evaluate more pixels outside them
+_GROUP = 8  # number of Gaussians that a tile processes at once
+_MANY = 64  # footprints in one partial sum, because adding many small numbers one by one to a large sum loses accuracy
+_BLOCK = (8, 16)  # pixels of a footprint that are processed at once, (rows, cols)
 
 
 @triton.jit(do_not_specialize=["shares"])
@@ -52,7 +52,7 @@ def _render(
     member = tl.arange(0, GROUP)
     sums = tl.zeros((EDGE * EDGE,), tl.float32)
     for outer in range(first + share * GROUP, last, shares * GROUP * MANY):
-        # Each member of a group has its own sum, so that the inner loop has no reduction.
+        # Each member of a group has its own sum, so that the inner loop needs no reduction.
         part = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
         for start in range(outer, tl.minimum(last, outer + shares * GROUP * MANY), shares * GROUP):
             held = start + member < last
@@ -135,7 +135,7 @@ Parameters = tuple[Tensor, Tensor, Tensor, Tensor]  # means, scales (or their lo
 
 
 def _zeros(like: Parameters) -> Parameters:
-    """Zeros of the shapes of parameters, in one array."""
+    """Zeros in the shapes of the parameters, in one array."""
     parts = torch.zeros(sum(array.numel() for array in like), device=like[0].device)
     means, scales, rotations, densities = (
         part.view(array.shape) for part, array in zip(parts.split([a.numel() for a in like]), like, strict=True)
@@ -144,7 +144,7 @@ def _zeros(like: Parameters) -> Parameters:
 
 
 class GpuPass:
-    """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
+    """One pass over a model: physical parameters, and the sum of gradients from its projections and voxel boxes."""
 
     def __init__(
         self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float,
@@ -168,22 +168,22 @@ class GpuPass:
 
 
 class GpuView:
-    """One rendered view: its image [row, col] and its backward pass."""
+    """One rendered projection: its image [row, col] and its backward pass."""
 
     def __init__(
         self, run: GpuPass, geometry: Geometry, beam: Tensor, faint: float, cut: float, model: RayModel,
         room: Room | None = None,
     ) -> None:  # fmt: skip
-        """`beam` is the view as `beam_of` gives it, `room` that of its lists of tiles."""
+        """`beam`: the projection, from `beam_of`; `room`: room for its lists of tiles."""
         if geometry.width:
-            raise ValueError(f"rays with a width ({geometry.width}) are projected on the CPU only: use device 'cpu'")
+            raise ValueError(f"rays with a width ({geometry.width}) can only be projected on the CPU: use device 'cpu'")
         self._run, self._geometry, self._beam, self._length = run, geometry, beam, model.length(geometry)
         self.footprints = footprints(
             *run.active, geometry, beam, faint, cut, self._length, model.exact_above, run.kernel
         )  # fmt: skip
         self.image = render(self.footprints, geometry.detector_shape, run.kernel, room)
         self._rays: tuple[Tensor, GpuRays] | None = None
-        if geometry.is_cone and model.exact_above < math.inf:  # their number is only known after waiting for the device
+        if geometry.is_cone and model.exact_above < math.inf:  # their number is known only after waiting for the device
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
                 means, scales, rotations, densities = (array[exact] for array in run.active)
@@ -204,7 +204,7 @@ class GpuView:
             rays.backward(gradient, *some, moved)
             centres[exact] = moved
             for total, part in zip(run.into, some, strict=True):
-                total[exact] += part  # no index is repeated, so the sum does not depend on an order
+                total[exact] += part  # no index is repeated, so the sum does not depend on the order
         return centres
 
 

@@ -1,7 +1,7 @@
-"""Rays: exact line integrals in a cone, for Gaussians whose affine footprint is not accurate enough (Triton).
+"""Exact line integrals in a cone, for Gaussians whose affine footprint is not accurate enough (Triton).
 
-The formulas are those of `cpu.rays`: with the affine footprint's centre, K and weight, N = δᵀKδ, and α, η, |D|, |D₀|
-as there, the value of a Gaussian at a pixel is
+The formulas are those of `cpu.rays`. With the centre, K and weight of the affine footprint, N = δᵀKδ, and α, η, |D|,
+|D₀| as there, the value of a Gaussian at a pixel is
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   where N / Q <= c²
 """
@@ -37,9 +37,9 @@ from recon.kernels.gpu.footprints import (
 from recon.kernels.gpu.tiles import tile_lists
 
 _BLOCK = 128
-_EDGE = 8  # pixels a tile's edge
-_GROUP = 4  # Gaussians that a tile processes at once
-_PIXELS = (8, 16)  # of a Gaussian at once, (rows, cols)
+_EDGE = 8  # edge of a tile in pixels
+_GROUP = 4  # number of Gaussians that a tile processes at once
+_PIXELS = (8, 16)  # pixels of a Gaussian that are processed at once, (rows, cols)
 # Columns of the terms: α, η, W / |D₀|, the truncation c².
 _AU, _AV, _ETA, _WEIGHT, _CUT = (tl.constexpr(column) for column in range(5))
 _TERMS = tl.constexpr(8)
@@ -69,7 +69,7 @@ def _terms(
         h = (a * pu + b * pv + pd) / s
         hh, along_u, along_v = hh + h * h, along_u + h / s * pu, along_v + h / s * pv
         broadest = tl.maximum(broadest, s)
-    most = tl.load(densities + i) * unit * broadest  # of any ray
+    most = tl.load(densities + i) * unit * broadest  # largest value on any ray
     seen = seen & (most > faint)
     au, av, eta = along_u / (hh * focal), along_v / (hh * focal), 1.0 / (hh * depth * depth)
     c2 = cut * cut if COMPACT else tl.minimum(cut * cut, 2.0 * tl.log(tl.where(seen, most, faint) / faint))
@@ -78,7 +78,7 @@ def _terms(
     tl.store(t + _ETA, tl.where(seen, eta, 0.0), live)
     tl.store(t + _WEIGHT, tl.where(seen, tl.load(f + W) / norm, 0.0), live)
     tl.store(t + _CUT, tl.where(seen, c2, 0.0), live)
-    # The conic N (1 - c²η) = c² (1 + α·δ)²: an ellipse unless the Gaussian reaches the source's plane.
+    # The conic N (1 - c²η) = c² (1 + α·δ)² is an ellipse unless the Gaussian reaches the plane of the source.
     left = 1.0 - c2 * eta
     bounded = left > 0.0
     left = tl.where(bounded, left, 1.0)
@@ -98,7 +98,7 @@ def _terms(
 def _at_pixels(du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT: tl.constexpr):
     """(N / Q <= c², τ, N, 1 + α·δ, 1 / Q, V / (W / |D₀|), the same with D for G) at offsets δ of pixels.
 
-    The pixels are at (over, up) from the axis, over f; G and D as in `cpu.project`.
+    The pixels are at (over, up) from the axis, divided by f; G and D as in `cpu.project`.
     """
     across = du - shear * dv
     square = k * across * across + kv * dv * dv
@@ -169,7 +169,7 @@ def _sums(
             )
             inside = inside & (row < row_high) & (col < col_high)
             under = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * weight
-            # Outside the value may be infinite.
+            # Outside, the value may be infinite.
             a, steep = tl.where(inside, under * value, 0.0), tl.where(inside, under * slope, 0.0)
             aq = 0.5 * inverse * (square * inverse * steep - a)
             ab, al = eta * aq - 0.5 * inverse * steep, lift * aq
@@ -243,13 +243,13 @@ def _bend(
 
 
 class GpuRays:
-    """Gaussians (one or more) in one view of a cone, integrated ray by ray, with forward and backward pass."""
+    """One or more Gaussians in one projection of a cone, integrated along each ray, with forward and backward pass."""
 
     def __init__(
         self, parameters: tuple[Tensor, Tensor, Tensor, Tensor], geometry: Geometry, beam: Tensor, faint: float,
         cut: float, kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:  # fmt: skip
-        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them.
+        """Gaussians are cut off at `cut` standard deviations, and left out if no ray gets more than `faint` from them.
 
         `parameters` are means [n, 3], standard deviations [n, 3], rotations [n, 9] and densities [n].
         """
@@ -265,7 +265,7 @@ class GpuRays:
         )  # fmt: skip
 
     def add_to(self, image: Tensor) -> None:
-        """Add the Gaussians to image [row, col]."""
+        """Add the Gaussians to an image [row, col]."""
         shape = self.geometry.detector_shape
         lists = tile_lists(self.boxes, shape, _EDGE)
         layers = image.new_empty((lists.shares, *shape))

@@ -1,7 +1,7 @@
-"""tile_lists: the Gaussians that touch each tile of an image or brick of voxels, by counting and one sort.
+"""tile_lists: lists of the Gaussians that touch each image tile or brick of voxels, made by counting and one sort.
 
-A pixel is a sum, so the order within a tile is free; a stable sort makes it the same in every run. The length of the
-lists is the only number that the host needs: it reads it from the device, or takes that of a `Room`.
+A pixel is a sum, so any order within a tile is correct; a stable sort makes it the same in every run. The host needs
+only one number, the length of the lists. It reads the length from the device, or uses that of a `Room`.
 """
 
 from __future__ import annotations
@@ -15,39 +15,41 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-PROGRAMS = 4096  # programs that keep a large device busy
+PROGRAMS = 4096  # number of programs that keep a large device busy
 _BLOCK = 256
-_LEAST = 32  # Gaussians that a part of a list should hold at least
-_SPARE = 1.25  # length of a room over the pairs that were counted
-_SHORT = 2**15 - 1  # tiles that a 16-bit number holds, the one after the last included: half the passes of the sort
+_LEAST = 32  # least number of Gaussians in a part of a list
+_SPARE = 1.25  # length of a room divided by the number of counted pairs
+# largest number of tiles for 16-bit numbers (including the one after the last); they need half the sorting passes
+_SHORT = 2**15 - 1
 
 
 @dataclass(eq=False)
 class Room:
-    """The length of lists that are filled again and again without waiting for the device.
+    """The length of lists that are refilled repeatedly without waiting for the device.
 
     Attributes:
-        needed: int64 scalar on the device: the most pairs that were needed; lists of more than `pairs` were cut.
-        pairs: the length; None until the first lists are counted, see `grow`.
+        needed: int64 scalar on the device: largest number of pairs needed so far; lists with more than `pairs` were
+            cut.
+        pairs: length of the lists; None until the first lists are counted, see `grow`.
     """
 
     needed: Tensor
     pairs: int | None = None
 
     def grow(self, pairs: int) -> None:
-        """Take a length with a quarter to spare, in whole blocks."""
+        """Set the length to a quarter more than `pairs`, in whole blocks."""
         self.pairs = _BLOCK * max(1, math.ceil(_SPARE * pairs / _BLOCK))
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Gaussians tile by tile.
+    """The Gaussians of each tile.
 
     Attributes:
         owners: int32 [pairs], indices of Gaussians; those of tile t are owners[starts[t]:starts[t + 1]]. In a room,
-            what follows the last tile's is without meaning.
+            values after those of the last tile have no meaning.
         starts: int32 [tiles + 1]; tiles are numbered row-major.
-        counts: tiles along each axis.
+        counts: number of tiles along each axis.
     """
 
     owners: Tensor
@@ -60,13 +62,13 @@ class TileLists:
 
     @property
     def shares(self) -> int:
-        """Number of parts of each list, each with a layer of its own, so that few tiles still occupy a device."""
+        """Number of parts of each list, each with its own layer, so that a few tiles still keep a device busy."""
         return max(1, min(PROGRAMS // self.n_tiles, self.owners.shape[0] // (_LEAST * self.n_tiles)))
 
 
 @triton.jit(do_not_specialize=["n"])
 def _touched(boxes, touched, n, edge, AXES: tl.constexpr, BLOCK: tl.constexpr):
-    """How many tiles each box touches, int64 [n]."""
+    """Number of tiles that each box touches, int64 [n]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     tiles = tl.full((BLOCK,), 1, tl.int64)
     for axis in tl.static_range(AXES):
@@ -81,16 +83,19 @@ def _tile_of_pairs(
     boxes, ends, owners, tiles, needed, n, pairs, halvings, edge, tiles_y, tiles_x, n_tiles,
     AXES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Owner and tile of each pair of a Gaussian and a tile that it touches, int32 [pairs] and [pairs]; `n_tiles` for
-    the tile of pairs that there are not."""
+    """Owner and tile of each pair of a Gaussian and a tile that it touches, int32 [pairs] and [pairs].
+
+    Unused pairs get the tile `n_tiles`.
+    """
     pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     low, high = tl.zeros((BLOCK,), tl.int32), tl.zeros((BLOCK,), tl.int32) + n
-    for _ in range(halvings):  # the first Gaussian whose pairs end behind this one
+    for _ in range(halvings):  # the first Gaussian whose pairs end after this one
         middle = (low + high) // 2
         before = (middle < n) & (tl.load(ends + middle, middle < n, 0) <= pair)
         low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
     owner, held = low, (low < n) & (pair < pairs)
-    rank = (tl.load(ends + owner, held, 1) - 1 - pair).to(tl.int32)  # from the last tile of the box to the first
+    # counted from the last tile of the box to the first
+    rank = (tl.load(ends + owner, held, 1) - 1 - pair).to(tl.int32)
     tile, stride = tl.zeros((BLOCK,), tl.int32), 1
     for back in tl.static_range(AXES):
         axis = AXES - 1 - back
@@ -109,7 +114,7 @@ def _tile_of_pairs(
 
 @triton.jit(do_not_specialize=["pairs", "halvings"])
 def _starts(tiles, starts, pairs, halvings, n_tiles, BLOCK: tl.constexpr):
-    """The first of the sorted pairs that is not of an earlier tile, int32 [n_tiles + 1]."""
+    """For each tile, the first of the sorted pairs that does not belong to an earlier tile, int32 [n_tiles + 1]."""
     tile = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     low, high = tl.zeros((BLOCK,), tl.int32), tl.zeros((BLOCK,), tl.int32) + pairs
     for _ in range(halvings):
@@ -120,10 +125,10 @@ def _starts(tiles, starts, pairs, halvings, n_tiles, BLOCK: tl.constexpr):
 
 
 def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int, room: Room | None = None) -> TileLists:
-    """Lists for boxes int32 [n, 2 * axes] (low, high of each axis, high excluded, inside `shape`), tiles of `edge`.
+    """Lists for boxes int32 [n, 2 * axes] (low, high for each axis, high excluded, inside `shape`), tiles of `edge`.
 
     Raises:
-        MemoryError: where there are 2^31 or more pairs of a Gaussian and a tile.
+        MemoryError: there are 2^31 or more pairs of a Gaussian and a tile.
     """
     counts, n, device = tuple(-(-size // edge) for size in shape), len(boxes), boxes.device
     n_tiles = math.prod(counts)
@@ -139,8 +144,8 @@ def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int, room: Room | None
             room.grow(pairs)
     if pairs >= 2**31:
         raise MemoryError(
-            f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than lists hold (2^31); "
-            "take a smaller image or grid, or fewer or smaller Gaussians"
+            f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than the lists can hold (2^31). Use a smaller "
+            "image or grid, or fewer or smaller Gaussians"
         )
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     tile = torch.empty(pairs, dtype=torch.int16 if n_tiles < _SHORT else torch.int32, device=device)

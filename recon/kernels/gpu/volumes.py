@@ -1,9 +1,10 @@
-"""GpuVolumes: what iterative methods on voxels do with volumes and views on a GPU, as `recon.kernels.cpu` does it.
+"""GpuVolumes: the operations of iterative voxel methods on volumes and projections, on a GPU.
 
-The functions have the names, arguments and meaning of those of `cpu.vectors`, `cpu.spread`, `cpu.tv` and `cpu.patches`,
-on float32 torch tensors of one device, and follow the CPU's results to rounding. Every value follows from elementwise
-operations, slices and sums in torch's fixed order. There are no matrix products or convolutions, so TF32 cannot
-change anything, and no atomics, so the same input gives the same bits. No tensor made here asks for gradients.
+The functions have the names, arguments and meaning of those in `cpu.vectors`, `cpu.spread`, `cpu.tv` and `cpu.patches`.
+They work on float32 torch tensors of one device, and agree with the CPU up to rounding. All values come from
+elementwise operations, slices and sums in torch's fixed order. There are no matrix products or convolutions, so TF32
+cannot change anything. There are no atomics, so the same input gives bit-identical results. No tensor made here
+requires gradients.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from recon.kernels.gpu import require
 Shape = tuple[int, int, int]
 DualField = tuple[Tensor, Tensor, Tensor]
 
-_AT_ONCE = 512 << 20  # bytes of temporary copies of some planes or views at once; at least one is taken
-_BEYOND = EDGE - 1  # voxels beyond a face that blocks reach
-_BLOCK_COPIES = 40  # arrays as large as the given planes that the transform of their blocks holds, at most
+_AT_ONCE = 512 << 20  # bytes for temporary copies of some planes or projections at a time (at least one)
+_BEYOND = EDGE - 1  # number of voxels that blocks reach beyond a face
+_BLOCK_COPIES = 40  # largest number of arrays, each as large as the given planes, during the transform of their blocks
 _LONG, _SHORT = math.sqrt(2) * math.cos(math.pi / 8), math.sqrt(2) * math.sin(math.pi / 8)
 
 
@@ -39,12 +40,12 @@ def combine(alpha: float, a: Tensor, beta: float, b: Tensor, out: Tensor) -> Non
 
 
 def maximum(a: Tensor, b: Tensor, out: Tensor) -> None:
-    """out = the larger of a and b; `out` may be one of them."""
+    """out = the elementwise maximum of a and b; `out` may be `a` or `b`."""
     torch.maximum(a, b, out=out)
 
 
 def add_product(x: Tensor, factor: float, a: Tensor, b: Tensor, nonnegative: bool) -> None:
-    """x += factor a b, negative values clipped with `nonnegative`."""
+    """x += factor a b; with `nonnegative`, negative values become 0."""
     x.addcmul_(a, b, value=factor)
     if nonnegative:
         x.clamp_(min=0)
@@ -53,7 +54,7 @@ def add_product(x: Tensor, factor: float, a: Tensor, b: Tensor, nonnegative: boo
 def replace_by_residual(
     data: Tensor, model: Tensor, weight: Tensor | None = None, scale: Tensor | None = None
 ) -> float:
-    """Replace `model` by scale (data - model); returns Σ weight (data - model)², summed in float64. None: all 1."""
+    """Replace `model` by scale (data - model); returns Σ weight (data - model)², summed in float64. weight None: 1."""
     total = torch.zeros((), dtype=torch.float64, device=data.device)
     for some in _parts(data, copies=2):
         difference = torch.sub(data[some], model[some], out=model[some])
@@ -67,7 +68,7 @@ def replace_by_residual(
 
 
 def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
-    """<start - end, end - before>, summed in float64: above zero where the step to `end` points back to `before`."""
+    """<start - end, end - before>, summed in float64: above zero if the step to `end` points back to `before`."""
     total = torch.zeros((), dtype=torch.float64, device=end.device)
     for some in _parts(end, copies=3):
         turn = (start[some] - end[some]).mul_(end[some] - before[some])
@@ -137,7 +138,7 @@ def filtered(cells: Tensor, transfer: F32) -> Tensor:
 
 
 def extrapolate(x: Tensor, factor: float, last: Tensor, start: Tensor) -> None:
-    """x += factor (x - last), and `last` becomes x before that, `start` x after it."""
+    """x += factor (x - last); `last` becomes x before the update, `start` x after it."""
     torch.sub(x, last, out=start)
     torch.add(x, start, alpha=factor, out=start)
     last.copy_(x)
@@ -145,9 +146,9 @@ def extrapolate(x: Tensor, factor: float, last: Tensor, start: Tensor) -> None:
 
 
 def spread(lines: Tensor, along_cols: NDArray[np.float64], along_rows: NDArray[np.float64]) -> Tensor:
-    """The lines [view, col, row] after passes of three neighbours each, of these variances [view] in px².
+    """The lines [view, col, row] blurred by passes over three neighbours, with these variances [view] in px².
 
-    `lines` themselves where no pass is needed, else a new tensor.
+    Returns `lines` itself if no pass is needed, otherwise a new tensor.
     """
     passes = passes_of(along_cols, along_rows)
     if passes == 0:
@@ -169,13 +170,13 @@ def dual_step(
 ) -> None:  # fmt: skip
     """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; see `cpu.tv.dual_step`.
 
-    Memory: two volumes beside x and p.
+    Memory: two volumes in addition to x and p.
     """
     pace = dual_pace(threshold, weights)
     point = _primal_point(x, p, threshold, weights, nonnegative)
     for axis, (field, weight) in enumerate(zip(p, weights, strict=True)):
         _before(field, axis).add_(_after(point, axis) - _before(point, axis), alpha=pace * weight)
-    # The difference from i to i + 1 belongs to voxel i or, of a mirror image, to voxel i + 1. The last one stays 0.
+    # The difference from i to i + 1 belongs to voxel i or, in a mirror image, to voxel i + 1. The last one stays 0.
     length = point.zero_()
     owners = [_after(length, axis) if mirrored else _before(length, axis) for axis, mirrored in enumerate((*back, 0))]
     for axis, (field, owner) in enumerate(zip(p, owners, strict=True)):
@@ -204,12 +205,13 @@ def _primal_point(x: Tensor, p: DualField, threshold: float, weights: Weights, n
 def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: Tensor) -> None:
     """out = D(x) of `cpu.patches`, at least 0 with `nonnegative`; `out` may be `x`.
 
-    Some planes of blocks are transformed at once, and the bits do not depend on how many. Memory: one volume beside x
-    and `out`, and half a GiB or, if that is more, forty planes.
+    Several planes of blocks are transformed at a time; the result does not depend on their number, bit for bit. Memory:
+    one volume in addition to x and `out`, plus half a GiB or forty planes, whichever is more.
 
     Args:
         x: [a, b, c].
-        threshold: of coefficients, in the unit of x; white noise of deviation σ has coefficients of deviation σ.
+        threshold: threshold for coefficients, in the unit of x; white noise with standard deviation σ has coefficients
+            with standard deviation σ.
     """
     na, nb, nc = x.shape
     axes = (0, 1, 2) if nc >= EDGE else (0, 1)
@@ -219,11 +221,11 @@ def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: 
     plane = math.prod(n + 2 * _BEYOND for n in (nb, nc))
     step = max(1, _AT_ONCE // (4 * _BLOCK_COPIES * plane))
     for first in range(0, na + _BEYOND, step):
-        end = min(first + step, na + _BEYOND)  # of the blocks' first planes
+        end = min(first + step, na + _BEYOND)  # end of the blocks' first planes
         given = x.index_select(0, places[0][first : end + _BEYOND])
         for axis in axes[1:]:
             given = given.index_select(axis, places[axis])
-        # A voxel sums its blocks in one order, by their first plane, wherever a part of the planes begins.
+        # A voxel sums its blocks in the order of their first plane, wherever a part of the planes begins.
         for at, value in reversed(list(enumerate(_shrunk(given, axes, limit, True)))):
             sums[first + at : end + at] += value
     torch.mul(sums[_BEYOND : na + _BEYOND], 16.0 ** -len(axes), out=out)
@@ -232,11 +234,11 @@ def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: 
 
 
 def _shrunk(given: Tensor, axes: Sequence[int], limit: float, mean: bool) -> list[Tensor]:
-    """What voxels 0 ... 3 along the first of `axes` get from each block, summed over blocks along the others.
+    """The contributions of each block to voxels 0 to 3 along the first of `axes`, summed over blocks along the others.
 
     Args:
-        limit: coefficients up to it count as 0.
-        mean: the first coefficient is kept.
+        limit: coefficients up to this become 0.
+        mean: True: the first coefficient is kept.
     """
     axis, *others = axes
     kept = []
@@ -267,7 +269,7 @@ def _values(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> list[Tensor]:
 
 
 def _mirrored(n: int, device: torch.device) -> Tensor:
-    """Which of n voxels lies at -3 ... n + 2, mirrored at both faces."""
+    """The voxel (of n) at each position from -3 to n + 2, mirrored at both faces."""
     at = torch.arange(-_BEYOND, n + _BEYOND, device=device) % (2 * n)
     return torch.minimum(at, 2 * n - 1 - at)
 
@@ -275,7 +277,7 @@ def _mirrored(n: int, device: torch.device) -> Tensor:
 def pulled_step(
     x: Tensor, change: Tensor, momentum: float, pace: float, gradient: Tensor, pull: float, z: Tensor, nonnegative: bool
 ) -> None:  # fmt: skip
-    """change = momentum change + pace (gradient + pull (z - x)), and x += change, at least 0 with `nonnegative`.
+    """change = momentum change + pace (gradient + pull (z - x)), x += change; with `nonnegative`, x is at least 0.
 
     Memory: one volume.
     """
@@ -290,23 +292,23 @@ def pulled_step(
 
 
 def _before(array: Tensor, axis: int) -> Tensor:
-    """All but the last along an axis."""
+    """All elements except the last along an axis."""
     return array.narrow(axis, 0, array.shape[axis] - 1)
 
 
 def _after(array: Tensor, axis: int) -> Tensor:
-    """All but the first along an axis."""
+    """All elements except the first along an axis."""
     return array.narrow(axis, 1, array.shape[axis] - 1)
 
 
 def _parts(array: Tensor, copies: int) -> list[slice]:
-    """Slices of the first axis, as long as the budget holds so many copies of one."""
+    """Slices of the first axis, each as long as `copies` copies fit into the memory budget."""
     step = max(1, _AT_ONCE // (4 * copies * max(1, math.prod(array.shape[1:]))))
     return [slice(first, first + step) for first in range(0, array.shape[0], step)]
 
 
 class GpuVolumes:
-    """Volumes and views on one device, and the operations on them."""
+    """Volumes and projections on one device, and the operations on them."""
 
     combine, replace_by_residual = staticmethod(combine), staticmethod(replace_by_residual)
     maximum, add_product = staticmethod(maximum), staticmethod(add_product)
@@ -335,11 +337,11 @@ class GpuVolumes:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)
 
     def dual_field(self, shape: Shape) -> DualField:
-        """Zeros [a, b, c] for the differences along each axis: at i, that from i to i + 1."""
+        """Zeros [a, b, c] for the differences along each axis; element i is the difference from i to i + 1."""
         return self.zeros(shape), self.zeros(shape), self.zeros(shape)
 
     def dual_scratch(self, shape: Shape) -> None:
-        """What the CPU's `dual_step` and `primal` need: nothing here."""
+        """Scratch memory for `dual_step` and `primal`; only the CPU needs it."""
 
     def patch_scratch(self, shape: Shape) -> None:
-        """What the CPU's `denoise` needs: nothing here."""
+        """Scratch memory for `denoise`; only the CPU needs it."""

@@ -1,12 +1,12 @@
-"""Voxelisation of Gaussians on a GPU, brick by brick; backward from ten moments a Gaussian (Triton).
+"""Voxelisation of Gaussians on a GPU in bricks; the backward pass uses ten moments per Gaussian (Triton).
 
-With P = Σ⁻¹ and Σ_yz the covariance's block in y and z the exponent is a sum of three squares,
+With P = Σ⁻¹, and Σ_yz the block of the covariance in y and z, the exponent is a sum of three squares,
 
     δᵀPδ = Pxx τ² + l δ'² + δz² / Σzz,   τ = δx + Pxy/Pxx δy + Pxz/Pxx δz,   δ' = δy - r δz
     l = Σzz / det Σ_yz,   r = Σyz / Σzz,   det Σ_yz = Pxx (s₁ s₂ s₃)²
 
-all from inner products, without cancellation. Backward as in `cpu.voxelize`, from the moments of (τ, δ', δz): in
-moments of δ itself the thin sides of a needle would be small differences of large sums.
+all from inner products, without cancellation. The backward pass is as in `cpu.voxelize`, with the moments of (τ, δ',
+δz). With moments of δ itself, the thin sides of a needle would be small differences of large sums.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from recon.kernels.gpu.footprints import add_shape, add_to, body, scaled, shape_
 from recon.kernels.gpu.tiles import Room, tile_lists
 
 _BLOCK = 128
-_EDGE = 8  # voxels a brick edge
-_GROUP = 4  # Gaussians that a brick processes at once
-_DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian at once
+_EDGE = 8  # edge of a brick in voxels
+_GROUP = 4  # number of Gaussians that a brick processes at once
+_DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian that are processed at once
 _HUGE, _LEAST = tl.constexpr(3.0e38), tl.constexpr(1.0e-30)
 # Columns of the table: centre and half widths in voxels, the three squares' factors, the density.
 X, Y, Z, KX, SXY, SXZ, KY, SYZ, KZ, HX, HY, HZ, RHO = (tl.constexpr(column) for column in range(13))
@@ -62,7 +62,7 @@ def _placed(
         h0, h1, h2 = r0 / (s * per_x), r1 / (s * per_x), r2 / (s * per_z)
         pxx, pxy, pxz = pxx + h0 * h0, pxy + h0 * h1, pxz + h0 * h2
     kx, kz = pxx, 1.0 / zz
-    # sqrt(l), by successive quotients: a product of three small scales would leave float32's range.
+    # sqrt(l), by successive quotients, because a product of three small scales would leave the range of float32.
     steep = tl.sqrt(zz) / tl.sqrt(pxx) / (tl.load(scales + 3 * i) * per_x)
     steep = steep / (tl.load(scales + 3 * i + 1) * per_x) / (tl.load(scales + 3 * i + 2) * per_z)
     ky = steep * steep
@@ -92,7 +92,7 @@ def _placed(
     tl.store(f + RHO, tl.where(seen, density, 0.0), live)
     hit = seen & (x + hx >= 0.0) & (x - hx <= nx - 1.0) & (y + hy >= 0.0) & (y - hy <= ny - 1.0)
     hit = hit & (z + hz >= 0.0) & (z - hz <= nz - 1.0)
-    # Clip as floats: a box far outside exceeds int32.
+    # Clip as floats, because a box far outside exceeds int32.
     x_low, x_high = tl.maximum(tl.ceil(x - hx), 0.0), tl.minimum(tl.floor(x + hx) + 1.0, nx * 1.0)
     y_low, y_high = tl.maximum(tl.ceil(y - hy), 0.0), tl.minimum(tl.floor(y + hy) + 1.0, ny * 1.0)
     z_low, z_high = tl.maximum(tl.ceil(z - hz), 0.0), tl.minimum(tl.floor(z + hz) + 1.0, nz * 1.0)
@@ -110,7 +110,7 @@ def place(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float,
     kernel: Kernel = Kernel.GAUSSIAN, corner: Tensor | None = None,
 ) -> Placed:  # fmt: skip
-    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ, compact ones at their end.
+    """Place Gaussians on a grid. They are cut off below `faint` (a density) and at `cut` σ, compact ones at their end.
 
     `corner` (x, y, z) on the device replaces the centre of the grid's first voxel.
     """
@@ -266,7 +266,7 @@ def fill_backward(
     placed: Placed, gradient: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, *, means_too: bool = True,
 ) -> None:  # fmt: skip
-    """Back-propagate `gradient` [z, y, x], adding to the others; `means_too=False` leaves positions out."""
+    """Back-propagate `gradient` [z, y, x], adding to the other gradients; `means_too=False`: not to positions."""
     n = densities.shape[0]
     _, ny, nx = placed.grid.shape
     if n == 0:

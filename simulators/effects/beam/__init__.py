@@ -1,4 +1,4 @@
-"""What a beam does that is not steady, even, wide enough and of one energy."""
+"""Effects of the beam: not constant, not uniform, too narrow, or of several energies."""
 
 from functools import partial
 
@@ -6,12 +6,18 @@ from simulators.effects import Domain, EffectRow
 
 _energies, _open_beam = (partial(EffectRow, module=f"{__name__}.{name}") for name in ("energies", "open_beam"))
 EFFECTS = {
-    "harmonics": _energies(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
-    "beam_hardening": _energies(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
-    "beam_bend": _open_beam(Domain.PHOTONS, "the open beam of the views is not that of the flats"),
-    "ring_current": _open_beam(Domain.PHOTONS, "the ring current decays and is topped up"),
-    "ghost": _open_beam(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
+    "harmonics": _energies(
+        Domain.OPTICAL_DEPTH, "some photons have three times the energy (third harmonic of the monochromator)"
+    ),
+    "beam_hardening": _energies(
+        Domain.OPTICAL_DEPTH, "beam hardening: the sample absorbs low energies before high ones"
+    ),
+    "beam_bend": _open_beam(Domain.PHOTONS, "the open beam changes between flats and projections"),
+    "ring_current": _open_beam(Domain.PHOTONS, "the ring current decays, and top-ups raise it again"),
+    "ghost": _open_beam(
+        Domain.PHOTONS, "a smooth change of the intensity moves across the frame within a few projections"
+    ),
     "black_band": _open_beam(Domain.PHOTONS, "a slit darkens a band at the left side"),
     "narrow_field": _open_beam(Domain.PHOTONS, "the beam is narrower than the sample"),
-    "lost_beam": _open_beam(Domain.PHOTONS, "for a time there is no light, or less of it"),
+    "lost_beam": _open_beam(Domain.PHOTONS, "for some time the beam is lost or weaker"),
 }

@@ -1,4 +1,4 @@
-"""The open beam: its bends, its current, what cuts it off, and what crosses it."""
+"""Effects of the open beam: changes of its shape and intensity, a loss of the beam, and objects that cross it."""
 
 from __future__ import annotations
 

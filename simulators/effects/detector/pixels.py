@@ -1,4 +1,6 @@
-"""Pixels of the sensor: their response, hot and dead ones, zingers, and rows that are exposed one after the other."""
+"""Effects of the sensor's pixels: sensitivity, hot and dead pixels, zingers, and rows that are exposed one after the
+other.
+"""
 
 from __future__ import annotations
 
@@ -109,8 +111,8 @@ class Zingers(ImageEffect):
         expected = self.rate * shot.exposure
         if expected > MOST:
             raise CannotExposeError(
-                f"zingers: {self.rate:g} a second are {expected:.3g} in a frame of {shot.exposure:g} s, above the "
-                f"limit of {MOST}; a rate counts the zingers of the whole frame"
+                f"zingers: {self.rate:g} per second are {expected:.3g} in a frame of {shot.exposure:g} s, "
+                f"above the limit of {MOST}; the rate counts the zingers of the whole frame"
             )
         n = int(rng.poisson(expected))
         where = np.array(np.unravel_index(rng.integers(image.size, size=n), image.shape), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What light does beside being absorbed by the sample: it is refracted and scattered, and meets crumbs on its way."""
+"""Effects of refraction and scattering in the sample, and of loose particles in the beam."""
 
 from functools import partial
 
@@ -8,11 +8,15 @@ _deflected, _phase_fringes = (
     partial(EffectRow, module=f"{__name__}.{name}") for name in ("deflected", "phase_fringes")
 )
 EFFECTS = {
-    "floaters": _deflected(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
-    "phase_fringes": _phase_fringes(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
+    "floaters": _deflected(
+        Domain.OPTICAL_DEPTH, "loose particles far from the axis are in the field of view in a few projections"
+    ),
+    "phase_fringes": _phase_fringes(
+        Domain.OPTICAL_DEPTH, "edges get bright rims (phase fringes) by propagation to the detector"
+    ),
     "scatter": _deflected(
         Domain.PHOTONS,
-        "photons that the sample deflects arrive elsewhere",
+        "photons that the sample deflects hit other pixels",
         frozenset({"beam_profile", "beam_bend", "narrow_field"}),
         "the sample scatters the light that reaches it",
     ),

@@ -1,4 +1,4 @@
-"""Light that the sample deflects, and crumbs that it meets on its way."""
+"""Light that the sample deflects, and loose particles in its path."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Crumb:
         row, col: of its middle.
         sigma: pixels.
         depth: optical depth through its middle.
-        which: number of the crumb in the scene.
+        which: number of the loose particle in the scene.
     """
 
     row: float
@@ -52,19 +52,20 @@ class Crumb:
 class Floaters(ImageEffect, Anomaly):
     """Crumbs on the outside of the can or elsewhere in the beam.
 
-    Turning crumbs turn with the stage. A crumb beyond the frame's width crosses the frame twice a turn, in front of the
-    axis and behind it. Within half a turn it crosses once, in a range of views, on one side. Loose crumbs drift
-    across at a speed of their own. All rows show a crumb at its place when the first row is exposed.
+    Turning particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a
+    turn, in front of the axis and behind it. Within 180 degrees it crosses once, in a range of views, on one side.
+    Loose particles drift across at a speed of their own. All rows show a loose particle at its place when the
+    first row is exposed.
 
     Attributes:
-        distance: [least, most] mm from the rotation axis; a loose crumb is visible within the larger distance.
-        count: number of crumbs.
+        distance: [least, most] mm from the rotation axis; a loose particle is visible within the larger distance.
+        count: number of loose particles.
         size: [least, most] mm, standard deviation of the cloud.
-        depth: largest optical depth through the middle of a crumb; the smallest is half of it.
+        depth: largest optical depth through the middle of a loose particle; the smallest is half of it.
         heights: [least, most] mm, down the rows from z = 0.
         motion: "turning" with the stage, or "loose".
-        speed: mm a view, the drift of a loose crumb in either direction.
-        views: [first, one after the last] in which crumbs exist; a loose one passes the axis within it.
+        speed: mm a view, the drift of a loose particle in either direction.
+        views: [first, one after the last] in which loose particles exist; a loose one passes the axis within it.
         seed: of sizes, places and depths.
     """
 
@@ -84,7 +85,9 @@ class Floaters(ImageEffect, Anomaly):
             if not least <= most:
                 raise ValueError(f"{name} must be [least, most] in mm, got {[least, most]}")
         if self.motion == "loose" and self.views is None:
-            raise ValueError("loose floaters need views, [first, one after the last], between which they pass the axis")
+            raise ValueError(
+                "loose floaters need views, [first, one after the last], between which they cross the axis"
+            )
 
     def apply(self, image: Image, shot: Shot) -> Image:
         for crumb in self.crumbs(shot):

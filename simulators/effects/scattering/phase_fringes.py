@@ -1,4 +1,4 @@
-"""Phase fringes: the wave interferes with itself between sample and detector, and edges get bright rims."""
+"""Phase fringes: the wave interferes with itself between sample and detector, which gives edges bright rims."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PhaseFringes(ImageEffect):
 
     def __post_init__(self) -> None:
         if self.method == "transport" and self.oversampling != 1:
-            raise ValueError(f"oversampling is for the method wave only; leave it out, got {self.oversampling}")
+            raise ValueError(f"oversampling is for the method wave only; omit it, got {self.oversampling}")
 
     @property
     def wavelength(self) -> float:
@@ -97,8 +97,9 @@ class PhaseFringes(ImageEffect):
     def _check_transport(self, area: float) -> None:
         if area > 1:
             raise CannotExposeError(
-                f"phase_fringes: a pixel's Fresnel number is {1 / area:.2g} and transport holds from 1 on, where "
-                f"fringes are finer than pixels; give at most {self.distance / area:.3g} mm of distance or method wave"
+                f"phase_fringes: a pixel's Fresnel number is {1 / area:.2g}, but the method transport "
+                "needs 1 or more, because fringes must be wider than pixels. Give at most "
+                f"{self.distance / area:.3g} mm of distance, or method wave"
             )
 
     def _check_propagator(self, z: float, detector: Detector) -> None:
@@ -124,9 +125,9 @@ class PhaseFringes(ImageEffect):
             wanted = math.ceil(turn / STEEPEST)
             advice = f"oversampling {wanted}, smaller pixels" if wanted <= 8 else "smaller pixels"
             raise CannotExposeError(
-                f"phase_fringes: the wave would alias: with delta_beta {self.delta_beta:g} its phase turns by "
-                f"{turn:.3g} rad from pixel to pixel, and oversampling {self.oversampling} follows "
-                f"{STEEPEST * self.oversampling:.3g}; give {advice} or a smaller delta_beta"
+                f"phase_fringes: the wave would alias, because with delta_beta {self.delta_beta:g} its "
+                f"phase changes by {turn:.3g} rad between pixels, and oversampling {self.oversampling} "
+                f"allows {STEEPEST * self.oversampling:.3g}. Give {advice} or a smaller delta_beta"
                 + (", or method transport" if area <= 1 else "")
             )
 

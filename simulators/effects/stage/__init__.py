@@ -7,13 +7,13 @@ from simulators.effects import Domain, EffectRow
 _Row = partial(EffectRow, module=f"{__name__}.errors")
 EFFECTS = {
     "encoder_error": _Row(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
-    "backlash": _Row(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),
-    "stage_wobble": _Row(Domain.MOTION, "the rotation axis tilts as the stage turns"),
-    "runout": _Row(Domain.MOTION, "the rotation axis wanders as the stage turns"),
+    "backlash": _Row(Domain.MOTION, "after a reversal the stage lags behind its encoder (backlash)"),
+    "stage_wobble": _Row(Domain.MOTION, "the rotation axis wobbles in tilt as the stage rotates"),
+    "runout": _Row(Domain.MOTION, "the rotation axis moves sideways as the stage rotates"),
     "jump": _Row(
         Domain.MOTION,
         "the sample slips on the stage once",
         frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
-        "errors of the stage depend on the stage's angle, and the sample slips on the stage",
+        "errors of the stage depend on its angle, and the sample slips on the stage",
     ),
 }

@@ -1,4 +1,4 @@
-"""Errors of the stage: of its encoder, backlash, wobble and runout of its axis; and a sample that slips on it."""
+"""Errors of the stage: its encoder, backlash, wobble and runout of its axis; and a sample that slips on it."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Backlash(PoseEffect):
 
 
 def came_forwards(angle_at: AngleAt, time: float) -> bool:
-    """Whether the stage turns forwards at `time` (s), or did so in its last move before."""
+    """True if the stage turns forwards at `time` (s), or did so in its last move before."""
     here = angle_at(time)
 
     def elsewhere(ago: float) -> bool:

@@ -1,1 +1,1 @@
-"""Bodies: solids whose chords are exact."""
+"""Bodies: solids with exact chord lengths."""

@@ -30,7 +30,7 @@ class Packed(NamedTuple):
         matrix: float64 [n, 3, 3]. ELLIPSOID: W with |W q| <= 1 inside, q from the centre.
         first_face: int64 [n + 1]; a POLYHEDRON's faces are first_face[i] to first_face[i + 1] of the next.
         faces: float64 [face, 4], unit normal and distance from the centre: normal · q <= distance inside.
-        first_vertex: int64 [n + 1], likewise.
+        first_vertex: int64 [n + 1], in the same way.
         vertices: float64 [vertex, 3], from the centre.
     """
 
@@ -133,7 +133,7 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     """
     rows = detector.shape[0]
     if pose.angle.shape != (rows,):
-        raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one a row")
+        raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one angle per row")
     shift, tilt = pose.shift, pose.tilt
     if all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, shift, tilt)):  # one pose for all rows
         shift, tilt = None if shift is None else shift[:1], None if tilt is None else tilt[:1]
@@ -183,9 +183,9 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
         gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
         if not gap > 1e-9 * sod:
             raise CannotExposeError(
-                f"solid {i} ({names[i]}) reaches {-gap:.3g} mm behind the source, which is "
-                f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
-                f"No frame was computed"
+                f"solid {i} ({names[i]}) extends {-gap:.3g} mm behind the source, which is {sod:g} mm in "
+                "front of the rotation axis. All of it must be between source and detector: move it, or "
+                "increase sod. No frame was computed"
             )
 
 

@@ -145,7 +145,10 @@ class Phantom:
         if len(called) != len(solids):
             raise ValueError(f"{len(solids)} solids have {len(called)} names; give each solid a name, or none")
         if len(set(called)) > MOST_NAMES:
-            raise ValueError(f"labels are bytes: at most {MOST_NAMES} names, got {len(set(called))}; let solids share")
+            raise ValueError(
+                f"labels are bytes: at most {MOST_NAMES} names, got {len(set(called))}; give several solids "
+                "the same name"
+            )
         return cls(tuple(solids), called, pack(solids))
 
     @cached_property

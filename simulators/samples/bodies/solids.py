@@ -128,8 +128,8 @@ def _hull(vertices: tuple[tuple[float, ...], ...]) -> Hull:
     if others := set(range(len(points))) - set(convex.vertices.tolist()):
         which = f"vertex {min(others)} at {vertices[min(others)]} mm"
         raise ValueError(
-            f"polyhedron: not convex: {which} is not a corner of the hull of all; leave it out, or describe the "
-            f"body by several convex ones"
+            f"polyhedron: not convex: {which} is not a corner of the convex hull; omit the vertex, or "
+            "describe the body by several convex ones"
         )
     # Faces of more than three corners come in triangles.
     _, once = np.unique(np.round(convex.equations / (1e3 * FLAT)) + 0.0, axis=0, return_index=True)

@@ -1,1 +1,1 @@
-"""Builders: batteries, cathodes and foams out of bodies."""
+"""Builders: compose batteries, cathodes and foams from bodies."""

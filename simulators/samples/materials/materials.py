@@ -149,7 +149,9 @@ class Material:
             raise ValueError(f"{self.name}: edge_shift_ev must lie in -20 ... 20 eV, got {self.edge_shift_ev}")
         if not K_EDGES.keys() & dict(self.fractions).keys():
             symbols = ", ".join(xraylib.AtomicNumberToSymbol(z) for z in K_EDGES)
-            raise ValueError(f"{self.name}: state_of_charge is for an oxide with {symbols}; this has none of them")
+            raise ValueError(
+                f"{self.name}: state_of_charge is for an oxide with {symbols}; this material has none of them"
+            )
 
     def attenuation(self, energies: ArrayLike) -> Reals:
         """Linear attenuation in 1/mm at `energies` in keV, float64, of their shape.
@@ -280,7 +282,7 @@ class Palette:
     own: Mapping[str, Material] = field(default_factory=lambda: MappingProxyType({}))
 
     def __call__(self, name: str) -> Material:
-        """Raises ValueError where no material has this name."""
+        """Raises ValueError if no material has this name."""
         material = self.own.get(name) or known(name)
         if material is None:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Parts: solids with materials, and the sample that they form in a beam.
+"""Parts: solids with materials, and the sample that they form in a given beam.
 
 Overlapping solids add up, so that a part that displaces another material counts with the difference of the two. Grey
 parts have the same attenuation at every energy.

@@ -1,4 +1,4 @@
-"""Spectrum: a beam's energies and weights, as few as its sample needs."""
+"""Spectrum: energies and weights of a beam, reduced to as few as its sample needs."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum
     for name, mm in (tube.filters or {}).items():
         weights = weights * np.exp(-mm * filters(name)(energies))
     if not weights.sum() > 1e-30 * open_beam:
-        raise ValueError(f"no light of the tube's {tube.kv:g} kV passes its filters {dict(tube.filters or {})} mm")
+        raise ValueError(f"no photons of the tube's {tube.kv:g} kV pass its filters {dict(tube.filters or {})} mm")
     return Spectrum.of(energies, np.where(weights > _NOTHING * weights.sum(), weights, 0.0))
 
 

@@ -1,3 +1,3 @@
-"""Samples of voxels: volumes that are read from files."""
+"""Samples made of voxels: volumes that are read from files."""
 
 PHANTOMS = {"volume": f"{__name__}.voxels"}

@@ -1,4 +1,4 @@
-"""Voxels: a sample given by a volume of attenuation, from a file or a reconstruction, with labels.
+"""Voxels: a sample defined by a volume of attenuation, from a file or a reconstruction, with labels.
 
 The sample is the linear interpolation between the voxels' centres, for projections and truth alike. In a scene:
 
@@ -40,7 +40,7 @@ class Voxels:
     Attributes:
         padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of zeros on all sides.
         spacing: mm from voxel to voxel along (z, y, x).
-        thresholds: 1/mm, ascending: label k from the k-th on; None where there is a `label_volume`.
+        thresholds: 1/mm, ascending: label k from the k-th on; None if there is a `label_volume`.
         label_volume: uint8 [z, y, x].
         names: of the labels 1, 2, ...
         radius: mm from the rotation axis to the farthest matter.
@@ -90,9 +90,9 @@ class Voxels:
             if thresholds:
                 raise ValueError("labels come from thresholds or from a volume, not from both")
             if labels.shape != attenuation.shape:
-                raise ValueError(f"labels of shape {labels.shape} do not go with a volume of {attenuation.shape}")
+                raise ValueError(f"labels of shape {labels.shape} do not match a volume of {attenuation.shape}")
             if not np.issubdtype(labels.dtype, np.integer):
-                raise ValueError(f"labels must be whole numbers, got {labels.dtype}")
+                raise ValueError(f"labels must be integers, got {labels.dtype}")
             low, n = int(labels.min()), int(labels.max())
             if not 0 <= low <= n <= MOST_LABELS:
                 raise ValueError(f"labels must be 0 ... {MOST_LABELS}, got {low} ... {n}")
@@ -136,8 +136,9 @@ class Voxels:
         nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
         if not nearest > -sod:
             raise CannotExposeError(
-                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
-                "it must lie wholly in front of the source. Raise sod, or make voxel_mm smaller. No frame was computed"
+                f"the volume begins {-nearest:.3g} mm in front of the rotation axis, and the source is "
+                f"{sod:g} mm in front of it. All of the volume must be between source and detector: "
+                "increase sod, or make voxel_mm smaller. No frame was computed"
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
@@ -205,7 +206,7 @@ def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) ->
 
 
 MOST_COLUMNS = 100_000
-VIEWS = 8  # Views over half a turn in which the largest line integral is searched
+VIEWS = 8  # Views over 180 degrees in which the largest line integral is searched
 
 
 @dataclass(frozen=True)
@@ -317,6 +318,6 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
         poses = (Pose.turned(k * math.pi / VIEWS, planes).shifted_by(shift) for k in range(VIEWS))
         most = max(float(whole.line_integrals(pose, detector).max()) for pose in poses)
         if not most > 0:
-            raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
+            raise ValueError(f"largest_line_integral needs a sample that absorbs; the largest sum is {most:g}")
         return settings.largest_line_integral / most
     return 1.0

@@ -1,4 +1,4 @@
-"""Simulated electrometer: `READ?` gives a current with its unit, a time and a status, as a picoammeter does.
+"""Simulated electrometer: `READ?` returns a current with its unit, a time and a status, like a picoammeter.
 
 Form of answers, from memory of the Keithley 6485: `+1.042700E-12A,+2.345000E+00,+0.000000E+00`. An unknown command gets
 no answer.

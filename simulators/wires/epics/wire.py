@@ -1,4 +1,4 @@
-"""Simulated motor record: fields of one axis, read and written by suffix, over a motor of whole steps.
+"""Simulated motor record: the fields of one axis, read and written by name, over a motor with whole steps.
 
 From the record's reference (motor R7): a value written to VAL, HOMF, HOMR or STOP acts before the write is answered;
 DMOV is 0 at once. Nothing is shared with the driver but the form of a value. Without a network it stands behind

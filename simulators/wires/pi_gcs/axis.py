@@ -1,8 +1,8 @@
-"""Simulated PI GCS 2.0 (C-863 class), the axis behind the wire: servo, reference, moves, stops, limits, trigger line.
+"""Simulated PI GCS 2.0 (C-863 class), the axis: servo, reference, moves, stops, limits, trigger line.
 
-Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis'
-own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: the effects of
-a move's end happen at the next call. Where a manual is silent the axis is strict: it refuses a move during a move.
+Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis' own
+zero, which before a reference move is wherever it was switched on. Nothing runs in the background: the effects of a
+move's end happen at the next call. Where a manual is silent the axis is strict: it refuses a move during a move.
 """
 
 from __future__ import annotations

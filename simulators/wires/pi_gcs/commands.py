@@ -1,4 +1,4 @@
-"""Simulated PI GCS 2.0 controller (C-863 class), its commands: what each does to the axis and the output lines.
+"""Simulated PI GCS 2.0 controller (C-863 class), the commands: what each does to the axis and the output lines.
 
 A setting returns None, a query the lines of its reply. A wrong command raises the code for the
 error register. One command takes one item (one axis, one parameter), as the C-863 does.

@@ -1,4 +1,4 @@
-"""Simulated PI GCS 2.0, an output line with a cable in it: its CTO settings, and the pulses of the move under way.
+"""Simulated PI GCS 2.0, an output line with a cable: its CTO settings, and the pulses of the current move.
 
 In mode 0 (PositionDistance) it gives one pulse for each step of travel. If the start threshold lies below the stop
 threshold, pulses begin only in the positive direction; if it lies above, only in the negative one. Equal thresholds

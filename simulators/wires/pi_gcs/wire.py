@@ -1,4 +1,5 @@
-"""Simulated PI GCS 2.0 controller (C-863 class), the wire: bytes to commands of its one axis, and its replies back.
+"""Simulated PI GCS 2.0 controller (C-863 class), the wire: converts bytes to commands of its one axis, and its
+replies to bytes.
 
 A command line ends with LF (CR is ignored, case does not matter) and is one item; single control bytes act at once.
 Settings are not answered. The error register keeps the last error; ERR? reads and clears it. An unknown query is not

@@ -1,4 +1,4 @@
-"""Simulated Tsuji PM16C-04XD, the box behind the wire: sixteen motors, four position controllers, error flags.
+"""Simulated Tsuji PM16C-04XD, the controller box: sixteen motors, four position controllers, error flags.
 
 Behaviour as in the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Where the manual is
 silent this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed only sets the command-error

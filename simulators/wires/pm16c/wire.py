@@ -1,4 +1,4 @@
-"""Simulated Tsuji PM16C-04XD, the wire: bytes to lines to commands of the box, and its replies back to bytes.
+"""Simulated Tsuji PM16C-04XD, the wire: converts bytes to lines to commands of the box, and its replies to bytes.
 
 ASCII lines end with CR LF both ways. Queries are answered, settings are not. An unknown command, or a setting
 that the box refuses, only sets an error flag (ERRF?, ERR?).

@@ -1,4 +1,4 @@
-"""Arguments of the wrong type: a ConfigError that names the argument, the value and what is expected."""
+"""Arguments of the wrong type raise a ConfigError that names the argument, its value and what is expected."""
 
 import inspect
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""The scripts of docs/examples run as they stand, with the simulated instrument on a virtual clock."""
+"""The scripts in docs/examples run unchanged, with the simulated instrument on a virtual clock."""
 
 import runpy
 import sys

@@ -147,7 +147,7 @@ def test_a_closed_instrument_and_a_second_scan_at_a_time_are_refused(connected: 
     said: list[str] = []
 
     def another() -> None:
-        with pytest.raises(api.ConfigError, match="still runs"):
+        with pytest.raises(api.ConfigError, match="still running"):
             instrument.scan(sample="second")
         said.append("refused")
 
@@ -177,7 +177,7 @@ def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(connected
     with connected(say=said.append, **words) as instrument:
         assert instrument.scan(live=False).clean
         instrument.scan(live=False, set={"scan.decide": "off"})
-    sentence = "scan.decide do needs a live reconstruction, and this scan has none: its plan is taken as it is."
+    sentence = "scan.decide do needs a live reconstruction, and this scan has none, so it follows its plan."
     assert said.count(sentence) == 1
 
 

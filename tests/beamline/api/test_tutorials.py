@@ -1,4 +1,4 @@
-"""The scripts of docs/tutorials.md run as they stand there, and its page shows what they print and draw.
+"""The scripts in docs/tutorials.md run unchanged, and the page shows what they print and draw.
 
 `python -m tests.beamline.api.test_tutorials` writes texts and pictures of the page anew; look at them.
 """

@@ -1,4 +1,4 @@
-"""Documents as a subscriber gets them."""
+"""Collects bluesky documents as a subscriber receives them."""
 
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -11,7 +11,7 @@ event_model = pytest.importorskip("event_model")
 
 
 class Heard:
-    """Documents, each validated by event-model as it comes."""
+    """Documents; each one is validated by event-model when it arrives."""
 
     def __init__(self) -> None:
         self.all: list[tuple[str, dict[str, Any]]] = []
@@ -24,7 +24,8 @@ class Heard:
         return [document for found, document in self.all if found == name]
 
     def read(self, key: str, run: int = -1) -> np.ndarray:
-        """The data of a key as a client reads it: by resource and datums alone. `run`: the only one, or its number."""
+        """The data of a key as a client reads it, only from resource and datums. `run`: number of the run (-1: the
+        last)."""
         resources = [document for document in self.of("stream_resource") if document["data_key"] == key]
         assert run >= 0 or len(resources) == 1
         resource = resources[run]

@@ -1,4 +1,4 @@
-"""The camera alone in plans of bluesky: frames in a file of ours, documents that are valid, lost frames named."""
+"""The camera alone in bluesky plans: it writes our file format, emits valid documents, and names lost frames."""
 
 import math
 from collections.abc import Generator
@@ -176,7 +176,7 @@ def test_a_plan_that_ends_before_its_frames_leaves_a_stopped_scan(engine: Any, t
     engine(plan())
     with h5py.File(_file(tmp_path)) as file:
         assert ending_in(file) == ScanEnding(
-            "stopped", tuple(range(N)), "0 of 5 frames were taken, as the plan ended before."
+            "stopped", tuple(range(N)), "0 of 5 frames were taken, because the plan ended earlier."
         )
 
 

@@ -1,4 +1,4 @@
-"""A RunEngine flies a simulated scan; its documents are valid, and lead to every frame of the file."""
+"""A RunEngine flies a simulated scan; its documents are valid and refer to every frame of the file."""
 
 import asyncio
 import json

@@ -127,7 +127,7 @@ def test_a_plan_that_is_ended_leaves_no_complete_file(engine: Any, tmp_path: Pat
     with h5py.File(path) as file:
         ending = ending_in(file)
     assert len(heard.of("event")) == 3 and ending.status == "stopped"
-    assert ending.reason.startswith("3 frames were taken until the plan ended (")
+    assert ending.reason.startswith("3 frames were taken before the plan ended (")
 
 
 async def _closed(camera: Any) -> None:
@@ -146,7 +146,7 @@ def test_a_plan_that_fails_leaves_no_complete_file(engine: Any, tmp_path: Path) 
             engine(_plan(camera, rotation))
     (path,) = tmp_path.glob("*/scan.h5")
     with h5py.File(path) as file:
-        assert ending_in(file).reason == "2 frames were taken until the plan ended (fail)."
+        assert ending_in(file).reason == "2 frames were taken before the plan ended (fail)."
 
 
 @pytest.mark.parametrize("success", [True, False])

@@ -1,4 +1,4 @@
-"""Documents of a scan through tiled: its client reads every frame, by what the RunEngine emitted alone."""
+"""Documents of a scan in tiled: with these documents alone, its client reads every frame."""
 
 from pathlib import Path
 from typing import Any

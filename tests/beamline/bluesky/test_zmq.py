@@ -1,4 +1,4 @@
-"""Documents by 0MQ reach bluesky's own dispatcher, and a proxy that is gone or hangs holds nobody up."""
+"""Documents over 0MQ reach bluesky's own dispatcher; a proxy that is gone or hangs delays nobody."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def _scan(runs: Path, address: str) -> Any:
 def test_every_document_of_a_scan_arrives_and_is_valid(tmp_path: Path) -> None:
     with _listener(address := _free()) as program:
         result = _scan(tmp_path, address)
-        assert result.exit_code == 0 and "Nobody listens" not in result.stderr, result.output
+        assert result.exit_code == 0 and "No program is listening" not in result.stderr, result.output
         assert program.stdout is not None
         found: list[tuple[str, dict[str, Any]]] = []
         while not found or found[-1][0] != "stop":
@@ -65,7 +65,7 @@ def test_every_document_of_a_scan_arrives_and_is_valid(tmp_path: Path) -> None:
 
 def test_without_a_listener_the_scan_is_complete_and_says_so(tmp_path: Path) -> None:
     result = _scan(tmp_path, _free())
-    assert result.exit_code == 0 and "Nobody listens at tcp://127.0.0.1:" in result.stderr
+    assert result.exit_code == 0 and "No program is listening at tcp://127.0.0.1:" in result.stderr
     assert next(tmp_path.glob("*/scan.h5")).is_file()
 
 

@@ -1,4 +1,4 @@
-"""A proxy of 0MQ and a dispatcher behind it, a program of its own: prints a line for each document that arrives."""
+"""A separate program with a 0MQ proxy and a dispatcher; it prints a line for each document it receives."""
 
 import json
 import sys

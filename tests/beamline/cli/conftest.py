@@ -1,4 +1,4 @@
-"""Commands are tested as from a terminal, wherever the tests themselves run."""
+"""Commands are tested as if they ran in a terminal, wherever the tests run."""
 
 import signal
 import sys
@@ -13,7 +13,8 @@ from tests.beamline.scans import write_exchange
 
 @pytest.fixture(autouse=True)
 def terminal() -> Iterator[None]:
-    """Signals that end things: under nohup, or started behind a shell, some are ignored, and commands respect that."""
+    """Restore the signals that end programs. Under nohup or in the background they are ignored, which commands
+    respect."""
     if sys.platform == "win32":
         yield
         return
@@ -25,13 +26,13 @@ def terminal() -> Iterator[None]:
 
 @pytest.fixture
 def no_debug(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A defect ends as its user sees it."""
+    """A defect ends a command in the way that its user sees."""
     monkeypatch.delenv("BEAMLINE_DEBUG", raising=False)
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current directory, with a good scan in it."""
+    """The current directory, which contains a valid scan."""
     monkeypatch.chdir(tmp_path)
     write_exchange(tmp_path / "scan.h5", SCAN)
     return tmp_path

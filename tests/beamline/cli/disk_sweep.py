@@ -1,11 +1,11 @@
-"""Runs commands again and again in forks of this process, each with another fault of the disk (tests.faulty_disk).
+"""Runs commands repeatedly in forks of this process, each time with another disk fault (tests.faulty_disk).
 
     LD_PRELOAD=faulty_disk.so FAULTY_DISK_PATTERN=out/ python -m tests.beamline.cli.disk_sweep FOLDER POINTS COMMAND...
 
-FOLDER is the current directory of the commands, which write to FOLDER/out; each is one argument. One JSON line a run:
-command, fault, write, exit code, stderr, the outputs by name with the SHA-256 of what does not change from run to run,
-and the files in them that are cut off. Trials of `tradeoff` and `study` are made up: they write a volume, in this
-process. Figures are blank: they are drawn in memory, which no disk spoils.
+FOLDER is the current directory of the commands; they write to FOLDER/out, and each is one argument. Each run prints one
+JSON line: command, fault, write, exit code, stderr, the outputs by name with the SHA-256 of the content that does not
+change between runs, and truncated files. Trials of `tradeoff` and `study` are replaced by ones that only write a volume
+in this process. Figures are blank, because they are drawn in memory, where a disk fault has no effect.
 """
 
 import ctypes
@@ -46,7 +46,7 @@ _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "
 
 
 def digest(path: Path) -> str:
-    """Of the content of a file or folder; of pages only whether they are there."""
+    """Digest of the content of a file or folder; for report pages, only whether they exist."""
     found = hashlib.sha256()
     if path.is_dir():
         for part in sorted(path.rglob("*")):
@@ -72,7 +72,7 @@ def digest(path: Path) -> str:
 
 
 def _whole(path: Path) -> bool:
-    """A page, table or picture is not cut off."""
+    """Whether a page, table or picture is complete."""
     data = path.read_bytes()
     if path.suffix == ".json":
         with suppress(ValueError):
@@ -83,7 +83,7 @@ def _whole(path: Path) -> bool:
 
 
 def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:
-    """A trial that takes no time."""
+    """A replacement for a trial that takes no time."""
     amount = float(trial.views)
     volume = np.linspace(0, amount, 3200, dtype=np.float32).reshape(2, 40, 40)
     found = {"residual_held_out": 1 / amount, "psnr_all": amount, "ssim_all": 0.5}
@@ -91,7 +91,7 @@ def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:
 
 
 def _done_once(words: list[str], cli: Any) -> None:
-    """Do a command in this process, without a word."""
+    """Run a command in this process without output."""
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         cli.main(words, prog_name="beamline", standalone_mode=False)
     gc.collect()
@@ -143,7 +143,7 @@ def main() -> None:
     for words in commands:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        _done_once(words, cli)  # what is loaded now, no fork loads again
+        _done_once(words, cli)  # modules that are loaded now need not be loaded by the forks
         run(words, "none", 0)
         writes = int(counted.read_text())
         for fault in list(_FAULTS)[1:]:

@@ -1,4 +1,4 @@
-"""What the tests of `beamline recon` share: a small scan, the command as its user calls it, what is left."""
+"""Shared by the tests of `beamline recon`: a small scan, a call as a user makes it, and the files it leaves."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def beamline(*arguments: object) -> Result:
 
 
 def succeeds(*arguments: str) -> Result:
-    """A command that ends well."""
+    """Run a command that must succeed."""
     result = beamline(*arguments)
     assert result.exit_code == 0, result.output
     return result

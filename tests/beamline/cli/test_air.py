@@ -65,7 +65,7 @@ def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
 
 def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Path]) -> None:
     bent, straight = (_prepared(scans[name]) for name in ("bent", "straight"))
-    assert "taken off" in bent.done["background"].sentence and straight.done["background"].sentence == ""
+    assert "subtracted" in bent.done["background"].sentence and straight.done["background"].sentence == ""
     left = bent.projections.data - straight.projections.data
     noise = float(np.std(left[:, :8]))
     assert np.abs(left.mean(axis=0)).max() < 0.01 and noise < 0.02
@@ -75,11 +75,11 @@ def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Pa
 
 def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict[str, Path], tmp_path: Path) -> None:
     said, record = _recon(scans["bent"], tmp_path / "v.h5", "-m", "fbp")
-    assert "Background of the beam: the air of the views is a surface" in said and record in said
+    assert "Background of the beam subtracted: the air is a surface" in said and record in said
     page = (tmp_path / "v.html").read_text(encoding="utf-8")
-    assert "the air of the views is a surface" in page.partition("What the metrics mean")[0] and "Level of air" in page
+    assert "the air is a surface" in page.partition("What the metrics mean")[0] and "Air level" in page
     said, record = _recon(scans["bent"], tmp_path / "plain.h5", "-m", "fbp", "--air", "columns", "--no-report")
-    assert "Background" not in said and record == "no surface taken off, a line through the air at the edges"
+    assert "Background" not in said and record == "no surface subtracted, only a line through the air at the edges"
 
 
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:

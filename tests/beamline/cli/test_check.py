@@ -1,4 +1,4 @@
-"""`beamline check`: the verdict, the figures, and exit code 2 with nothing moved or written."""
+"""`beamline check`: its verdict, its figures, and exit code 2; nothing moves and nothing is written."""
 
 import json
 from pathlib import Path
@@ -41,8 +41,8 @@ def test_violations() -> None:
     result = run(DEMO, *broken)
     assert result.exit_code == 2
     assert "is valid" not in result.stdout
-    assert (result.stdout + result.stderr).count("period_s 0.02 is below the camera's least") == 1
-    assert "limits are violated, nothing was started" in result.stderr
+    assert (result.stdout + result.stderr).count("period_s 0.02 is below the camera's minimum of") == 1
+    assert "limits are exceeded, nothing was started" in result.stderr
     result = run(DEMO, "--json", *broken)
     assert result.exit_code == 2
     (line,) = result.stdout.splitlines()
@@ -54,7 +54,7 @@ def test_violations() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "sentence"),
     [
-        ("optics.pixel_size_um", 4600, "is 4600 um, the camera's pixels are 4.6 um"),
+        ("optics.pixel_size_um", 4600, "is 4600 um, but the camera's pixels are 4.6 um"),
         ("optics.pixel_size_um", 450, ""),
         ("optics.distance_mm", 0.1, "less than half the field of"),
         ("optics.distance_mm", 0, ""),
@@ -82,4 +82,4 @@ def test_a_port_that_cannot_be_is_refused(port: str, good: bool) -> None:
     assert (port_problem(port) == "") is good
     if not good:
         result = run(DEMO, "--set", f"devices.stage.port={port}")
-        assert result.exit_code == 2 and "is no port; expected one such as COM3" in result.stderr
+        assert result.exit_code == 2 and "is not a port; expected one such as COM3" in result.stderr

@@ -1,4 +1,4 @@
-"""Commands of other packages: by the name that the package announces, whatever theirs is there."""
+"""Commands of other packages are found by the name that the package announces."""
 
 from importlib.metadata import EntryPoint
 

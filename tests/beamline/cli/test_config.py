@@ -1,4 +1,4 @@
-"""`beamline config`: what it prints can be used as it is."""
+"""`beamline config`: its output can be used as a configuration."""
 
 import json
 from pathlib import Path

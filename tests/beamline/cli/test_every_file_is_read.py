@@ -1,4 +1,4 @@
-"""Every file that a command writes is read by every command that claims to: all pairs of both.
+"""Every command reads every file it claims to read: all pairs of files and commands.
 
 Series in time are read in tests/recon/features/joint/test_command.py.
 """

@@ -1,4 +1,4 @@
-"""Every kind of output on a disk that fails at any write: it is right, or exit code 5 and nothing is there."""
+"""If the disk fails at any write, an output is either correct, or absent with exit code 5, for all kinds of output."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A scan in a layout of its own gives, by the names of its datasets, what the same scan gives in ours."""
+"""A scan in another HDF5 layout gives the same result as in ours, if its datasets are named."""
 
 from pathlib import Path
 

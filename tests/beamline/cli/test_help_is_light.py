@@ -1,4 +1,4 @@
-"""Help and refusals come at once: nothing loads a library that computes, or that only other work needs."""
+"""Help and errors come at once: they load no library for computing, and none that only other commands need."""
 
 import subprocess
 import sys

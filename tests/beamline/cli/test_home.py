@@ -1,4 +1,4 @@
-"""`beamline home`: asks before the stage turns, says where it stands, and stops it when it is cut off."""
+"""`beamline home`: asks before the stage turns, reports the position, and stops the stage if it is interrupted."""
 
 import pytest
 from click.testing import CliRunner, Result
@@ -23,7 +23,7 @@ def run(*arguments: str, answer: str = "") -> Result:
 def test_a_stage_finds_its_reference(kind: str) -> None:
     result = run("--yes", "--set", f"devices.stage={{kind: {kind}, port: 'sim://{kind}', {FIGURES}}}")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == "The stage has found its reference and is at 0.0000 deg.\n"
+    assert result.stdout == "The stage has found its reference mark and is at 0.0000 deg.\n"
 
 
 def test_a_home_switch_gets_its_angle() -> None:
@@ -47,7 +47,7 @@ def test_nothing_turns_before_somebody_says_so(monkeypatch: pytest.MonkeyPatch, 
     result = run(answer=answer)
     assert result.exit_code == 130
     assert "May it turn?" in result.stderr
-    assert "was not confirmed. Nothing has moved" in result.stderr
+    assert "Nothing has moved, because the search was not confirmed" in result.stderr
 
 
 def test_an_interrupted_search_stops_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:

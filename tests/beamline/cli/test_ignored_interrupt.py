@@ -1,4 +1,4 @@
-"""A process that a script started in the background, or some CI, ignores SIGINT from the start, and keeps to that."""
+"""A process that ignored SIGINT from its start (background of a script, some CI) continues to ignore it."""
 
 from __future__ import annotations
 

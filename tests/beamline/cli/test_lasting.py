@@ -1,4 +1,4 @@
-"""A terminal or a disk that takes no output ends no command, and changes no exit code of one that leaves files."""
+"""If a terminal or disk accepts no output, no command ends, and no exit code of a command that writes files changes."""
 
 import os
 import subprocess

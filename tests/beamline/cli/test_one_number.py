@@ -1,4 +1,4 @@
-"""One name, one number: a figure is the same wherever it is shown."""
+"""The same quantity has the same value wherever it is shown."""
 
 import json
 import re

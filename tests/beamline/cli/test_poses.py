@@ -65,9 +65,9 @@ def test_poses_of_a_volume_come_back_as_a_table_that_gives_the_same_volume(tmp_p
 def test_a_volume_without_poses_has_none_to_export(tmp_path: Path) -> None:
     assert run("recon", scan(tmp_path, posed()), *FEW, "--no-report", "-o", tmp_path / "a.h5")[0] == 0
     code, said = run("export", tmp_path / "a.h5", "-o", tmp_path / "a.csv", "--poses")
-    assert code != 0 and "holds no poses" in said and not (tmp_path / "a.csv").exists()
+    assert code != 0 and "contains no poses" in said and not (tmp_path / "a.csv").exists()
     code, said = run("export", tmp_path / "a.h5", "-o", tmp_path / "a.csv")
-    assert code == 2 and "--poses needs the suffix .csv" in said
+    assert code == 2 and "--poses writes .csv files" in said
 
 
 def test_bad_tables_are_bad_usage_and_leave_nothing(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_bad_tables_are_bad_usage_and_leave_nothing(tmp_path: Path) -> None:
     assert code == 2 and "no finite shift" in said
     short = table(tmp_path, f"view,{COLUMNS}", *(column[:-3] for column in (np.arange(N), *SHIFTS.T, *TURNS.T)))
     code, said = run("recon", path, "--poses", short, *FEW, "-o", tmp_path / "a.h5")
-    assert code != 0 and "no pose of 3 of the 40 views" in said
+    assert code != 0 and "no pose for 3 of the 40 projections" in said
     assert not (tmp_path / "a.h5").exists()
 
 

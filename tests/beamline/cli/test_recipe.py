@@ -1,4 +1,4 @@
-"""Recipes: what they give is what the call gave."""
+"""Recipes: a recipe gives the same result as the call that wrote it."""
 
 from pathlib import Path
 

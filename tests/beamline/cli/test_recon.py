@@ -1,4 +1,4 @@
-"""`beamline recon`: options, what is printed and what is left."""
+"""`beamline recon`: options, output on the terminal, and files."""
 
 import json
 import re
@@ -29,9 +29,9 @@ def test_defaults_and_results(folder: Path) -> None:
         "volume": "2 x 40 x 40 in 1/mm",
         **_axis(lines),
     }
-    assert "Data residual" in result.stdout
-    assert "fbp: 30 views" in result.stderr
-    assert "fbp: 30 views" not in result.stdout
+    assert "Residual of the" in result.stdout
+    assert "fbp starts: 30 projections" in result.stderr
+    assert "fbp starts: 30 projections" not in result.stdout
 
 
 @pytest.mark.parametrize(("more", "chosen"), others_slow([((), "fbp"), (("-m", "r2"), "preview: 125 steps")]))
@@ -66,8 +66,8 @@ def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndar
 
 
 def _axis(lines: dict[str, str]) -> dict[str, str]:
-    assert float(lines["axis_col"]) == pytest.approx(SCAN.axis_col, abs=0.25)
-    return {"axis_col": lines["axis_col"]}
+    assert float(lines["axis"].removeprefix("column ")) == pytest.approx(SCAN.axis_col, abs=0.25)
+    return {"axis": lines["axis"]}
 
 
 def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
@@ -95,7 +95,7 @@ def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     result = beamline("recon", "scan.h5", "--steps", "2", *few, "--no-report")
     assert result.exit_code == 0 and "The fit started" not in result.stderr
     # Two steps of fifty Gaussians, not finished on voxels, do not explain the views, and that is said.
-    assert "leaves structure in the residual of the views" in result.stderr
+    assert "may hide cracks, pores or edges" in result.stderr
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path,
     assert result.exit_code == code, result.output
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
     assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
-    assert ("views held out" in result.stderr) is (code == 6)
+    assert ("held-out projections" in result.stderr) is (code == 6)
 
 
 @pytest.mark.slow
@@ -138,8 +138,8 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
         record = read_reconstruction(folder / f"{rings}.h5")
         scores[rings] = ring_score(record.volume.data[0], (middle, middle))
         assert record.parameters["rings"] == rings
-        assert ("--rings auto (by a filter)" in result.stderr) == (rings == "none")
-    assert "Rings: removed by sort; stripes of" in result.stderr
+        assert ("--rings auto (a filter on the projections)" in result.stderr) == (rings == "none")
+    assert "Rings: removed by sort. The height of the stripes fell from" in result.stderr
     assert str(record.parameters["rings_removed"]) in result.stderr
     assert scores["auto"] < 0.5 * scores["none"], scores
 
@@ -149,7 +149,11 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     way = ("--phase", "paganin:Al", "--energy-kev", "20", "--pixel-size-um", "1", "--no-report")
     result = succeeds("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
     said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["phase"])
-    assert said in result.stderr and said.startswith("Phase: Paganin's filter over 5.4") and "delta/beta 295.8" in said
+    assert (
+        said in result.stderr
+        and said.startswith("Phase retrieval with Paganin's filter over 5.4")
+        and "delta/beta 295.8" in said
+    )
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
@@ -163,6 +167,6 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
     result = succeeds("recon", "scan.h5", "--config", "recipe.yaml")
     found = read_reconstruction(folder / "scan_fbp.h5").parameters
     assert (found["tilt_deg"], found["distortion_col"], found["distortion_factors"]) == (-0.5, 20.0, "(1.0, 1e-05)")
-    assert "Views are turned by -0.5 degrees." in result.stderr
-    assert "Views are turned by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
+    assert "The projections are rotated by -0.5 degrees." in result.stderr
+    assert "The projections are rotated by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html", "lens.txt", "recipe.yaml"}

@@ -1,4 +1,4 @@
-"""`beamline recon` ended from outside: it delivers what it has, or leaves nothing; a checkpoint goes on."""
+"""`beamline recon` ended from outside: it delivers what it has, or leaves no file; a checkpoint can be resumed."""
 
 import signal
 import sys
@@ -144,7 +144,7 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     fewer = [*options[2:], "--steps", "20", "-o", "other.h5", "--resume", "fit.h5"]
     result = beamline("recon", "scan.h5", *fewer)
     assert result.exit_code == 2
-    assert "has 60 steps already" in result.stderr and "--steps" in result.stderr and "other.h5" not in left(folder)
+    assert "has already 60 steps" in result.stderr and "--steps" in result.stderr and "other.h5" not in left(folder)
 
 
 def test_ctrl_c_while_a_volume_is_measured_and_written_does_not_discard_it(

@@ -1,4 +1,4 @@
-"""`beamline recon` refuses for the disk, as a process, and what it made itself; refusals.txt has the others."""
+"""`beamline recon` stops with an error because of the disk or of its own files; refusals.txt has the other cases."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_work(folder: Path, monkeypa
     monkeypatch.setattr("beamline.reconstruct.options.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
     result = beamline("recon", "scan.h5", "-m", "fbp")
     assert result.exit_code == 5
-    assert "The volume takes 12.8 kB, the disk of scan_fbp.h5 has 12.8 kB free" in result.stderr
+    assert "the volume needs 12.8 kB, but the disk of scan_fbp.h5 has 12.8 kB free" in result.stderr
     assert "slices" not in result.stderr  # no work was begun
     assert left(folder) == {"scan.h5"}
 

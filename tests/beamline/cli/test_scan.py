@@ -1,4 +1,4 @@
-"""`beamline scan`: what it prints where, what the signals do, and every exit code."""
+"""`beamline scan`: its output, its reaction to signals, and all exit codes."""
 
 import json
 import signal
@@ -72,7 +72,7 @@ DECIDES = {"scan.decide": "ask", "scan.mode": "step", "scan.pass_views": 5}
 
 
 def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(tmp_path: Path) -> None:
-    said = "scan.decide ask needs a live reconstruction, and this scan has none: its plan is taken as it is."
+    said = "scan.decide ask needs a live reconstruction, and this scan has none, so it follows its plan."
     assert f"{SIMULATED}: {said}" in scan("--dry-run", **DECIDES).stderr
     assert "scan.decide" not in scan("--dry-run", **DECIDES | {"scan.decide": "off"}).stderr
     table = tmp_path / "day.csv"
@@ -90,7 +90,7 @@ def test_a_rehearsal_says_what_the_scan_takes(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, [*real, "--rehearse"])
     assert done.exit_code == 0, done.output
     planned = json.loads(CliRunner().invoke(main, [*real, "--dry-run", "--json"]).stdout)["duration"]
-    assert f"At the instrument the plan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
+    assert f"At the instrument the scan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
 
 
 @pytest.mark.slow
@@ -358,7 +358,7 @@ def test_7_a_complete_scan_with_alarms_says_so_last(tmp_path: Path, monkeypatch:
     assert result.exit_code == 7
     assert result.stdout.splitlines()[-1].startswith("flagged   stuck 3 alarm; see ")
     assert "Scan complete: 17 frames, 3 WITH AN ALARM" in result.stderr
-    assert "A reconstruction (--flags use): Of 12 views 3 have an alarm and are left out" in result.stderr
+    assert "With --flags use, a reconstruction does this: Of 12 views 3 have an alarm and are left out" in result.stderr
     assert "complete, but 3 of 17 frames have an alarm of the monitor: stuck 3 alarm" in result.stderr.splitlines()[-1]
     assert rows(tmp_path) == 17
     on(monkeypatch, FakeInstrument(Faults(repeats={9})))

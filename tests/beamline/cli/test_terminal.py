@@ -1,4 +1,4 @@
-"""A bar where a terminal is, few plain lines where there is none, and every event as words or nothing."""
+"""A progress bar on a terminal, few plain lines elsewhere; every event is either put into words or not shown."""
 
 import io
 from collections.abc import Iterator
@@ -119,7 +119,7 @@ EVENTS = [
     (
         "block_started",
         {"n": 10, "kind": "dark", "mode": "static", "first_row": 0, "exposure": 0.05, "period": 0.1},
-        "10 dark frames (static, 0.05 s",
+        "Taking 10 dark frames (static, exposure 0.05 s",
     ),
     ("block_done", BLOCK, None),
     ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
@@ -130,14 +130,14 @@ EVENTS = [
     (
         "recon_started",
         {"file": "s.h5", "method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
-        "r2: 26 views, rotation axis at column 81.99",
+        "r2 starts: 26 projections, rotation axis at column 81.99",
     ),
     (
         "recon_started",
         {"file": "s.h5", "method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
-        "r2 again, from the start: 40 views, rotation axis at column 82.50",
+        "r2 starts again from the beginning: 40 projections, rotation axis at column 82.50",
     ),
-    ("snapshot", SNAPSHOT, "Volume from 40 views so far: v.h5"),
+    ("snapshot", SNAPSHOT, "Volume from the first 40 projections: v.h5"),
     (
         "scan_done",
         SCAN,
@@ -151,7 +151,8 @@ EVENTS = [
     (
         "next_chosen",
         {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71, "judged": 2, "passes": 2},
-        "After pass 2: again, chosen by the program: it brings most a second. An earlier choice: predicted +0.80 dB, "
+        "After pass 2: again, chosen by the program: it brings most a second. Result of an earlier choice: predicted "
+        "+0.80 dB, "
         "measured +0.71 dB",
     ),
     (
@@ -159,12 +160,12 @@ EVENTS = [
         {
             **CHOSEN,
             "by": "operator",
-            "reason": "the operator chose it",
+            "reason": "chosen by the operator",
             "gained": 0.4,
             "gained_low": 0.2,
             "gained_high": 0.6,
         },
-        "again, the operator chose it. An earlier choice: measured +0.40 dB (0.20 to 0.60)",
+        "again, chosen by the operator. Result of an earlier choice: measured +0.40 dB (0.20 to 0.60)",
     ),
     ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),
@@ -184,7 +185,7 @@ def test_events_in_words(event: str, data: dict[str, Any], words: str | None) ->
 
 
 TABLE = """\
-Pass 3 is over, 270 views so far. What can be measured next:
+Pass 3 is done, 270 projections so far. What can be measured next:
   choice gain, dB                dB/min        s     dose      data
 > next   +0.82 (0.61 to 1.02)     +0.52       95   12.5 %   1.21 GB
   again  -0.31 (-0.52 to 0.10)    -0.20       95   12.5 %   1.21 GB
@@ -198,7 +199,10 @@ PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}
     ("more", "words"),
     [
         ({}, ""),
-        ({"wait": 30.0}, "Within 30 s: beamline decide CHOICE, Enter for next; else the plan goes on.\n"),
+        (
+            {"wait": 30.0},
+            "Within 30 s: beamline decide CHOICE, Enter for next; otherwise as planned.\n",
+        ),
         ({"remark": "No volume yet: \x1b[2J"}, "No volume yet: \\x1b[2J\n"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What no single value's type can say is refused with its line: files, regions, outputs, triggers, controllers."""
+"""Errors that concern several values name their line: files, regions, outputs, triggers, controllers."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("simulated_zaber")
             r"my\.yaml:\d+: recon\.axis 8\.5 .* columns 0 \.\.\. 7",
         ),
         ("simulation: {}", "simulation: &a {scene: {x: *a}}", "contains itself"),
-        ("simulation: {}", "simulation: " + 1000 * "[", "64 groups within each other"),
+        ("simulation: {}", "simulation: " + 1000 * "[", "64 nested groups"),
     ],
 )
 def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: str, said: str) -> None:
@@ -53,7 +53,7 @@ def test_a_shutter_does_not_share_the_trigger_output(tmp_path: Path, stage: str,
 def test_what_breaks_one_frame_a_pulse_is_not_for_fly_scans(option: str) -> None:
     path = config.config_folder() / "instrument.yaml"
     key = option.split("=")[0]
-    with pytest.raises(ConfigError, match=rf"devices\.camera\.{key} .* one frame a pulse"):
+    with pytest.raises(ConfigError, match=rf"devices\.camera\.{key} .* one frame per pulse"):
         load(path, f"devices.camera.{option}")
     load(path, f"devices.camera.{option}", "scan.mode=step")
 

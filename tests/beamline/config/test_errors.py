@@ -1,4 +1,4 @@
-"""Faults of a configuration say file, line, key, what was found and what is legal."""
+"""Errors in a configuration name the file, line, key, the value found and the legal values."""
 
 from pathlib import Path
 
@@ -58,8 +58,8 @@ FAULTS = {
     "truth": (("views: 12", "views: yes"), "my.yaml:3: scan.angles: views is true (YAML reads yes, no, on and off"),
     "a path of Windows in double quotes": (
         ("sample: {name: test}", 'sample: {name: test}\nstorage: {folder: "D:\\tomo\\new"}'),
-        "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t': within double quotes a "
-        "backslash begins one; write the text without quotes, or within single ones",
+        "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t'. In double quotes a "
+        "backslash starts such a character; write the text without quotes, or in single quotes",
     ),
     "a line end in a port": (
         ('port: "sim://pm16c"', 'port: "COM3\\n"'),
@@ -110,8 +110,8 @@ FAULTS = {
     ),
     "a stage without a simulated controller": (
         ('kind: pm16c, port: "sim://pm16c"', 'kind: zaber, port: "sim://zaber"'),
-        "my.yaml:7: devices.stage: a zaber stage has no simulated controller, so sim://zaber is none of its ports; "
-        "simulate a stage with kind: pi_gcs, port: sim://pi_gcs, or set its real port and rehearse with --rehearse",
+        "my.yaml:7: devices.stage: a zaber stage has no simulated controller, so sim://zaber is not a valid port. "
+        "Simulate a stage with kind: pi_gcs, port: sim://pi_gcs, or set the real port and rehearse with --rehearse",
     ),
     "an output that the PM16C has not": (
         ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),
@@ -128,7 +128,7 @@ FAULTS = {
     ),
     "no page": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: ring, pattern: (.)}\n  shutter:"),
-        "my.yaml:9: devices.beam_monitor.url: 'ring' is not the address of a page: http://host/...",
+        "my.yaml:9: devices.beam_monitor.url: 'ring' is not the address of a page; expected http://host/...",
     ),
     "no simulation": (("simulation: {}\n", ""), "simulated devices need a simulation section"),
     "twice": (

@@ -1,4 +1,4 @@
-"""Configuration: precedence, defaults, round trip, its plan, and its scenes."""
+"""Configuration: precedence, defaults, round trip, the plan made from it, and its scenes."""
 
 import json
 import math
@@ -68,7 +68,7 @@ def test_names_of_keys_in_the_last_version_are_understood_with_their_places(tmp_
         (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs passes"),
         (("scan.mode=step", PASSES), "needs passes"),
         ((PASSES, "recon.live=false"), "scan.decide ask needs a live volume; set recon.live to true"),
-        ((PASSES, "recon.method=fbp"), "needs a volume that grows with the views; set recon.method to r2"),
+        ((PASSES, "recon.method=fbp"), "needs a volume that grows during the scan; set recon.method to r2"),
         ((PASSES, "recon.method=auto"), "set recon.method to r2"),
     ],
 )
@@ -77,7 +77,7 @@ def test_a_scan_cannot_decide_without_what_a_prediction_needs(
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         load(write(tmp_path), "scan.decide=ask", *words)
-    assert sentence in str(caught.value) and "off takes the plan as it is" in str(caught.value)
+    assert sentence in str(caught.value) and "with off the scan follows its plan" in str(caught.value)
 
 
 def test_a_step_scan_decides_with_passes_of_some_views(tmp_path: Path) -> None:

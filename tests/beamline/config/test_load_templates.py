@@ -1,4 +1,4 @@
-"""The shipped templates: every key there is stands in them, and every alternative in a comment is one."""
+"""The shipped templates contain every key, and every alternative in a comment is legal."""
 
 import re
 from dataclasses import asdict

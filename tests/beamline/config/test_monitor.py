@@ -1,4 +1,4 @@
-"""Section monitor: every limit of every check is a key with a type, a range and a default, and nothing else is."""
+"""Section monitor: every limit of every check is a key with type, range and default, and there are no other keys."""
 
 import pytest
 

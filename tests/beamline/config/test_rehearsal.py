@@ -1,4 +1,4 @@
-"""A real configuration runs as it is with simulated devices, whatever its devices are; faults name their line."""
+"""A real configuration also runs with simulated devices, for all kinds of devices; errors name their line."""
 
 from dataclasses import astuple
 from pathlib import Path
@@ -145,5 +145,5 @@ def test_keys_of_a_real_camera_are_one_fault_that_names_the_way(tmp_path: Path) 
     with pytest.raises(ConfigError) as refused:
         load(path, environment={})
     said = str(refused.value)
-    assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: library, index, link, ")
-    assert "are no keys of this kind" in said and "--rehearse" in said and "\n" not in said
+    assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: remove library, index, link, ")
+    assert "because this kind does not have these keys" in said and "--rehearse" in said and "\n" not in said

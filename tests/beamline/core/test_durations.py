@@ -1,4 +1,4 @@
-"""The rest of a work takes as long as so far."""
+"""Remaining time: the rest of a work takes as long per step as the work so far."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Errors of ours come whole from a worker process: one that cannot be made anew there would hang its pool."""
+"""Our errors can be pickled, because an error that cannot be restored would hang a worker pool."""
 
 import copy
 import pickle

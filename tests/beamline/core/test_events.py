@@ -1,4 +1,4 @@
-"""Every sink hears everything in order, and one that breaks or dawdles is nobody else's trouble."""
+"""Every sink receives all events in order; a sink that fails or is slow does not affect the others."""
 
 import threading
 

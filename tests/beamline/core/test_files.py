@@ -1,4 +1,4 @@
-"""Only regular files of a sane size are read as text."""
+"""Only regular files of a reasonable size are read as text."""
 
 import os
 from pathlib import Path

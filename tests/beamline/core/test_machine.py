@@ -1,4 +1,4 @@
-"""This machine: a line that is short and true; memory in bytes, within a container's limit, and a peak that stays."""
+"""Description of this machine: one short line; memory in bytes, within a container's limit; peak memory."""
 
 import json
 import sys

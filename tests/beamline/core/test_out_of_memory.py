@@ -1,4 +1,4 @@
-"""Memory that ran out is no defect of the program."""
+"""Running out of memory is not reported as a defect of the program."""
 
 import errno
 

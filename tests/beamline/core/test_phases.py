@@ -1,4 +1,4 @@
-"""Phases: their seconds add up to the time since the start, whatever was done."""
+"""Phases: their durations always add up to the time since the start."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
+"""A child process: its lines arrive in order, and it has ended when it should have, whatever happens to it."""
 
 import os
 import subprocess
@@ -154,7 +154,11 @@ time.sleep(100)
 
 @pytest.mark.parametrize(
     ("program", "code", "said"),
-    [(ENDS_AT_ONCE, 1, b""), (ASKS, 1, b"KeyboardInterrupt: the process that started"), (NEVER_ASKS, 130, b"")],
+    [
+        (ENDS_AT_ONCE, 1, b""),
+        (ASKS, 1, b"KeyboardInterrupt: this process ends, because the process that started it has died"),
+        (NEVER_ASKS, 130, b""),
+    ],
 )
 def test_a_process_with_a_tether_ends_when_whoever_wanted_its_result_is_gone(
     program: str, code: int, said: bytes

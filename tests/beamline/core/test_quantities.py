@@ -1,4 +1,4 @@
-"""A value of a mistaken unit is told of with what may be meant, by check and recon; those of instruments are not."""
+"""A value in a wrong unit is reported with a suggestion; values of real instruments are not reported."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Files in the working folder with names of our modules, or of Python's own, are no part of any process we start."""
+"""Files in the working folder with names of our or Python's modules are not imported by any of our processes."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Narration: a finding of several frames is told once, with its number of frames; all else as it comes."""
+"""Output lines: a finding about several frames is printed once with their number; other events as they come."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON of this program is JSON for every reader: no NaN and no Infinity, which only Python's own reader takes."""
+"""Our JSON can be read by every JSON reader: it contains no NaN and no Infinity, which only Python reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-Z suspends no scan: the stage would go on turning in front of an open shutter."""
+"""Ctrl-Z does not suspend a scan, because the stage would continue to turn with an open shutter."""
 
 import os
 import signal
@@ -15,4 +15,4 @@ def test_ctrl_z_neither_suspends_nor_stops(capfd: pytest.CaptureFixture[str]) ->
     with stop_signals(stop):
         os.kill(os.getpid(), signal.SIGTSTP)
     assert not stop.stopping
-    assert "`beamline pause` pauses it" in capfd.readouterr().err
+    assert "Use `beamline pause` to pause the scan" in capfd.readouterr().err

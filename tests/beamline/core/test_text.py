@@ -1,4 +1,4 @@
-"""Text of files is shown, and does nothing to a terminal; an advised number has three digits and keeps its side."""
+"""Text from files cannot control a terminal; a suggested number has three digits and stays on its side of a limit."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Whole files: what the disk refuses, or gives back otherwise, leaves nothing, and the older file untouched."""
+"""Files are written completely or not at all: if the disk fails, an older file stays unchanged."""
 
 import errno
 import subprocess

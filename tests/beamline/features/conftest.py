@@ -1,4 +1,4 @@
-"""Commands of features are tested as the core's are."""
+"""Commands of features are tested in the same way as those of the core."""
 
 from tests.beamline.cli.conftest import folder, no_debug, terminal
 

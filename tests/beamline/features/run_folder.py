@@ -1,4 +1,4 @@
-"""A folder of a run with a small scan, for what watches runs."""
+"""A run folder with a small scan, for tests of programs that watch runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAILED = (
 
 
 def write_run(run: Path, *events: dict[str, Any]) -> Path:
-    """49 of its frames, and these events."""
+    """Write 49 frames of the run, and these events."""
     run.mkdir(exist_ok=True)
     write_flagged(run / "scan.h5", frames_of(TwoCylinders()), {})
     lines = "".join(f"{json.dumps(event)}\n" for event in events)
@@ -34,7 +34,7 @@ def write_run(run: Path, *events: dict[str, Any]) -> Path:
 
 @contextmanager
 def asking(run: Path) -> Iterator[list[str]]:
-    """A run whose scan asks what is next, until it is answered; the answers so far."""
+    """A run whose scan asks what to do next until it is answered; yields the answers so far."""
     answers: list[str] = []
     (run / CONFIG).touch()
     with closing(RecordFile(run, RunRecord("asking"))) as record:

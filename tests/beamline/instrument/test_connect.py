@@ -1,4 +1,4 @@
-"""Composition root: a configuration becomes devices whose figures are those predicted; what cannot be is refused."""
+"""Connecting: a configuration becomes devices whose figures match the prediction; impossible ones raise an error."""
 
 import dataclasses
 import itertools
@@ -60,11 +60,11 @@ def test_close_frees_everything_twice() -> None:
 def test_settings_that_a_device_would_refuse() -> None:
     for change, message in (
         ("devices.camera.roi=[0, 0, 30, 40]", "devices.camera: roi .* must be in steps of 4"),
-        ("scan.exposure_s=1e-7", "devices.camera: exposure 1e-07 s lies outside"),
+        ("scan.exposure_s=1e-7", "devices.camera: exposure 1e-07 s is outside"),
         ("devices.stage.acceleration_deg_s2=0.001", "devices.stage: .*least acceleration"),
         ("devices.stage.max_speed_deg_s=5001", r"devices.stage: 5001 deg/s are 5001000 pulses/s, .* 1 to 5000000"),
         ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
-        ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; it has"),
+        ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; legal:"),
         (f"devices.stage={STAGES['zaber'].replace('60,', '1e-9,')}", "devices.stage: 30 deg/s and 1e-09 deg/s² are"),
         (f"devices.stage={STAGES['pi_gcs'].replace('60,', '1e-9,')}", "devices.stage: .* must be "),
     ):
@@ -146,7 +146,7 @@ def test_every_camera_option_reaches_the_driver(
     changes = [f"devices.camera.{key}={value}" for key, value in said.items()]
     instrument = devices.connect(shipped("instrument", "scan.mode=step", *changes))
     instrument.close()
-    assert "-19.5 °C, its cooler says busy" in capsys.readouterr().err
+    assert "-19.5 °C; its cooler reports busy" in capsys.readouterr().err
     (camera,) = made
     assert camera.library == Path("/opt/libdcamapi.so")
     assert camera.memory is instrument.frame_memory is not None

@@ -1,4 +1,4 @@
-"""Ask: a request is put to stderr and waits for Enter; where nobody sits, it says so."""
+"""Ask: a request appears on stderr and waits for Enter; if nobody is at the terminal, it says so."""
 
 import io
 import sys
@@ -11,7 +11,7 @@ from drivers.base.errors import DeviceError
 
 def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
-    with pytest.raises(DeviceError, match="to ask at"):
+    with pytest.raises(DeviceError, match="to ask the operator"):
         ask_operator("Open the beam shutter.")
 
     class Terminal(io.StringIO):

@@ -1,4 +1,4 @@
-"""Simulated devices scan as real ones do: from the trigger to the right angle, with beam, on the clock asked for."""
+"""Simulated devices scan like real ones: trigger, right angle, beam, and the requested clock."""
 
 import math
 
@@ -71,7 +71,7 @@ def test_a_simulated_camera_that_takes_the_other_edge_is_refused_with_the_one_it
     """It would expose at every pulse's end; a real cable may have an inverter, so a real camera may."""
     falling = "falling" in stage
     other, needed = ("positive", "negative") if falling else ("negative", "positive")
-    with pytest.raises(ConfigError, match=f"active_high {str(not falling).lower()} .* set trigger_polarity {needed}"):
+    with pytest.raises(ConfigError, match=f"active_high {str(not falling).lower()} .* Set trigger_polarity {needed}"):
         small(f"devices.stage={STAGES[stage]}", f"devices.camera.trigger_polarity={other}")
     real = shipped("instrument", "devices.camera.trigger_polarity=negative")
     assert real.devices.stage.settings.active_high

@@ -1,4 +1,4 @@
-"""What a simulator knows of its scene reaches the run: labels beside the file, a cone in it, or a refusal."""
+"""Values of a simulated scene reach the run: labels next to the file, a cone geometry in it, or an error."""
 
 from pathlib import Path
 
@@ -123,9 +123,9 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ((), r"optics.axis_col: .* set it, here 21\. Nothing was started"),
-        (("devices.camera.binning=2",), r"set it, here 10\.25\. Nothing"),
-        (("devices.camera.roi=[1100, 2028, 32, 40]",), r"32 of them begin at 1136 then, not at 1100\. Nothing"),
+        ((), r"set optics.axis_col, here to 21: .*Nothing was started"),
+        (("devices.camera.binning=2",), r"set optics.axis_col, here to 10\.25: .*Nothing"),
+        (("devices.camera.roi=[1100, 2028, 32, 40]",), r"32 rows must then begin at 1136, not at 1100\. Nothing"),
     ],
 )
 def test_a_cone_that_its_file_could_not_tell_is_refused(tmp_path: Path, overrides: tuple[str, ...], words: str) -> None:

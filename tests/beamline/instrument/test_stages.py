@@ -1,4 +1,4 @@
-"""A stage from its configuration: its limits, its transcript, and the outputs that it has for a shutter."""
+"""A stage from its configuration: its limits, its transcript, and its outputs for a shutter."""
 
 import math
 from contextlib import nullcontext

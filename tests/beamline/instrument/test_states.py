@@ -1,4 +1,4 @@
-"""`beamline check --connect`: each device is asked, one that does not answer keeps no other from it, nothing moves."""
+"""`beamline check --connect` asks each device; one that does not answer does not block the others; nothing moves."""
 
 from __future__ import annotations
 

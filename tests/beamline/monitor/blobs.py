@@ -1,4 +1,4 @@
-"""A turning sample of Gaussian blobs, as previews of 32 x 128 blocks: fast enough for scans of hundreds of views."""
+"""A rotating sample of Gaussian blobs, as previews of 32 x 128 blocks: fast enough for hundreds of projections."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,7 +17,7 @@ OPEN, DARK, NOISE = 20_000.0, 100.0, 0.004  # counts, counts, relative noise of 
 STEP = np.radians(0.2)
 
 Change = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
-"""Line integrals, or counts, of view i, changed."""
+"""Function that changes the line integrals, or the counts, of projection i."""
 
 
 def unchanged(view: int, image: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -25,8 +25,9 @@ def unchanged(view: int, image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Blobs:
-    """A scan of `views`; `depth` changes line integrals and `counts` the counts. Rows of the file begin with 5 darks
-    and 5 flats: view i is row 10 + i.
+    """A scan of `views` projections; `depth` changes line integrals, `counts` changes counts.
+
+    The file begins with 5 darks and 5 flats, so projection i is row 10 + i.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class Blobs:
         self.depths = self.rng.uniform(0.05, 0.3, blobs)
 
     def line_integrals(self, view: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
-        """[row, col] with the sample shifted by (down, across) blocks; a view need not be whole."""
+        """[row, col] with the sample shifted by (down, across) blocks; `view` need not be an integer."""
         radius, phase = self.at
         cols = (COLS - 1) / 2 + radius * np.cos(view * self.step + phase) + shift[1]
         down = np.exp(-0.5 * ((np.arange(ROWS)[:, None] - self.rows - shift[0]) / self.sizes) ** 2)
@@ -67,7 +68,7 @@ class Blobs:
         return frame, FrameDigest(0.0, 65535.0, mean, 1.0, mean, 0.0, 0.0, 1.0, row, preview, preview)
 
     def flags(self, checks: Sequence[Check] = CHECKS, **known: Any) -> list[Flag]:
-        """`known`: what else the checks know of the scan, see ScanContext."""
+        """The flags of the checks. `known`: further values of the scan for the checks, see ScanContext."""
         monitor = watch.start(ScanContext(65535, ROWS * COLS * BLOCK**2, 0.1, **known), checks)
         found: list[Flag] = []
         for frame, digest in self.frames():

@@ -1,4 +1,4 @@
-"""Frames for the monitor's tests: discs in closed form, photon noise, offset; and faults put in by hand."""
+"""Frames for the monitor's tests: analytic discs, photon noise, offset, and faults put in by hand."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ STEP = np.pi / 180
 
 
 class FakeScan:
-    """Makes frames one after the other, in file order; noise is seeded."""
+    """Makes frames one after another in file order, with seeded noise."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(5)
@@ -32,7 +32,7 @@ class FakeScan:
         self.time = 1000.0
 
     def expected(self, angle: float | None, discs: Iterable[tuple[float, ...]] = DISCS) -> NDArray[np.float64]:
-        """Detected photons [row, col] with the sample at `angle`; None: without sample."""
+        """Expected photons [row, col] with the sample at `angle`; None: without sample."""
         depth = np.zeros(COLS)
         if angle is not None:
             for x, y, radius, attenuation in discs:
@@ -76,7 +76,7 @@ class FakeScan:
     def again(
         self, views: Iterable[int], first: int, light: float = 1.0, discs: Iterable[tuple[float, ...]] = DISCS
     ) -> list[Frame]:
-        """Views that are taken again after the last one; view 0 is row `first`."""
+        """Projections that are repeated after the last one; projection 0 is row `first`."""
         discs = tuple(discs)
         taken = [self.frame(FrameKind.PROJECTION, light * self.expected(i * STEP, discs), i * STEP) for i in views]
         return [replace(frame, replaces=first + i) for frame, i in zip(taken, views, strict=True)]
@@ -92,7 +92,7 @@ class FakeScan:
         stored: frozenset[int] = frozenset(),
         step: float = np.nan,
     ) -> list[Flag]:
-        """All flags of a fresh monitor that sees `frames`."""
+        """All flags of a new monitor for `frames`."""
         context = ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period, step=step, stored=stored)
         state = scan.start(context, checks)
         flags: list[Flag] = []
@@ -102,7 +102,7 @@ class FakeScan:
         return flags
 
     def of(self, check: str, frames: Iterable[Frame], **options: Any) -> list[Flag]:
-        """Those of one check."""
+        """The flags of one check."""
         return [flag for flag in self.flags(frames, **options) if flag.check == check]
 
 

@@ -1,4 +1,4 @@
-"""The light is compared with the flats where there is air, and with the views before; a drift is said once."""
+"""Intensity in air is compared with the flats and with earlier projections; a drift is reported once."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -30,7 +30,7 @@ def test_a_drift_against_the_flats_is_said_when_it_reaches_the_limit_and_twice_t
     assert abs(flags[1].score) > 2 * abs(flags[0].score)
     assert flags[0].frame - 10 == pytest.approx(0.02 / abs(rate), abs=10)
     assert flags[0].score == pytest.approx(-rate * (flags[0].frame - 10), abs=0.003)
-    assert f"{'less' if rate < 0 else 'more'} light than in the flats" in flags[0].advice
+    assert f"{'darker' if rate < 0 else 'brighter'} than in the flats" in flags[0].advice
 
 
 def test_a_drift_that_went_and_comes_again_is_said_again() -> None:
@@ -53,7 +53,7 @@ def test_a_dip_that_stays_becomes_normal() -> None:
 def test_a_sample_that_covers_all_is_said_once_and_dips_are_still_seen() -> None:
     flags = drifting(lambda view: 1.0 if view < 60 else 0.8, 70, depth=lambda view, image: image + 0.5)
     assert [(f.level, f.frame - 10) for f in flags] == [(Level.INFO, 0)] + [(Level.ALARM, i) for i in range(60, 70)]
-    assert "covers all of it" in flags[0].advice
+    assert "covers the whole frame" in flags[0].advice
 
 
 def test_a_sample_that_covers_the_edges_does_not_hide_air_above_it() -> None:

@@ -1,4 +1,4 @@
-"""A view differs from those before by its gain, its shift or its turn, and the fit tells them apart."""
+"""A projection may differ from earlier ones by gain, shift or rotation, and the fit distinguishes them."""
 
 from typing import Any
 

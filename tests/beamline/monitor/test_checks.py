@@ -1,4 +1,4 @@
-"""The registry of checks: bits that never move, limits that are values, and a check that needs only its line."""
+"""The registry of checks: bits never change, limits are values, and a new check needs only its line."""
 
 from pathlib import Path
 from typing import Any

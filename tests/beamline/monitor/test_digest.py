@@ -1,4 +1,4 @@
-"""Digest against numpy and scipy, which know nothing of it."""
+"""Digest (statistics of a frame) compared with numpy and scipy."""
 
 import zlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""Every fault of the scene early_acquisition is found by its own check, and no check cries for the rest of the scan."""
+"""Every fault of the scene early_acquisition is found by its own check; no check reports anything else."""
 
 import pytest
 import yaml

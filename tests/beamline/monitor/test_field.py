@@ -1,4 +1,4 @@
-"""The field: places and pixels without light, a sample that goes on beyond it, and what enters or leaves it."""
+"""Field of view: pixels without beam, a sample wider than the field, and what enters or leaves it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -51,9 +51,9 @@ def test_a_sample_beyond_the_field_is_a_fact_about_the_scan(first: int, sides: s
     (flag,) = of_field(Blobs(30, depth=lambda view, image: image + wide))
     assert flag.level is Level.INFO and flag.score == pytest.approx(0.4, abs=0.1) and sides in flag.advice
     assert flag.region is not None and abs(flag.region[2] - first * BLOCK) < 8 * BLOCK
-    assert "beside the rotation axis" not in flag.advice
+    assert "off the rotation axis" not in flag.advice
     (flag,) = of_field(Blobs(30, depth=lambda view, image: image + wide * (view > 12)))
-    assert "beside the rotation axis" in flag.advice and sides in flag.advice
+    assert "off the rotation axis" in flag.advice and sides in flag.advice
 
 
 def of_pixels(fake: Any, frames: list[Frame]) -> list[Flag]:
@@ -73,7 +73,7 @@ def test_a_few_dead_pixels_are_a_fact_that_is_said_once_with_their_places(fake: 
     (flag,) = of_pixels(fake, with_dead_pixels(fake, [(0, 0), (33, 95)], flats))
     assert (flag.level, flag.frame, flag.region) == (Level.INFO, 5 + flats, (0, 34, 0, 96))
     assert flag.score == pytest.approx(2 / (64 * 96))
-    assert "some: 2, at (row, column) (0, 0), (33, 95)." in flag.advice
+    assert "Dead pixels: 2, at (row, column) (0, 0), (33, 95)." in flag.advice
 
 
 def test_many_are_a_warning(fake: Any) -> None:

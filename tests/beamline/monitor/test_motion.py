@@ -1,4 +1,4 @@
-"""A jump is flagged in the view in which it happens, a shake by its size across and down; nothing else is either."""
+"""A jump is flagged in its projection, a shake with its horizontal and vertical size; nothing else is flagged."""
 
 import re
 
@@ -29,7 +29,7 @@ def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> Non
     flags = of_motion(jumping(down, across))
     assert [(flag.frame, flag.level) for flag in flags] == [(50, Level.ALARM)]
     assert flags[0].score == pytest.approx(np.hypot(down, across), rel=0.15)
-    signs = re.search(r"by ([+-]).* px across and ([+-]).* px down", flags[0].advice)
+    signs = re.search(r"by ([+-]).* px horizontally and ([+-]).* px vertically", flags[0].advice)
     assert signs is not None
     for sign, moved in zip(signs.groups(), (across, down), strict=True):
         assert moved == 0 or (moved > 0) is (sign == "+")
@@ -39,7 +39,7 @@ def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
     flags = of_motion(jumping(0, 0, slip=5))
     assert [flag.frame for flag in flags] == [50]
     assert flags[0].score == pytest.approx(5, abs=0.7)
-    assert "steps more than its step" in flags[0].advice
+    assert "steps more than one step" in flags[0].advice
 
 
 def test_vibration_raises_the_limit() -> None:
@@ -68,7 +68,10 @@ def shaking(
 def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, down: float, seed: int) -> None:
     flags = [flag for flag in shaking(across, down, seed=seed) if flag.level is not Level.INFO]
     assert [(flag.check, flag.level) for flag in flags] == [("motion", Level.WARN)]
-    told = [float(size) for size in re.findall(r"stand ([\d.]+) px across and ([\d.]+) px down", flags[0].advice)[0]]
+    told = [
+        float(size)
+        for size in re.findall(r"shakes by ([\d.]+) px horizontally and ([\d.]+) px vertically", flags[0].advice)[0]
+    ]
     assert told == pytest.approx([across, down], rel=0.35)
     assert "`beamline recon --calibrate shifts`" in flags[0].advice
 

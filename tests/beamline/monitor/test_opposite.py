@@ -1,4 +1,4 @@
-"""Views from the other side, and views taken again, tell the axis, shifts and changes of the sample."""
+"""Opposite and repeated projections reveal the axis, shifts and changes of the sample."""
 
 from collections.abc import Callable
 
@@ -56,7 +56,7 @@ def test_a_sample_that_sank_is_flagged_by_its_view_from_the_other_side() -> None
     assert [flag.frame for flag in flags] == [100, 103]  # 5 degrees are between the views that are kept
     assert all(flag.level is Level.WARN for flag in flags)
     assert [flag.score for flag in flags] == pytest.approx([1.2, 1.2], abs=0.15)
-    assert "px down" in flags[0].advice
+    assert "px vertically" in flags[0].advice
 
 
 def test_a_shift_across_shows_between_two_pairs() -> None:
@@ -74,7 +74,7 @@ def test_a_sample_that_shrank_is_flagged() -> None:
 def test_a_view_taken_again_shows_a_shift() -> None:
     scan = Moved(190, lambda view: (0, 1.5 * (view > 150)))
     flags = [flag for flag in only(scan) if flag.frame >= 190]
-    assert flags and "taken again" in flags[0].advice and flags[0].frame == 10 + 180
+    assert flags and "at the same angle" in flags[0].advice and flags[0].frame == 10 + 180
     assert flags[0].score == pytest.approx(1.5, abs=0.2)
 
 

@@ -1,4 +1,4 @@
-"""Groups of darks and flats with one fault each: the fault is found with its figure, and good groups have none."""
+"""Groups of darks and flats with one fault each: the fault is found with its value; good groups have none."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -98,10 +98,10 @@ def slit(images: Images) -> Images:
     ("spoil", "what", "said"),
     [
         (saturated, "saturated", "of their pixels are saturated (limit 0.10%)"),
-        (dimmed, "no_beam", "there is no beam in them"),
+        (dimmed, "no_beam", "they show no beam"),
         (flickering, "uneven", "differs by 22% from flat to flat (limit 10%)"),
         (crossed, "uneven", "something was in the beam"),
-        (slit, "mostly_unlit", "62% of the frame has no light"),
+        (slit, "mostly_unlit", "62% of the frame gets no beam"),
     ],
 )
 def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], Images], what: str, said: str) -> None:
@@ -117,7 +117,7 @@ def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], 
 def test_darks_with_light_are_told_from_darks_with_an_offset(share: float) -> None:
     """Light brings its noise: 25 photons on an offset of 100 counts are no lit darks, a leaking shutter is."""
     (fault,) = found(darks(share * PHOTONS), flats(frames(5, PHOTONS, 2)))
-    assert fault.rule == "light_in_darks" and "there is light in them" in fault.message
+    assert fault.rule == "light_in_darks" and "they were exposed to the beam" in fault.message
     assert rules(darks(), flats(frames(5, 25.0, 2))) == []
 
 
@@ -133,7 +133,7 @@ def test_clean_darks_of_a_scan_of_few_photons_are_not_lit() -> None:
 
 def test_darks_and_flats_with_the_same_light_are_the_flats_fault() -> None:
     (fault,) = found(darks(PHOTONS), flats(frames(5, PHOTONS, 2)))
-    assert fault.rule == "no_beam" and "open for them, and closed for the darks" in fault.message
+    assert fault.rule == "no_beam" and "open for the flats, and closed for the darks" in fault.message
 
 
 def test_a_group_that_lost_the_beam_is_judged_by_the_others() -> None:

@@ -1,4 +1,4 @@
-"""Frames whose neighbour in the file is none in angle: no check compares them with it, and true alarms stay."""
+"""Frames whose neighbour in the file is not their neighbour in angle: no check compares them, true alarms stay."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""What checks could not look at is said, with the number of views; a whole scan of even steps has nothing of it."""
+"""Projections that checks could not examine are reported with their number; a complete scan has none."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -34,5 +34,7 @@ def test_each_reason_is_named_with_its_views(fake: Any) -> None:
 def test_views_at_uneven_angles_and_too_few_of_them_were_not_compared(fake: Any) -> None:
     jumps = [frame for at in (0, 50, 7, 91, 23, 60, 3) for frame in fake.views(1, first=at)]
     (text,) = said(fake.references() + jumps)
-    assert text.startswith("gain, motion, floater, ghost, dips of beam in 7 of 7 views (no four views")
+    assert text.startswith(
+        "gain, motion, floater, ghost, dips of beam in 7 of 7 projections (no four earlier projections"
+    )
     assert "in 1 of 1 views" in said(fake.references() + fake.views(1))[0]

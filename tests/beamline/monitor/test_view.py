@@ -1,4 +1,4 @@
-"""A view is the frame's line integrals on a grid of cells, and knows where there is light."""
+"""A view is the line integrals of a frame on a grid of cells, and knows which cells have beam."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The checks together: silent on clean scans, several flags on one frame, means of the latest references."""
+"""All checks together: no flags on clean scans, several flags on one frame, means of the latest flats and darks."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

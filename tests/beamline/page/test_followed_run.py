@@ -1,4 +1,4 @@
-"""Values of a run: what its log says, event by event."""
+"""Values of a run are derived from its log, event by event."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_what_can_be_measured_next_stands_in_lists_until_it_is_chosen() -> None:
 
 def test_a_choice_is_one_of_the_options() -> None:
     assert choice_of(_after(STARTED, ASKED), "enough") is Choice.ENOUGH
-    with pytest.raises(ConfigError, match="'offset' cannot be chosen now; on offer: next, enough"):
+    with pytest.raises(ConfigError, match="'offset' cannot be chosen now; possible: next, enough"):
         choice_of(_after(STARTED, ASKED), "offset")
     with pytest.raises(ConfigError, match="no pass has ended yet"):
         choice_of(_after(STARTED), "next")

@@ -1,4 +1,4 @@
-"""What the page reads of a scan file is what stands in it, also while it grows."""
+"""The page reads what is in a scan file, also while the file grows."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What is measured next: the best gain a second until the target is met, and never beyond a target."""
+"""Choice of the next measurement: the best gain per second until the target is met, and no further."""
 
 import math
 from dataclasses import replace
@@ -86,8 +86,15 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
         ([NEXT], ScanTarget(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; the target allows 100 s"),
         ([NEXT], ScanTarget(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
         ([NEXT], ScanTarget(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; the target allows 50 %"),
-        ([NEXT], ScanTarget(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "less is accepted"),  # whichever is met first
-        ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice is clearly better"),
+        ([NEXT], ScanTarget(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "is accepted"),  # whichever is met first
+        (
+            [NEXT, option(Choice.AGAIN, 1.1)],
+            QUALITY,
+            NOTHING,
+            9,
+            Choice.NEXT,
+            "no other choice is significantly better",
+        ),
         ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
         ([NEXT, option(Choice.AGAIN, 1.3)], QUALITY, NOTHING, 9, Choice.AGAIN, "1.30 dB"),
         ([NEXT, option(Choice.AGAIN, 1.3, off=0.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
@@ -95,7 +102,7 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
         ([NEXT, option(Choice.RETAKE, 0.1, 0.5)], QUALITY, NOTHING, 9, Choice.RETAKE, "0.10 dB"),
         # The next pass takes too long, a few retakes do not.
         ([NEXT, option(Choice.RETAKE, 0.01, 1)], ScanTarget(seconds=5), NOTHING, 9, Choice.RETAKE, "0.01 dB"),
-        ([option(Choice.OFFSET, 0.0)], ScanTarget(seconds=99), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+        ([option(Choice.OFFSET, 0.0)], ScanTarget(seconds=99), NOTHING, 0, Choice.ENOUGH, "no choice would improve"),
         (
             [option(Choice.NEXT, 0.0), option(Choice.OFFSET, 1.0)],
             ScanTarget(dose=1),
@@ -112,7 +119,7 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
             Choice.OFFSET,
             "1.00 dB",
         ),  # they come anyway
-        ([], ScanTarget(dose=1), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+        ([], ScanTarget(dose=1), NOTHING, 0, Choice.ENOUGH, "no choice would improve"),
     ],
 )
 def test_the_choice_and_its_reason(

@@ -1,4 +1,4 @@
-"""Trigger trains: every view gets its pulse, at a whole count, whatever the plan and the stage's direction."""
+"""Trigger trains: every projection gets its pulse at a whole count, for any plan and direction of the stage."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A scan of three balls in a beam with photon noise, whose frames can be replaced; and what a volume of it is worth."""
+"""A scan of three balls with photon noise whose frames can be replaced, and the quality of its volume."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.beamline.prepared_views import prepare
 
 SHAPE, VIEWS, AXIS = (12, 48), 45, 23.5
 DARK, BEAM, READOUT = 100.0, 30_000.0, 2.0  # counts
-# x, y, z, radius in pixels, and attenuation per pixel; the others lie in the first and add to it.
+# x, y, z, radius in pixels, and attenuation per pixel; the other balls are inside the first and add to it.
 BALLS = ((2.0, 1.0, 0.0, 14.0, 0.02), (8.0, 3.0, 0.0, 4.0, 0.04), (-4.0, -5.0, 1.0, 4.0, 0.03))
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
 
@@ -23,7 +23,7 @@ Frames = NDArray[np.float64]
 
 
 def line_integrals(scale: float = 1.0) -> Frames:
-    """[view, row, col], through the middles of the pixels."""
+    """[view, row, col], for rays through the centres of the pixels."""
     u, v = np.arange(SHAPE[1]) - AXIS, (np.arange(SHAPE[0]) - (SHAPE[0] - 1) / 2)[:, None]
     total = np.zeros((VIEWS, *SHAPE))
     for x, y, z, radius, mu in BALLS:
@@ -33,7 +33,7 @@ def line_integrals(scale: float = 1.0) -> Frames:
 
 
 def truth(scale: float = 1.0) -> Frames:
-    """Attenuation [z, y, x] per pixel, means of voxels."""
+    """Attenuation [z, y, x] per pixel, averaged over voxels."""
     fine = [(np.arange(3 * n) + 0.5) / 3 - n / 2 for n in (SHAPE[0], SHAPE[1], SHAPE[1])]
     z, y, x = np.meshgrid(*fine, indexing="ij", sparse=True)
     total = sum(scale * mu * ((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 <= r * r) for a, b, c, r, mu in BALLS)
@@ -42,7 +42,7 @@ def truth(scale: float = 1.0) -> Frames:
 
 @dataclass
 class Blocks:
-    """Frames of a scan by groups, in the order of the file; `groups` of darks and flats, of `n` each."""
+    """The frames of a scan in groups, in file order; `groups` of darks and flats with `n` frames each."""
 
     groups: int = 2
     n: int = 3
@@ -60,12 +60,12 @@ class Blocks:
                 self.frames.append((FrameKind.PROJECTION, self.taken(parts[group])))
 
     def taken(self, lines: Frames, light: float = BEAM) -> Frames:
-        """Frames through these line integrals, each with noise of its own."""
+        """Frames for these line integrals, each with independent noise."""
         noise = self.rng.normal(DARK, READOUT, lines.shape)
         return np.asarray((self.rng.poisson(light * np.exp(-lines)) + noise).round())
 
     def of(self, kind: FrameKind) -> list[Frames]:
-        """Its groups of frames of this kind, which may be written to."""
+        """The groups of frames of this kind, which may be changed."""
         return [frames for own, frames in self.frames if own is kind]
 
     def source(self) -> ArraySource:
@@ -77,7 +77,7 @@ class Blocks:
 
 
 def decibels(source: ArraySource, scale: float = 1.0) -> tuple[float, list[str]]:
-    """Peak signal over error of FBP as a reconstruction makes it, and what was told."""
+    """PSNR of the FBP volume as a reconstruction makes it, and the messages."""
     found, told = prepare(source, Selection(axis_col=AXIS))
     right, made = truth(scale), fbp(found.projections.data, found.geometry, filter="hann")
     return float(20 * np.log10(right.max() / np.sqrt(np.mean((made - right) ** 2)))), told

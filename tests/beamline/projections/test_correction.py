@@ -1,4 +1,4 @@
-"""The correction of a scan reads what is asked for and the references, and gives the same in batches as at once."""
+"""The correction reads only the requested frames, flats and darks, with the same result in batches and at once."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
         assert bool(correction.plan.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "components of their changes" in correction.plan.done["flats"].sentence
+    assert "principal components of the flats" in correction.plan.done["flats"].sentence
     few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
         correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
@@ -135,11 +135,11 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     assert off[0] > 0.5 and off[1] < 0.01
     assert (
         correction.plan.done["flats"].sentence
-        == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+        == "The ring current of the projections varies from 0.857 to 1.143 times its median; this was corrected."
     )
     current[2] = np.nan
     source.state(currents=current)
-    with pytest.raises(ConfigError, match="views or flats"):
+    with pytest.raises(ConfigError, match="projections or flats"):
         correction_of(source, used)
 
 
@@ -180,7 +180,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     correction = correction_of(source, PLAIN)
     found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
-    assert correction.plan.done["flats"].sentence.startswith("Exposures of the views: 0.1")
+    assert correction.plan.done["flats"].sentence.startswith("Exposure times of the projections vary from 0.1")
     assert not list(references_usable(ScanEvidence(source)))
 
 

@@ -1,4 +1,4 @@
-"""What a scan reads well and yet is doubtful: an axis that its views contradict, and views that are copies."""
+"""Doubtful scans that can be read: the projections contradict the stated axis, or some are copies."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def told(selection: Selection, copies: tuple[int, ...] = ()) -> list[str]:
     for view in copies:
         views[view] = views[view - 1]
     _, sentences = prepare(scan_of(darks, flats, views, angles), selection)
-    return [sentence for sentence in sentences if "rotation axis" in sentence or "view before" in sentence]
+    return [sentence for sentence in sentences if "rotation axis" in sentence or "projection before" in sentence]
 
 
 def test_a_scan_that_is_as_stated_is_not_doubted() -> None:
@@ -38,5 +38,5 @@ def test_a_scan_that_is_as_stated_is_not_doubted() -> None:
 
 def test_copies_and_an_axis_that_the_views_contradict_are_named() -> None:
     axis, copied = told(Selection(axis_col=COLS - 1 - AXIS + 5), copies=(30, 31, 40))
-    assert "rotation axis in column 33." in axis and "column 35 was given" in axis
-    assert copied.startswith("3 views of 60 (frames 36-37, 46) with the pixels of the view before")
+    assert "rotation axis at column 33." in axis and "but 35 was given" in axis
+    assert "3 projections of 60 (frames 36-37, 46) are identical to the projection before" in copied

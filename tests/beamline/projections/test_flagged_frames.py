@@ -1,4 +1,4 @@
-"""The frames that a report shows: the worst of each kind, with place and reason; every flag's reason in words."""
+"""The frames in a report: the worst of each kind with position and reason; every flag has its reason in words."""
 
 from __future__ import annotations
 

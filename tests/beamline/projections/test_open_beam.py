@@ -1,4 +1,4 @@
-"""Photons of a scan file: their likelihood reaches every method as in Python, by itself where they are few."""
+"""Photon counts of a scan file: every method can use their likelihood; it is used automatically if they are few."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a file's frames to line integrals: the right numbers, the right geometry, only what was asked for."""
+"""From frames to line integrals: right values, right geometry, and nothing that was not requested."""
 
 from __future__ import annotations
 
@@ -150,7 +150,9 @@ def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None
     assert prepared.geometry.n_views == 43
     np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
     np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
-    assert any("2 of 45 views hold no finite pixel (first: frame 7)" in text for text in warnings)
+    assert any(
+        "2 of 45 projections have no finite pixel and are left out (first: frame 7)" in text for text in warnings
+    )
 
 
 def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
@@ -179,7 +181,7 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     source.axis_col = 20.5
     prepared, warnings = prepare(source, FOUND)
     assert prepared.axis_col == 20.5
-    assert any("the file's 20.50 is used" in text for text in warnings)
+    assert any("the file's column 20.50 is used" in text for text in warnings)
 
 
 def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,7 +223,7 @@ def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wal
     counts = scan.counts().astype(np.float32)
     counts[:, :, :12] = DARK + np.random.default_rng(0).normal(0, 3, counts[:, :, :12].shape)
     prepared, warnings = prepare(counted(counts, scan.angles, dtype=np.float32), FOUND)
-    assert "30.0% of the detector got no beam, or is saturated: its rays count as not measured." in warnings
+    assert "30.0% of the detector got no beam or is saturated. Its rays count as missing data." in warnings
     assert prepared.measured is not None and not prepared.measured[:, :12].any() and prepared.measured[:, 12:].all()
     assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)
     use = DataUse(prepared.ray_weights())

@@ -1,4 +1,4 @@
-"""Views held out: evenly spread, none where the selection left some out, and one set for the reconstructor."""
+"""Held-out projections: evenly spread; none if the selection leaves some out; one set for the reconstruction."""
 
 from __future__ import annotations
 

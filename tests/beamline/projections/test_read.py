@@ -1,4 +1,4 @@
-"""Pixels as they are read: in batches, in bins of what is finite, and reference frames by the views between them."""
+"""Reading pixels: in batches, in bins of finite values, and flats and darks between projections."""
 
 from __future__ import annotations
 

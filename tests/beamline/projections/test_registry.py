@@ -1,4 +1,4 @@
-"""Steps: their order, their options by their defaults, and what the file records of one that says nothing itself."""
+"""Correction steps: their order, their options by default, and the record of steps that state nothing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:
     steps: list[PrepStep] = [Preparation("ignore", noise="counts", gain=2.0), Rings("vo")]
-    done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
+    done = {"rings": StepDone("none was found", {"rings_removed": "none was found"}), "noise": StepDone("counted")}
     expected = {
         "flags": "ignore",
         "references": "check",
@@ -38,6 +38,6 @@ def test_the_file_records_what_a_step_says_or_its_options() -> None:
         "flat_fields": "groups",
         "ring_current": "ignore",
         "noise_said": "counted",
-        "rings_removed": "none seen",
+        "rings_removed": "none was found",
     }
     assert recorded(steps, done) == expected

@@ -1,4 +1,4 @@
-"""Darks and flats that are none are left out and named, or the scan is refused; none spoils a volume in silence."""
+"""Wrong darks and flats are left out and named, or the scan ends with an error; none spoils a volume silently."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
         blocks.of(DARK)[0][0] += share * BEAM
         found, (line,) = decibels(blocks.source())
         assert found > clean(1, n) - 0.1
-        assert line.startswith("The darks 0: there is light in them")
+        assert line.startswith("The darks 0: they were exposed to the beam")
 
 
 @pytest.mark.parametrize(("scale", "at"), others_slow([(1.0, 1), (0.05, 0), (3.0, 2)]))
@@ -95,7 +95,7 @@ def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine
     blocks.of(FLAT)[at][:] = _flats_through(blocks, what)
     found, (line,) = decibels(blocks.source())
     rows = (3, 5) if at == 0 else (6 + VIEWS + 3, 6 + VIEWS + 5)
-    assert line.startswith(f"The flats {rows[0]}-{rows[1]}: in places the views are brighter")
+    assert line.startswith(f"The flats {rows[0]}-{rows[1]}: the sample, or something else, was in the beam")
     assert found > clean(2, 3) - 0.5
 
 
@@ -103,12 +103,12 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """The views outshine them in places, and hold no more matter elsewhere."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match=r"flats 4-5: in places the views are brighter"):
+    with pytest.raises(DataError, match=r"flats 4-5: the sample was in the beam"):
         decibels(blocks.source())
 
 
 @pytest.mark.parametrize(
-    ("value", "said"), [(np.nan, "is not finite"), (65535.0, "are saturated"), (0.0, "the beam was lost")]
+    ("value", "said"), [(np.nan, "has no valid value"), (65535.0, "are saturated"), (0.0, "the beam was lost")]
 )
 def test_a_flat_without_counts_is_left_out(value: float, said: str) -> None:
     blocks = Blocks(1, 3)

@@ -1,4 +1,4 @@
-"""The monitor over a file says what it said while the scan ran, and judges files that no monitor has seen."""
+"""The monitor gives the same flags on a file as during the scan, and also checks files that it has not seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real scans: no alarm on clean ones, what is odd about them is said, and anomalies put into them are found."""
+"""Real scans: no alarm on clean ones, their peculiarities are reported, and inserted anomalies are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the monitor knows of a file before its first frame."""
+"""The values that the monitor has from a file before its first frame."""
 
 from __future__ import annotations
 

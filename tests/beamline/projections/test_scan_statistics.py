@@ -69,7 +69,8 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
         photons = (found[1].mean - found[0].mean) * 0.25
         light, dose = light_of(source, found, LightAsked(0.25, "water")).in_words()
     views = SCAN.angles.size
-    assert light == f"{photons:.4g} photons a pixel and view in the open beam, {photons * views:.4g} in {views} views"
+    each = f"{photons:.4g} photons per pixel and projection in the open beam"
+    assert light == f"{each}, {photons * views:.4g} in {views} projections"
     expected = absorbed_dose("water", 20.0, photons * views / 0.002**2)
     assert dose.startswith(f"{expected:.4g} Gy absorbed in water at 20 keV")
 
@@ -78,7 +79,7 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
     ("energy_kev", "material", "kinds", "said"),
     [
         (None, "water", (0, 1, 2), "does not state its energy"),
-        (20.0, "Xx", (0, 1, 2), "neither a material"),
+        (20.0, "Xx", (0, 1, 2), "not a known material"),
         (20.0, None, (0,), "no darks and flats"),
     ],
 )

@@ -1,4 +1,4 @@
-"""A selection: columns there and back through bins, and words, rows, bins and axes that do not fit a scan."""
+"""Selections: columns through binning and back; words, rows, bins and axes that do not fit a scan."""
 
 from __future__ import annotations
 
@@ -48,5 +48,5 @@ def test_the_central_ray_meets_the_row_that_is_given_whatever_rows_are_read() ->
     assert cone.of(source).geometry(2.5, np.arange(3.0)).axis_row == 9
     half = replace(cone, rows=(2, 8), binning=2)
     assert half.of(source).geometry(2.5, np.arange(3.0)).axis_row == (9 - 2 - 0.5) / 2
-    with pytest.raises(ConfigError, match="--central-row is for a cone beam; array is a parallel one"):
+    with pytest.raises(ConfigError, match="--central-row is for a cone beam, and array is a parallel-beam scan"):
         replace(cone, cone=None).of(source).geometry(2.5, np.arange(3.0))

@@ -159,7 +159,7 @@ SAME: dict[str, tuple[Instrument, tuple[Put, ...]]] = {
     "a cone without a sign": (CONE, (("instrument/source/distance", 1.2, "cm"),)),
     "a source far away": (PLAIN, (("instrument/source/distance", -52.0, "m"), (f"{DETECTOR}/distance", 30.0, "mm"))),
     "two turns more": (PLAIN, ((ANGLE, np.r_[0, 0, PLAIN.degrees + 720], "degree"),)),
-    "less whole turns": (PLAIN, ((ANGLE, np.r_[0, 0, (PLAIN.degrees + 300) % 360 - 300], "degree"),)),
+    "subtract whole turns": (PLAIN, ((ANGLE, np.r_[0, 0, (PLAIN.degrees + 300) % 360 - 300], "degree"),)),
     "backwards": (
         replace(PLAIN, store=lambda f: f[np.r_[0, 1, 73:1:-1]]),
         ((ANGLE, np.r_[0, 0, PLAIN.degrees[::-1]], "degree"),),
@@ -176,7 +176,7 @@ def test_a_field_that_is_used_gives_the_volume(tmp_path: Path, expected: float, 
 REFUSED: dict[str, tuple[Instrument, tuple[Put, ...], str]] = {
     "radians as degrees": (PLAIN, ((ANGLE, np.radians(np.r_[0, 0, PLAIN.degrees]), "degree"),), "look like radians"),
     "a detector before the sample": (CONE, ((f"{DETECTOR}/distance", -5.0, "mm"),), "-5 mm behind it"),
-    "high pixels of a cone": (CONE, ((f"{DETECTOR}/y_pixel_size", 0.5, "mm"),), "in a cone beam: square pixels"),
+    "high pixels of a cone": (CONE, ((f"{DETECTOR}/y_pixel_size", 0.5, "mm"),), "a cone beam needs square pixels"),
     "a pixel of a metre": (PLAIN, ((f"{DETECTOR}/x_pixel_size", 1.0, "m"),), "pixel"),
 }
 

@@ -1,4 +1,4 @@
-"""Frames that others divided by their flats: transmission by its name, by flats of 1, and never as line integrals."""
+"""Frames that were already divided by flats: recognised as transmission, never used as line integrals."""
 
 from __future__ import annotations
 
@@ -55,9 +55,11 @@ def test_whole_numbers_have_a_flat_of_their_own(tmp_path: Path) -> None:
 def test_it_is_never_taken_as_line_integrals(tmp_path: Path, beam: float) -> None:
     path = stack(tmp_path / "t.tif", beam * np.exp(-LINES))
     for quantity in ("line_integrals", None):
-        with pytest.raises(DataError, match=r"the sample is.* Say --quantity transmission"):
+        with pytest.raises(DataError, match=r"Give --quantity transmission.*the sample"):
             lines(path, quantity=quantity)
-    assert "Say --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
+    assert (
+        "Give --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
+    )
 
 
 @pytest.mark.parametrize("kind", ["exchange", "nxtomo"])

@@ -1,4 +1,4 @@
-"""A sample wider than the field is named; edges of matter are no air, and those of a beam that drifts are."""
+"""A sample wider than the field is reported; its edges are not used as air, those of a drifting beam are."""
 
 from __future__ import annotations
 
@@ -56,22 +56,25 @@ def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
     assert set(low.beyond()) == set(high.beyond()) == {"left", "right"}
     for edges, continues in ((low, False), (high, True)):
         sentences = [cut_sentence(edges.beyond(), edges.continued, wide) for wide in (False, True)]
-        assert [edges.continued == continues == ("FBP continues" in sentence) for sentence in sentences] == [True, True]
+        assert [edges.continued == continues == ("FBP extrapolates" in sentence) for sentence in sentences] == [
+            True,
+            True,
+        ]
         assert ["scan.offset_views" in sentence for sentence in sentences] == [True, False]
     _, (line,) = prepare(scan(90.0), SELECTION)
-    assert "FBP continues the views, with" in line and "The edge columns are not used as air" in line
+    assert "FBP extrapolates the projections" in line and "The edge columns are therefore not used as air" in line
 
 
 @pytest.mark.slow
 def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_with_its_views() -> None:
     _, told = prepare(scan(28.0, beside=15.0), SELECTION)
-    (line,) = (line for line in told if "leaves the field" in line)  # a disc's views are mirror images, too
-    views = re.search(r"leaves the field at the right edge in views (\d+) to (\d+) of 90", line)
+    (line,) = (line for line in told if "leaves the field of view" in line)  # a disc's views are mirror images, too
+    views = re.search(r"leaves the field of view at the right edge in projections (\d+) to (\d+) of 90", line)
     assert views is not None  # a line integral of 0.1 is at the edge at 25 and 155 degrees
     assert np.abs(np.array(views.groups(), float) - (13, 77)).max() <= 4
     for radius, beside in ((20.0, 8.0), (40.0, 3.0), (45.0, 0.0)):
         _, told = prepare(scan(radius, beside=beside), SELECTION)
-        assert not any("leaves the field" in line for line in told), (radius, beside)
+        assert not any("leaves the field of view" in line for line in told), (radius, beside)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +87,7 @@ def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_curren
     source = scan(radius, current[:, None, None] / 200)
     source.state(currents=np.r_[np.full(10, 200.0), current])
     _, told = prepare(source, SELECTION.with_steps(Preparation(ring_current=ring_current)))
-    assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
+    assert ["varies by 33% (from 150 to 200)" in line for line in told if "ring current" in line] == of_current
 
 
 @pytest.mark.parametrize(
@@ -94,12 +97,12 @@ def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: fl
     as_taken, told = prepare(scan(120.0, 1.8 * light), SELECTION)
     mean = as_taken.projections.data.mean()
     more = prepare(scan(120.0, 1.8 * light / 1.1), SELECTION)[0].projections.data.mean() - mean
-    (line,) = (line for line in told if "No column shows air" in line)
+    (line,) = (line for line in told if "no detector column shows air" in line)
     assert more == pytest.approx(0.095, abs=0.002)
-    share = re.search(r"by 0.095, (\d+)% of the mean", line)
+    share = re.search(r"0.095 too large \((\d+)% of the mean", line)
     assert share is not None
     assert int(share[1]) == pytest.approx(100 * more / mean, rel=0.05)
-    assert "No exposure is stated" in line
+    assert "The exposures are not both stated" in line
 
 
 @pytest.mark.parametrize(

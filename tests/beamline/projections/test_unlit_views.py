@@ -1,4 +1,4 @@
-"""Views without light are no data: they are left out and named, at once, in batches and while a scan grows."""
+"""Projections without beam are left out and named: at once, in batches and during a scan."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     at_once = ScanCorrection(evidence_of(source, SELECTION), SELECTION.of(source), lambda _: None).at_once(frames)
     in_slabs, told = prepare(source, SELECTION, DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7))
     np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)
-    assert len([line for line in told if "3 views of 45 (frames 9, 36-37) without light" in line]) == 1
+    assert len([line for line in told if "3 projections of 45 (frames 9, 36-37) had no beam" in line]) == 1
     fed = ScanCorrection(evidence_of(source, SELECTION), SELECTION.of(source).with_steps(Air("none")), told.append)
     parts = [fed.feed(part, last=part[-1] == frames[-1]) for part in np.array_split(frames, 5)]
     ids = np.concatenate([part.view_ids for part in parts if part is not None])
@@ -69,7 +69,7 @@ def test_line_integrals_that_were_never_written_are_left_out() -> None:
     source = ArraySource(lines.astype(np.float32), [0] * VIEWS, ANGLES)
     source.quantity = "line_integrals"
     found, told = prepare(source, SELECTION)
-    assert found.geometry.n_views == VIEWS - 2 and "2 views of 45 (frames 5, 40) without light" in told[0]
+    assert found.geometry.n_views == VIEWS - 2 and "2 projections of 45 (frames 5, 40) had no beam" in told[0]
 
 
 def test_a_band_in_which_the_sample_is_opaque_has_views_with_light() -> None:

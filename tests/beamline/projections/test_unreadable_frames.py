@@ -1,4 +1,4 @@
-"""A frame that a file does not give is left out and named, in views and references, whatever the format."""
+"""A frame that cannot be read is left out and named, for projections, flats and darks, in any format."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     assert prepared.projections.view_ids.tolist() == views.tolist()
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)
     said = " ".join(told)
-    assert "frames cannot be read: 9, 20-21, left out." in said and "1, 4, left out." in said
+    assert "frames cannot be read and are left out: 9, 20-21." in said and "are left out: 1, 4." in said
     with pytest.raises(DataError, match="cannot be read"):
         ingest(scan, tmp_path / "copy.h5")
     assert not (tmp_path / "copy.h5").exists()

@@ -1,4 +1,4 @@
-"""Views with an alarm are left out, those with a warning weigh half, and --flags ignore weighs all equally."""
+"""Projections with an alarm are left out, with a warning count half; with --flags ignore all count equally."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
     rays = found.ray_weights(3)
     assert rays is not None and rays.shape == (27, 2, 40) and (rays[24:] == 1).all()
     (line,) = told
-    assert line.startswith("Of 30 views 6 have an alarm and are left out (beam 6 alarm), 2 have a warning")
-    assert "(beam 2 warn). They leave 42° without a view. --flags" in line  # six of them side by side, 6° apart
+    assert line.startswith("Of 30 projections, 6 have an alarm and are left out (beam 6 alarm), 2 have a warning")
+    assert "(beam 2 warn). They leave 42° without a projection. --flags" in line  # six of them side by side, 6° apart
     assert (found.left_out, found.n_projections) == (6, 30)
 
 
@@ -64,7 +64,7 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
     found, told = prepare(scan(tmp_path), SELECTION.with_steps(Preparation("ignore")))
     assert found.geometry.n_views == 30 and found.view_weights is None and found.ray_weights() is None
-    assert told[0] == "--flags ignore: 6 views with an alarm and 2 with a warning are used as they are."
+    assert told[0] == "--flags ignore: 6 projections with an alarm and 2 with a warning are used as they are."
 
 
 @pytest.mark.parametrize("n", others_slow([FEWEST_VIEWS, FEWEST_VIEWS - 1, 0], 2))

@@ -1,4 +1,4 @@
-"""A scan that grows while it is followed: both share one clock of the test's, so that nothing waits for real."""
+"""A scan that grows while it is followed; both use the test's clock, so that nothing waits in real time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.beamline.scans import TwoCylinders
 from tests.clock import SteppedClock
 
 EPOCH = 1.8e9
-TICK = 0.02  # s that pass with each look at the clock
+TICK = 0.02  # s that pass each time the clock is read
 
 
 class ScanClock(SteppedClock):
@@ -59,9 +59,12 @@ def schedule(
     passes: Sequence[int] = (),
     **info: Any,
 ) -> None:
-    """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
-    last one; status None never finishes it. `flags` come with the row that they are named by. `passes`: rows at
-    the ends of passes, of a scan that decides. `info`: of the file."""
+    """Schedule the scan: its file appears after `begin` s, gets a frame every `period` s, ends `pause` s after the
+    last.
+
+    status None: it never ends. `flags`: flags, by the row with which they are written. `passes`: rows at the ends of
+    passes of a scan that decides. `info`: information in the file.
+    """
     writers: list[NXtomoWriter] = []
     of_file = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, decides=bool(passes), **info)
 
@@ -85,7 +88,7 @@ def schedule(
     if status is not None:
         clock.due.append((end, lambda: writers[0].close(status)))
     else:
-        clock.due.append((end, lambda: writers[0]._lock.release()))  # its program is dead
+        clock.due.append((end, lambda: writers[0]._lock.release()))  # the lock of a dead program is released
         # Hours later, so that the file is closed when the test is over.
         clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
 
@@ -95,7 +98,7 @@ def alarms(*frames: int) -> dict[int, Flag]:
 
 
 FIT = R2(seconds=2.0, gaussians=200)
-BRIEF = R2(seconds=0.3, gaussians=100)  # where nobody looks at the voxels
+BRIEF = R2(seconds=0.3, gaussians=100)  # for tests that do not check the voxels
 
 
 def options(tmp_path: Path, **changes: object) -> ReconOptions:
@@ -112,5 +115,5 @@ def options(tmp_path: Path, **changes: object) -> ReconOptions:
 
 
 def close(clock: ScanClock) -> None:
-    """Let the rest of the schedule happen."""
+    """Run the rest of the schedule."""
     clock.sleep(1e6)

@@ -1,4 +1,4 @@
-"""A budget leaves out what its forecast says is late, and nothing else changes; and who was left out is told."""
+"""A time limit leaves out only what its forecast says will be late, and reports what was left out."""
 
 from __future__ import annotations
 

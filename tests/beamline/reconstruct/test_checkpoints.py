@@ -1,4 +1,4 @@
-"""Whether a checkpoint is of this fit: every change of data or settings is found, and told by its name."""
+"""Whether a checkpoint belongs to this fit: every change of data or settings is found and named."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_plan_shorter_than_what_is_done_is_refused(tmp_path: Path) -> None:
     counts = np.array([100, 120, 0], np.int64)  # limit, step, seen
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(counts=counts), {}, 200))
     again, said = CheckpointOptions(None, tmp_path / "fit.h5"), list[str]()
-    with pytest.raises(ConfigError, match=r"120 steps.* 120 with --steps"):
+    with pytest.raises(ConfigError, match=r"120 steps.* --steps 120 or more"):
         again.begin({}, 20, said.append)
     assert again.begin({}, 120, said.append) is not None and again.begin({}, 0, said.append) is not None
 

@@ -1,4 +1,4 @@
-"""`recon --uncertainty`: a second volume in the file, also in slabs and of a box; left out where it is stopped."""
+"""`recon --uncertainty`: a second volume in the file, also in slabs and for a box; left out if the run is stopped."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     names = [event.event for event in events]
     assert names[0] == "state"
     assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
-    watch = f"open {tmp_path / 'recon.live.png'}: slices from the eighth view on"
+    watch = f"open {tmp_path / 'recon.live.png'}: it shows slices from the eighth projection on"
     assert watch in str(events[1].data["message"])
     assert '<a href="recon.live.png">' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert names.count("recon_started") == 1
@@ -104,7 +104,7 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     ("seconds", "told"),
     others_slow(
         [
-            (3.0, "Stopped while the scan was running: the volume shows the first {} views."),
+            (3.0, "Stopped during the scan: the volume is reconstructed from the first {} projections."),
             (1.5, ""),  # seven views
             (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 views."),
         ]
@@ -180,9 +180,14 @@ SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
     ("frames", "status", "said", "left"),
     [
         ([], None, "No scan began in .* within 3 s", set()),
-        (FRAMES[:16], None, "has lost its writer and is not finished.*`beamline recover .*12 views", SO_FAR),
+        (
+            FRAMES[:16],
+            None,
+            "is no longer being written.* and is not finished.*`beamline recover .*12 projections",
+            SO_FAR,
+        ),
         (FRAMES[:4], "stopped", "0 projections", set()),
-        (FRAMES[:5], "stopped", "1 projections", set()),
+        (FRAMES[:5], "stopped", "1 projection", set()),
         ([f for f in FRAMES if f.kind != 1], "complete", "without flats", set()),
     ],
     ids=["none", "dies", "no views", "one view", "no flats"],

@@ -1,4 +1,4 @@
-"""Line integrals of a followed scan: flags, references that come late, and parts of a run, as of a finished one."""
+"""Line integrals during a scan equal those of the finished scan: flags, late flats and darks, parts of a run."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     assert problem is not None
     np.testing.assert_array_equal(np.stack(problem.images), whole.projections.data / problem.scale)
     again = [event for event in events if event.event == "state" and event.data["state"] == "correcting"]
-    assert [event.data["message"].split(",")[0] for event in again] == ["Flats or darks came after views"]
+    assert [event.data["message"].split(",")[0] for event in again] == ["Correcting all projections again"]
 
 
 def _brighter(frame: Frame, index: int) -> Frame:
@@ -202,7 +202,7 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
     states = [event.data for event in events if event.event == "state" and event.data["state"] == "correcting"]
     begins, has_parts = [data["message"] for data in states]
-    assert "next part of the run begin" in begins and "The run has several parts" in has_parts
+    assert "the next part of the run starts" in begins and "the run has several parts" in has_parts
     first = next(event for event in events if event.event == "snapshot")
     assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
     warned = [event.data["message"] for event in events if event.event == "warning"]

@@ -1,4 +1,4 @@
-"""A fault around a scan that is followed costs less than 0.3 dB against an undisturbed fit of the same views."""
+"""A fault around a followed scan costs less than 0.3 dB, compared with an undisturbed fit to the same projections."""
 
 from __future__ import annotations
 

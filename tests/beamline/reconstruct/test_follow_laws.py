@@ -1,4 +1,4 @@
-"""The law of the error of a followed scan: once at the end of each pass, of all views until then."""
+"""Error model of a followed scan: measured once at the end of each pass, from all projections so far."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When slices of a growing scan are drawn, and what their heading says."""
+"""When slices are drawn during a scan, and what their heading says."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def live(angles: np.ndarray) -> tuple[LiveSlices, Drawn, SteppedClock, Any]:
 @pytest.mark.parametrize(
     ("step", "n", "heading"),
     [
-        (STEP, 63, "FBP of 63 views so far, sequential: 63 of 180 degrees so far, axis at column 7.0"),
-        (STEP, 180, "FBP of 180 views so far, axis at column 7.0"),
-        (GOLDEN, 34, "FBP of 34 views so far, axis at column 7.0"),
+        (STEP, 63, "FBP of the first 63 projections, sequential: 63 of 180 degrees so far, axis at column 7.0"),
+        (STEP, 180, "FBP of the first 180 projections, axis at column 7.0"),
+        (GOLDEN, 34, "FBP of the first 34 projections, axis at column 7.0"),
     ],
 )
 def test_a_heading_says_what_part_of_the_half_turn_is_there(step: float, n: int, heading: str) -> None:
@@ -63,8 +63,9 @@ def test_they_are_drawn_from_the_eighth_view_on_for_new_views_after_a_pause() ->
     assert not drawn.headings
     slices.draw(first(8), None, 0.0)
     assert drawn.headings == [
-        "FBP of 8 views so far, sequential: 8 of 180 degrees so far, axis at the middle, not known yet: crescents are "
-        "no fault of the scan (optics.axis_col or --axis states it)"
+        "FBP of the first 8 projections, sequential: 8 of 180 degrees so far, axis at the detector middle, because it "
+        "is "
+        "not known yet: crescents are expected (set optics.axis_col or --axis)"
     ]
     clock.time += 1
     slices.draw(first(8), 7.0, 0.0)

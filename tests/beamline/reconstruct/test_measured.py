@@ -1,4 +1,4 @@
-"""Figures of merit in a report: of each row, whatever other row stands beside it."""
+"""Quality figures in a report: each row has its own, independent of the other rows."""
 
 from __future__ import annotations
 

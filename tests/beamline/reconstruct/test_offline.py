@@ -1,4 +1,4 @@
-"""Offline reconstruction: the right volume, everything it was made with, and nothing at all where it fails."""
+"""Offline reconstruction: the right volume with a complete record; if it fails, no file is left."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tm
     assert sum(done["times"].values()) == pytest.approx(done["elapsed"], abs=0.35)  # three looks beside the phases
     assert list(done["times"]) == [
         "opening the scan", "flags and references", "tilt and references", "rotation axis", "jumps", "correction",
-        "background, rings, views held out, hardening", "compiling kernels", "reconstruction", "measuring the volume",
-        "FBP for comparison", "writing the volume", "report",
+        "background, rings, held-out projections, hardening", "compiling kernels", "reconstruction",
+        "checking the volume", "FBP for comparison", "writing the volume", "report",
     ]  # fmt: skip
     begun = [event.data["phase"] for event in events if event.data.get("stage") == "phase" and event.data["n"] == 0]
     assert begun == list(done["times"])
@@ -274,7 +274,7 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
     options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, early_stop=True)})
     metrics = reconstruct_file(options, events.append, SystemClock()).metrics
     said = [event.data["message"] for event in events if event.event == "state"]
-    assert said == ["4 of 45 views are held out to say when to stop"]
+    assert said == ["4 of 45 projections are held out to decide when to stop"]
     assert "residual_held_out" in metrics
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.parameters["n_views"] == 41

@@ -1,4 +1,4 @@
-"""Progress events: the rate of this fit, whatever step it began at, and the time left by plan or by clock."""
+"""Progress events: the speed of this fit from any first step, and the time left by plan or by clock."""
 
 from __future__ import annotations
 

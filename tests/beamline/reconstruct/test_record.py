@@ -1,4 +1,4 @@
-"""What is delivered beside a volume: the direct reconstruction of the same views, by the method that takes them."""
+"""The volume that is delivered next to a result: a direct reconstruction of the same projections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A region of the volume: the voxels, and their places, of the whole volume."""
+"""A region of the volume: its voxels and their positions are those of the whole volume."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_box_around_the_sample_is_that_of_the_record(whole: Callable[..., Re
     found, every = volume("-m", "fbp", "--roi", "auto", "--no-report", "-o", "auto.h5"), whole("-m", "fbp").volume.data
     z, y, x = (slice(*map(int, side.split(":"))) for side in str(found.parameters["roi"]).split(","))
     np.testing.assert_allclose(found.volume.data, every[z, y, x], atol=1e-5 * every.max())
-    assert str(found.parameters["roi_found"]).startswith("The sample lies in voxels")
+    assert str(found.parameters["roi_found"]).startswith("The sample, with a margin, is in the voxels")
 
 
 @pytest.mark.slow

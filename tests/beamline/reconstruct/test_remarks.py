@@ -1,4 +1,4 @@
-"""What speaks against a volume is said with frames and pixels of the file."""
+"""Remarks that speak against a volume name frames and pixels of the file."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def odd(said: list[str]) -> str:
 def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:
     selection = Selection(rows=(FIRST_ROW, FIRST_ROW + 48), binning=2)
     said = odd(warnings_of(*_made(rng, {7: 0.3, 30: -0.5}, "sirt"), selection))
-    assert said.startswith("2 views with a part that is not in the volume")
+    assert "2 projections with a part that is not in the volume" in said
     assert "frame 27, rows" in said and "frame 50, rows" in said and said.count("(absorbs less)") == 1
     worst = said.split("frame 50, rows ")[1].split(" (")[0].replace(", columns", " ...").split(" ... ")
     first, last, left, right = map(int, worst)
@@ -69,7 +69,7 @@ def test_mass_where_views_show_nothing_is_told_and_that_of_a_direct_method_is_no
     method: str, told: bool, rng: np.random.Generator
 ) -> None:
     made, prepared = _made(rng, {}, method)
-    stray = "of the mass of the SIRT volume is stray, where the views show nothing"
+    stray = "of the mass of the SIRT volume lies in voxels that the projections show to be empty"
     assert not any(stray in each for each in warnings_of(made, prepared))
     spoiled = made.volume.data.copy()
     spoiled[:, 2:8, 2:8] += 0.02
@@ -82,7 +82,7 @@ def test_a_model_of_needles_is_told(width: float, told: bool, rng: np.random.Gen
     made, prepared = _made(rng, {}, "r2")
     model = Gaussians.from_physical(np.zeros((5, 3)), np.tile([width, 4.0, width], (5, 1)), np.ones(5))
     said = warnings_of(replace(made, gaussians=model), prepared)
-    assert any("100% of the mass of the model is in Gaussians thinner than a pixel" in each for each in said) is told
+    assert any("100% of the mass is in needle-shaped Gaussians, thinner than a pixel" in each for each in said) is told
 
 
 def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_where_all_are_like_the_volume(
@@ -119,7 +119,7 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
     assert (judgement.figures["residual"] > 0.5) is (wider or not begun)
     said = not_begun_warning(replace(made, volume=volume), judgement)
     assert (said == "") is begun
-    assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
+    assert begun or ("does not show the sample yet" in said and "more time, steps or iterations" in said)
 
 
 def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None:

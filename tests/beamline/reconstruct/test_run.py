@@ -1,4 +1,4 @@
-"""The seconds of a call: what its fit gets of them, what is said where they are too few, and what is then left out."""
+"""Time limit of a call: how much the fit gets, what is said if that is too little, and what is then left out."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:
 def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> None:
     left, _, said = _within(12.0, spent=9.0)
     assert left == 0
-    assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
+    assert len(said) == 1 and "12 s is not enough" in said[0] and "correction took 9 s" in said[0]
 
 
 def _told(
@@ -85,9 +85,9 @@ def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_
     events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), SteppedClock(tick=0.1))
     said = [str(event.data.get("message", "")) for event in events]
     fit = next(n for n, event in enumerate(events) if event.data.get("stage") == "recon")
-    assert any("2 s do not suffice" in text for text in said[:fit])
+    assert any("2 s is not enough" in text for text in said[:fit])
     assert "FBP for comparison" not in phases and "fbp" not in events[-1].data
-    remark = next(text for text in said[fit:] if text.startswith("Left out, as the seconds"))
+    remark = next(text for text in said[fit:] if text.startswith("These checks were left out, because the time limit"))
     assert remark in (tmp_path / "out.html").read_text()
 
 

@@ -1,4 +1,4 @@
-"""The box around the sample holds all of it, is not much larger, and is the whole volume where the field cuts it."""
+"""The box around the sample contains all of it, is not much larger, and is the whole volume for a wide sample."""
 
 from __future__ import annotations
 

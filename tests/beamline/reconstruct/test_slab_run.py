@@ -1,4 +1,4 @@
-"""Slabs that are stopped and resumed: the same volume to the bit, and nothing lost of what was finished."""
+"""Slabs that are stopped and resumed: the same volume bit for bit, and no finished work is lost."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_other_data_or_options_are_refused_and_nothing_is_touched(
         ("--tv-weight", "0.01"): "tv_weight (0.01, 0.002 in the file)",
         ("--air", "none"): "projections (other content)",
         ("--rows", "0:80"): "is of 96 slices, this volume has 80",
-        ("--memory", "3.5M"): "Give --memory 5M if",
+        ("--memory", "3.5M"): "Use --memory 5M if",
     }.items():
         refused = beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5", *options)
         assert refused.exit_code == 5 and said in refused.stderr, refused.output

@@ -1,4 +1,4 @@
-"""Slabs within a memory: the same volume, within the memory, with nothing left beside it."""
+"""Slabs within a memory limit: the same volume, within the limit, and no other files are left."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
     planned = json.loads(beamline(*given, "--dry-run", "--json").stdout.splitlines()[-1])
     result = beamline(*given)
     assert result.exit_code == 0, result.output
-    assert "scratch files" in result.stderr and "slices" in result.stderr
+    assert "Temporary files" in result.stderr and "slices" in result.stderr
     parts = read_reconstruction(Path("parts.h5"))
     assert planned["slabs"] == int(parts.parameters["slabs"]) > 1
     np.testing.assert_array_equal(parts.volume.data, volume(*more, "--memory", "1G", "-o", "whole.h5"))
@@ -121,7 +121,7 @@ def test_no_more_memory_is_taken_than_was_given(
         peak = tracemalloc.get_traced_memory()[1] - before
     finally:
         tracemalloc.stop()
-    assert result.exit_code == 0 and "scratch files" in result.stderr, result.output
+    assert result.exit_code == 0 and "Temporary files" in result.stderr, result.output
     assert peak < 1e6 * memory
 
 
@@ -153,7 +153,7 @@ def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
     for words in ((), ("--dry-run",)):
         result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "-o", "out.h5", *words)
         assert result.exit_code == 5, result.output
-        assert "Give --memory 3M if there is as much, or --bin 2" in result.stderr
+        assert "Use --memory 3M if the computer has that much, or --bin 2" in result.stderr
     result = beamline("recon", "scan.h5", "-m", "os-sirt-tv", "--memory", "3M", "-o", "out.h5")
     assert result.exit_code == 5 and "os-sirt-tv of the smallest slab" in result.stderr and "-m fbp" in result.stderr
     result = beamline("recon", "scan.h5", "-m", "r2", "--checkpoint", "fit.h5", "--memory", "3M", "-o", "out.h5")
@@ -169,7 +169,7 @@ def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) ->
     few = ("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--memory", "16M", "--dry-run")
     said = beamline(*few)
     assert said.exit_code == 0, said.output
-    assert "200 x 48 x 48 voxels by sirt, from 60 views" in said.stdout and "about" in said.stdout
+    assert "200 x 48 x 48 voxels with sirt, from 60 projections" in said.stdout and "about" in said.stdout
     data = json.loads(beamline(*few, "--json").stdout.splitlines()[-1])
     assert data["slabs"] > 1 and data["memory"] <= 16_000_000 < data["at_once"]
     assert data["output"] == 4 * 200 * 48**2 and data["scratch"] == 4 * 60 * 200 * 48 + 2 * data["output"]

@@ -1,4 +1,4 @@
-"""Truths: what is read, what fits, and volume files measured by them."""
+"""Ground truth: reading it, matching it to a volume, and measuring volume files with it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_truths_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither"):
         read_truth(str(tmp_path / "text.npz"))
     np.save(tmp_path / "good.npy", DATA)
-    with pytest.raises(ConfigError, match=r"slices 2:9 do"):
+    with pytest.raises(ConfigError, match=r"slices 2:9 are outside"):
         read_truth(f"{tmp_path / 'good.npy'}:2:9")
     with pytest.raises(ConfigError, match=r"missing\.npy"):
         read_truth(str(tmp_path / "missing.npy"))
@@ -60,13 +60,13 @@ def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
         block = DATA[2 * z : 2 * z + 2, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
         assert fitted.data[z, y, x] == pytest.approx(block.mean())
     np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)
-    with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), the volume \(4, 6, 9\)"):
+    with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), but the volume has \(4, 6, 9\)"):
         fit_truth(DATA, Grid((4, 6, 9)), 1)
 
 
 def test_a_constant_truth_is_refused() -> None:
     for value in (1.0, np.nan):
-        with pytest.raises(ConfigError, match="nothing to compare"):
+        with pytest.raises(ConfigError, match="cannot be used for a comparison"):
             fit_truth(np.full((4, 8, 8), value, np.float32), Grid((4, 8, 8)), 1)
 
 

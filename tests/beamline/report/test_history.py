@@ -1,4 +1,4 @@
-"""A fit's record goes into a file and comes back; the residual that judges it is that of views held out, if any."""
+"""The record of a fit is written to a file and read again; the residual in held-out projections judges it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The report: valid, self-contained, escaped, written as a whole."""
+"""The report: valid, self-contained, escaped, written completely or not at all."""
 
 import base64
 import re

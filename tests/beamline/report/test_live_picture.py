@@ -1,4 +1,4 @@
-"""The picture of a growing volume: where things are in it, and that the difference is in units of the noise."""
+"""The picture of a growing volume: positions in it, and a difference image in units of the noise."""
 
 import io
 

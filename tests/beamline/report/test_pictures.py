@@ -1,4 +1,4 @@
-"""Pictures of a report: one grey window, rows and axes that run downwards, differences about zero."""
+"""Pictures of a report: one grey window, rows and axes pointing down, differences centred at zero."""
 
 import io
 

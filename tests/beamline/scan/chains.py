@@ -1,4 +1,4 @@
-"""Runs whose parts end one after the other, and what their files must have."""
+"""Runs whose parts end one after another, and the required content of their files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.beamline.ran import killed, small
 
 FIRST = 5  # 3 darks and 2 flats
 VIEWS = 12
-START, DARKS, VIEW, END, LAST = 0, 2, FIRST + 2, FIRST + 4, FIRST + VIEWS  # frames of a part, at which it ends
+START, DARKS, VIEW, END, LAST = 0, 2, FIRST + 2, FIRST + 4, FIRST + VIEWS  # frames of a part at which it can end
 
 
 MODES = {
@@ -44,8 +44,8 @@ ENDS = "stopped", "aborted", "failed", "killed", "full", "lossy", "unjoined"
 
 
 class Chain:
-    """A run whose parts end one after the other; `end` takes the next part, which ends so at a frame, if it has one of
-    that number."""
+    """A run whose parts end one after another; `end` takes the next part, which ends in a given way at a given
+    frame."""
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch, mode: str = "fly") -> None:
         self.folder, self.patch = folder, patch
@@ -57,7 +57,7 @@ class Chain:
         return run
 
     def take(self, instrument: FakeInstrument, stop: StopRequest, at_start: bool = False) -> None:
-        """The run's next part, whatever it ends with."""
+        """Take the next part of the run, however it ends."""
         started = (lambda event: stop.stop() if event.event == "run_started" else None) if at_start else None
         sinks = [] if started is None else [started]
         devices = instrument.connected()
@@ -71,7 +71,7 @@ class Chain:
     def end(self, how: str, at: int) -> None:
         with suppress(BeamlineError, DeviceError):
             getattr(self, f"_{how}")(at)
-        for part in self.run.rglob("scan.h5"):  # all of this was a while ago
+        for part in self.run.rglob("scan.h5"):  # make the files look older
             when = part.stat().st_mtime - 2 * QUIET
             os.utime(part, (when, when))
 
@@ -88,16 +88,16 @@ class Chain:
         self.take(FakeInstrument(Faults(errors={at: 99})), StopRequest())
 
     def _lossy(self, at: int) -> None:
-        """To its end, with views lost, two of them side by side, and the last."""
+        """It runs to its end and loses projections: two neighbours, and the last one."""
         self.take(FakeInstrument(Faults(lost={at}, ignored={at + 1, FIRST + VIEWS - 1})), StopRequest())
 
     def _killed(self, at: int) -> None:
-        """As kill -9 leaves it: the newest part marked as being written, the joined file as it was."""
+        """As after kill -9: the newest part is marked as being written, the joined file is unchanged."""
         with killed(self.patch), self._joined_stays():
             self._aborted(at)
 
     def _full(self, at: int) -> None:
-        """The disk takes no frame from one on; its file is never closed, as in a process that has ended since."""
+        """From one frame on the disk is full; the file is never closed, as in a process that has ended."""
         reached = False
 
         def write(table: Rows, frame: Frame, *given: Any) -> None:
@@ -114,14 +114,14 @@ class Chain:
                 self.take(FakeInstrument(), StopRequest())
             except DataError as refused:
                 assert reached and "No space left" in str(refused)
-        if not reached:  # the references of the end alone are fewer frames
+        if not reached:  # flats and darks at the end alone are fewer frames
             return
         part = parts_of(self.run)[-1] / "scan.h5"
         shutil.copy(part, part.with_name("died.h5"))
         part.with_name("died.h5").replace(part)
 
     def _unjoined(self, at: int) -> None:
-        """As kill -9 leaves it while the parts are joined."""
+        """As after kill -9 while the parts are joined."""
         with self._joined_stays():
             self._aborted(at)
 
@@ -134,7 +134,7 @@ class Chain:
 
 
 class _Stays:
-    """What is made of a file in the block is undone at its end."""
+    """Restores a file at the end of the context."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
@@ -150,7 +150,7 @@ class _Stays:
 
 
 def rows_of(run: Path) -> list[tuple[int, int]]:
-    """Kind and trigger of the committed frames of all parts, by their files."""
+    """Kind and trigger of the committed frames of all parts, from their files."""
     found: list[tuple[int, int]] = []
     for part in parts_of(run):
         if parts.may_hold_frames(part / "scan.h5"):
@@ -165,7 +165,8 @@ def views_of(run: Path) -> list[int]:
 
 
 def assert_whole(path: Path) -> None:
-    """Each view once, at its angle and with the pixels of its angle, and all other frames of the parts."""
+    """Assert that the file has each projection once, with the right angle and pixels, and all other frames of the
+    parts."""
     with open_scan(path) as source:
         frames = list(source.frames())
     assert_true(frames)

@@ -1,4 +1,4 @@
-"""Every frame carries the angle it was exposed at, every missing one is named, and the instrument ends up safe."""
+"""Every frame has the angle of its exposure, missing frames are named, and the instrument ends in a safe state."""
 
 import itertools
 from dataclasses import replace

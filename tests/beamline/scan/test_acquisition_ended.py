@@ -1,4 +1,4 @@
-"""A scan that is stopped, aborted or cut short by a device: what was exposed keeps its angles, and it ends up safe."""
+"""A scan that is stopped, aborted or ended by a device: exposed frames keep their angles; the end is safe."""
 
 import numpy as np
 import pytest
@@ -140,7 +140,7 @@ def test_a_camera_error_once_is_survived_twice_is_not() -> None:
     [
         (Faults(ignored=set(range(5, 99))), InstrumentError, "trigger cable", 5),
         (Faults(stall_at=8700), DeviceError, "stopped short", 5 + 6),
-        (Faults(stuck_shutter=True), InstrumentError, "shutter: it is closed, flats need it open", 3),
+        (Faults(stuck_shutter=True), InstrumentError, "shutter: it is closed, but flats need it open", 3),
     ],
 )
 def test_a_device_that_does_not_do_its_part_ends_the_scan_in_its_own_words(

@@ -1,4 +1,4 @@
-"""A scan that is paused, at any moment, gives the frames of one that was not: none is lost, none is there twice."""
+"""A scan that is paused at any moment gives the same frames as one without a pause: none lost, none twice."""
 
 from __future__ import annotations
 

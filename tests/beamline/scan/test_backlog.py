@@ -1,4 +1,4 @@
-"""A scan waits for room in memory and on its disk, and goes on when there is some."""
+"""A scan waits for free memory and disk space, and continues when there is some."""
 
 import re
 import time
@@ -24,7 +24,11 @@ from tests.beamline.ran import Ran
 def test_a_scan_pauses_before_its_disk_is_full_and_goes_on_when_there_is_space() -> None:
     pause = PauseRequest()
     look, mb = partial(hold_for_space, pause, 100_000_000), 1_000_000
-    steps = [(500, 900, ""), (121, 800, ""), (119, 790, "119 MB are free.* 790 MB are still to come.* at 220 MB")]
+    steps = [
+        (500, 900, ""),
+        (121, 800, ""),
+        (119, 790, "119 MB are free.* 790 MB are still to be written.* when 220 MB"),
+    ]
     for free, left, said in [*steps, (219, 790, "Free some"), (220, 790, ""), (119, 790, "Free some")]:
         look(free * mb, left * mb)
         assert re.search(said, pause.reason) if said else pause.reason == ""
@@ -44,7 +48,7 @@ def test_a_scan_waits_for_space_on_its_disk(tmp_path: Path, monkeypatch: pytest.
 
     def give_back(event: Event) -> None:
         if event.data.get("state") is State.PAUSED:
-            assert "1 MB are free on the scan's disk" in event.data["message"]
+            assert "1 MB are free" in event.data["message"]
             free[0] = 10**12
 
     ran = Ran(tmp_path, FakeInstrument(at={8: take}), heard=give_back)

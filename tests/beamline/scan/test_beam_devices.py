@@ -1,4 +1,4 @@
-"""Filter and monochromator are where the scan wants them before its first frame, and the file says so."""
+"""Filter and monochromator are set as the scan wants before its first frame, and the file records it."""
 
 import math
 from collections.abc import Callable
@@ -167,7 +167,7 @@ def test_the_simulated_beam_has_the_energy_in_a_scan_and_in_tune(tmp_path: Path)
 
 def test_a_beam_of_many_energies_has_no_monochromator() -> None:
     tube = NICKEL | {"beam": {"photons_per_s": 1.0e5, "tube": {"kv": 60}}}
-    with pytest.raises(ConfigError, match="gives one energy"):
+    with pytest.raises(ConfigError, match="gives a single energy"):
         dry_run(with_scene(small(MONOCHROMATOR, "scan.energy=8.3"), tube))
 
 

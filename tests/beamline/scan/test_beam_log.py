@@ -1,4 +1,4 @@
-"""Beam log: every reading is kept and told, an outage is told once, and nothing that a monitor does touches a scan."""
+"""Beam log: every reading is kept and reported, an outage is reported once; a beam monitor never affects a scan."""
 
 import threading
 from collections.abc import Mapping

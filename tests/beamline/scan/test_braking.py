@@ -1,4 +1,4 @@
-"""Frames of a stage that brakes: its motion confirms their triggers, or their number does, or nothing."""
+"""Frames while the stage brakes: their triggers are confirmed by its motion or by their number, or not at all."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Verbs from another terminal reach a running scan, and nobody waits for one that is dead."""
+"""Commands from another terminal reach a running scan, and nobody waits for a dead one."""
 
 import os
 import stat
@@ -80,7 +80,7 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
         files.append(RecordFile(runs[1], RunRecord(State.PREPARING)))
         with verbs_taken(runs[1], stop, PauseRequest()):
             result = CliRunner().invoke(main, ["abort"])
-            assert result.exit_code == 2 and "2 scans run in runs: a, b" in result.stderr
+            assert result.exit_code == 2 and "2 scans are running in runs: a, b" in result.stderr
             assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0
             assert stop.aborting
     for file in files:
@@ -120,7 +120,10 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
-        assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
+        assert (
+            refused.exit_code == 2
+            and "is not waiting for a decision on what to measure next: it is acquiring" in refused.stderr
+        )
         assert list((run / "control").iterdir()) == [] and not chosen
         enter(State.ASKING)
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])
@@ -130,7 +133,7 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         enter(State.ASKING)
         monkeypatch.setattr("beamline.cli.control._LOOKS", 5)
         twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
-        assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
+        assert twice.exit_code == 2 and "has made no other choice" in twice.stderr
         enter(State.ASKING)
         other = CliRunner().invoke(main, ["decide", str(run), "offset"])
         assert other.exit_code == 2 and "does not take offset" in other.stderr and "took next: because" in other.stderr
@@ -167,7 +170,7 @@ def test_a_log_that_is_none_or_has_no_end_keeps_no_command_waiting_and_fills_no_
             assert {reader.state()["frames"] for _ in range(3)} == {0}
     else:
         shown = CliRunner().invoke(main, ["watch", str(run), "--port", "0"])
-        assert shown.exit_code == 5 and f"{run} is no folder of a run" in shown.stderr
+        assert shown.exit_code == 5 and f"{run} is not the folder of a run" in shown.stderr
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**28

@@ -1,4 +1,4 @@
-"""Scans that decide: a live reconstruction's laws, or the operator, choose what is measured; the file keeps why."""
+"""Scans that decide: an error model or the operator chooses what to measure; the file records the reason."""
 
 import json
 import sys
@@ -87,14 +87,14 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     ran.assert_good_file(16, "complete")  # with the flats of the end
     assert [(each["passes"], each.get("dropped", 0)) for each in decisions] == [(1, 0), (2, 0), (3, 3)]
     assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 16
-    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: all that the plan "
+    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: the rest of the plan "
     assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
     assert "16 of 19" in cells(run)
     with open_scan(ran.folder / "scan.h5") as source:
         assert [(found.severity, found.message) for found in scan_ended(ScanEvidence(source))] == [("info", run.ended)]
         facts = facts_of(source)
         assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
-    assert run.ended.endswith("1 dB less is accepted. 3 planned frames were not taken.")
+    assert run.ended.endswith("a loss of 1 dB is accepted. 3 planned frames were not taken.")
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 
@@ -120,7 +120,7 @@ def gone(scan: Path, output: Path) -> Sequence[str]:
         [
             (gone, False, "no live reconstruction is running"),
             (None, False, "no live reconstruction is running"),
-            (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
+            (live((1.0, 0.1, None)), True, "improvements are not predicted for a cone beam"),
         ]
     ),
 )
@@ -173,7 +173,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
 
     def react(event: Event) -> None:
         state = event.data.get("state")
-        if event.data.get("message") == "The scan goes on":
+        if event.data.get("message") == "The scan continues":
             seen.append(("goes on", instrument.is_open))
         if event.event != "state" or state not in (State.ASKING, State.PAUSED):
             return
@@ -187,7 +187,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     assert ran.error is None
     assert seen == [("asking", False), ("paused", False), ("goes on", False), ("asking", False)]
     said = [event.data.get("message") for event in ran.of("state") if event.data["state"] == State.ASKING]
-    assert said == ["", "The scan asks again what to measure next"]
+    assert said == ["", "The scan again waits for a decision on what to measure next"]
     assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
     ran.assert_good_file(12, "complete")
 

@@ -1,4 +1,4 @@
-"""The decider asks the law, or the operator, after each pass; where neither answers the plan goes on."""
+"""The decider asks the error model or the operator after each pass; without an answer, the plan continues."""
 
 import json
 import math
@@ -134,7 +134,7 @@ def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
     scan = Scan()
     assert scan.after(3, law(36, exponent=0.5)) is Choice.ENOUGH
     assert not scan.stop.stopping
-    assert scan.chosen["reason"].startswith("all that the plan still has would add 0.62 dB")
+    assert scan.chosen["reason"].startswith("the rest of the plan would add 0.62 dB")
     assert scan.chosen["choice"] == "enough" and scan.recorded[0]["reason"] == scan.chosen["reason"]
 
 
@@ -187,7 +187,7 @@ def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
     scan = Scan(wait=0.5)
     assert scan.after(1) is Choice.NEXT and scan.waited == round(0.5 / PAUSE_POLL)
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no prediction within 0.5 s")
-    assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: no prediction within 0.5 s."
+    assert scan.of("pass_ended")[0]["remark"] == "The expected improvement is not known: no prediction within 0.5 s."
     assert {option["gain"] for option in scan.chosen["options"]} == {None, 0.0}
     assert scan.after(3, law(12), law(33, exponent=0.2)) is Choice.ENOUGH  # the first is of an earlier pass, and late
     assert scan.waited == 2
@@ -212,7 +212,9 @@ def test_a_dead_live_process_means_the_plan_and_is_said_once(asks: bool) -> None
     assert [scan.after(n) for n in (2, 3)] == [Choice.NEXT] * 2
     assert scan.waited == 0 and scan.states.state is State.ACQUIRING
     assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.why_no_law)]
-    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.why_no_law}."]
+    assert [each["remark"] for each in scan.of("pass_ended")] == [
+        f"The expected improvement is not known: {scan.why_no_law}."
+    ]
 
 
 def test_a_law_of_before_does_not_serve_when_the_process_is_dead() -> None:
@@ -240,11 +242,14 @@ def test_the_operator_is_asked_with_a_closed_shutter() -> None:
     assert scan.log == ["close shutter", "close shutter", "asking"]  # while it waits for the law, too
     (ended,) = scan.of("pass_ended")
     assert ended["wait"] == 60 and ended["recommended"] == "next"
-    assert (scan.chosen["by"], scan.chosen["reason"]) == ("operator", "the operator chose it")
+    assert (scan.chosen["by"], scan.chosen["reason"]) == ("operator", "chosen by the operator")
     (refused,) = scan.of("warning")
-    assert refused["message"] == "The choice offset changed nothing: expected again, enough, next."
+    assert refused["message"] == "The choice offset had no effect: expected again, enough, next."
     scan.decide.answer(Choice.ENOUGH)  # too late
-    assert scan.of("warning")[1]["message"] == "The choice enough changed nothing: the scan does not ask now."
+    assert (
+        scan.of("warning")[1]["message"]
+        == "The choice enough had no effect: the scan is not waiting for a decision now."
+    )
     assert not scan.stop.stopping
 
 
@@ -259,7 +264,7 @@ def test_without_an_answer_the_plan_goes_on_though_no_law_came() -> None:
     scan = Scan(asks=True, wait=0.5)
     assert scan.after(3) is Choice.NEXT
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no answer within 0.5 s")
-    assert scan.of("pass_ended")[0]["remark"].startswith("Gains are not known: ")
+    assert scan.of("pass_ended")[0]["remark"].startswith("The expected improvement is not known: ")
 
 
 def test_after_a_pause_it_asks_again() -> None:
@@ -288,7 +293,7 @@ def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
     none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")
     assert scan.after(1, none) is Choice.NEXT
     assert scan.waited == 1 or asks
-    assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: 30 views are few."
+    assert scan.of("pass_ended")[0]["remark"] == "The expected improvement is not known: 30 views are few."
     assert (scan.chosen["by"], scan.chosen["reason"]) == (
         "plan",
         "no answer within 0.5 s" if asks else "30 views are few",

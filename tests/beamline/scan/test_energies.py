@@ -1,4 +1,4 @@
-"""A series of energies: a scan of each in one folder, which goes on after a stop."""
+"""A series of energies: one scan for each in one folder, which can continue after a stop."""
 
 import hashlib
 import json
@@ -158,7 +158,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     assert [need.kev for need in rest.energies] == [ENERGIES[3]]
     assert rest.total_bytes == one["total_bytes"]  # the disk needs no room for those that were taken
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")
-    assert "energies  4, 8.32 to 8.352 keV, a scan like this of each" in told.stdout
+    assert "energies  4, 8.32 to 8.352 keV, one such scan at each" in told.stdout
     assert told.exit_code == 0 and not (tmp_path / "none").exists()
 
 
@@ -171,11 +171,11 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),
         (("recon.live=true", "scan.decide=do"), "set scan.energies to null"),
-        (("simulation.scene.beam.energy_kev=null", "simulation.scene.beam.tube={kv: 60}"), "gives one energy"),
+        (("simulation.scene.beam.energy_kev=null", "simulation.scene.beam.tube={kv: 60}"), "gives a single energy"),
         (("simulation.scene.phantom.materials.fresh.formula=Xx",), "Xx"),
         (("scan.energies=[8.3, 9000]",), "9000"),
         (("scan.energies=[.nan]",), "scan.energies.0 is .nan"),
-        (("devices.monochromator={kind: simulated, range_kev: [25, 4]}",), "give the lower energy first"),
+        (("devices.monochromator={kind: simulated, range_kev: [25, 4]}",), "expected the lower energy first"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, words: tuple[str, ...], said: str) -> None:

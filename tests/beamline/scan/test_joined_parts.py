@@ -1,4 +1,4 @@
-"""A joined file is whole, also in a copy of its run; where its parts have changed or are missing it is refused."""
+"""A joined file is complete, also in a copied run; if its parts have changed or are missing, there is an error."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def _without_its_parts(run: Path) -> None:
     ("change", "said"),
     others_slow(
         [
-            (_fewer_frames, "part-2/scan.h5 has .* frames, not the"),
+            (_fewer_frames, "part-2/scan.h5 has .* frames instead of the"),
             (_gone, "part-3/scan.h5 is not there"),
             (_torn, "is cut off"),
-            (_without_its_parts, "does not say what its parts are"),
+            (_without_its_parts, "does not list its parts"),
         ]
     ),
 )
@@ -116,7 +116,7 @@ def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, 
                 np.testing.assert_array_equal(archived.read(slice(None)), source.read(slice(None)))
     assert _beamline("recover", tmp_path / "alone" / JOINED) == (
         0,
-        f"{tmp_path / 'alone' / JOINED} is in order, with {n} frames; nothing was changed.\n",
+        f"{tmp_path / 'alone' / JOINED} is intact, with {n} frames. Nothing was changed.\n",
     )
 
 
@@ -125,5 +125,5 @@ def test_while_a_later_part_grows_the_joined_file_is_refused(recovered: Path) ->
     shutil.copytree(recovered.parent / "part-3", recovered.parent / "part-4")
     with h5py.File(recovered.parent / "part-4" / "scan.h5", "r+") as file:
         file[layout.FINISHED][()] = 0
-    with pytest.raises(DataError, match=r"lacks those of .*part-4"):
+    with pytest.raises(DataError, match=r"the frames of .*part-4.* are missing"):
         open_scan(recovered)

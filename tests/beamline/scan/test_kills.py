@@ -1,4 +1,4 @@
-"""Kill -9 at random moments of a running scan: every frame that was committed is there, whole and at its angle.
+"""kill -9 at random moments of a scan: every committed frame is in the file, intact and with its angle.
 
 What a kill leaves is what had reached the file system by then. So one scan stands for many kills: it is stopped
 (SIGSTOP), its files are copied, it goes on, and is killed in the end.

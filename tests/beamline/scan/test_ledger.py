@@ -1,4 +1,4 @@
-"""Whatever is lost, ignored or added between trigger and file is named exactly, and every kept frame has its angle."""
+"""Frames that are lost, ignored or added between trigger and file are named exactly; kept frames have their angle."""
 
 from dataclasses import dataclass
 from random import Random

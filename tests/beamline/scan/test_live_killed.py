@@ -1,4 +1,4 @@
-"""Kill -9 of a scan while its live reconstruction works: the reconstruction ends, and the run has one whole volume."""
+"""kill -9 of a scan during its live reconstruction: the reconstruction ends, and the run has one complete volume."""
 
 import json
 import os
@@ -97,5 +97,5 @@ def test_a_follower_of_its_own_ends_when_its_scan_is_killed_before_anybody_recov
                     scan.kill()
             assert follower.wait(WITHIN) == 5
             assert follower.stderr is not None
-            assert "has lost its writer" in (said := follower.stderr.read()) and "scan --resume" in said
+            assert "is no longer being written" in (said := follower.stderr.read()) and "scan --resume" in said
     assert not (tmp_path / "own.h5").exists()

@@ -1,4 +1,4 @@
-"""The live volume that fits beside a scan, and what is said of it."""
+"""The live volume that is possible during a scan, and the messages about it."""
 
 import pytest
 
@@ -28,13 +28,13 @@ def test_its_need_of_memory_and_the_reason_are_stated() -> None:
     # 256² x (50 B x 256 + 40 B x 180) = 1.31 GB; 2304 x 4096 x (50 B x 4096 + 40 B x 3600) = 3.29 TB.
     whole = live_need((256, 256), 180, int(8e9))
     assert whole == (
-        "the live volume is of 180 views of 256 x 256 pixels, in about 1.31 GB of memory; it may take half of the 8 GB "
-        "that are free"
+        "the live volume uses 180 projections of 256 x 256 pixels and about 1.31 GB of memory; at most half of the "
+        "8 GB of free memory is allowed"
     )
     reduced = live_need((2304, 4096), 3600, int(24e9))
     for part in (
-        "of 1200 views of 288 x 512 pixels", "one view of 3, pixels binned 8 x 8", "at most 512 columns",
-        "half of the 24 GB that are free", "all 3600 of 2304 x 4096 would take 3.29 TB",
+        "uses 1200 projections of 288 x 512 pixels", "one projection in 3, pixels binned 8 x 8", "at most 512 columns",
+        "half of the 24 GB of free memory", "all 3600 projections of 2304 x 4096 would need 3.29 TB",
     ):  # fmt: skip
         assert part in reduced
     assert "columns" not in live_need((256, 256), 180, int(1e9))
@@ -43,8 +43,8 @@ def test_its_need_of_memory_and_the_reason_are_stated() -> None:
 @pytest.mark.parametrize(
     ("changes", "proposed"),
     [
-        ((), "{scheme: interlaced, passes: 6} 22.0"),
-        (("scan.mode=step", "scan.period_s=1"), "{scheme: golden} 22.9"),
+        ((), "{scheme: interlaced, passes: 6} it has 22.0"),
+        (("scan.mode=step", "scan.period_s=1"), "{scheme: golden} it has 22.9"),
         (("scan.angles.views=181",), None),  # of no number of equal passes
         (("scan.angles={scheme: interlaced, views: 180, passes: 6}",), None),
         (("scan.angles.views=24",), None),  # over before anybody looks

@@ -1,4 +1,4 @@
-"""The live reconstruction beside a scan: its story is told among ours; neither its life nor its death costs a frame."""
+"""The live reconstruction of a scan: its events appear with ours; whatever happens to it, no frame is lost."""
 
 import json
 import sys
@@ -84,7 +84,7 @@ while "{waits_for}" not in events.read_text():
     names = [(event.event, event.data.get("state")) for event in ran.events]
     blocks = [i for i, (name, _) in enumerate(names) if name == "block_started"]
     views = next(i for i in blocks if ran.events[i].data["kind"] == "projection")
-    warned = any("not ready after 0 s" in text for text in ran.warnings)
+    warned = any("still loading after 0 s" in text for text in ran.warnings)
     told = [i for i, event in enumerate(ran.events) if WAITS in event.data.get("message", "")]
     assert all(blocks[0] < i < views and ran.events[i].data["state"] == "flats" for i in told)
     assert len(told) == 1 or not warned  # one that is ready by then is not waited for
@@ -163,7 +163,9 @@ print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_co
 """
 
     def wait() -> None:
-        wait_until(lambda: "recon_done" in said or any("again" not in text for text in said if "has ended" in text))
+        wait_until(
+            lambda: "recon_done" in said or any("again" not in text for text in said if "reconstruction ended" in text)
+        )
 
     said: list[str] = []
     instrument = FakeInstrument(at={10: wait})
@@ -291,8 +293,8 @@ def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and
     for after in (0.0, 1.0, 4.5, 5.0):
         seconds = begin + after
         assert not aborting()
-    waiting = "Waiting for the live volume of the views so far"
-    assert [text.split(".")[0] for text in told] == [f"{waiting}: {first + n} of at most {most} s" for n in (0, 5)]
+    waiting = "Waiting for the live volume from the projections taken so far"
+    assert [text.split(".")[0] for text in told] == [f"{waiting} ({first + n} of at most {most} s)" for n in (0, 5)]
     stop.abort()
     seconds += 100.0
     assert aborting() and len(told) == 2

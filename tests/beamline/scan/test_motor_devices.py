@@ -1,4 +1,4 @@
-"""Scans with a sample that a motor moves, and with a stage behind a motor record, on the simulated instrument."""
+"""Simulated scans with a sample moved by a motor, and with a stage behind an EPICS motor record."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_flats_are_taken_with_the_sample_out_and_views_with_it_in(mover: str) ->
 def test_a_step_scan_by_a_motor_record_and_no_fly_scan() -> None:
     settings = small(f"devices.stage={EPICS}", *SHORT)
     said = dry_run(settings).timeline.violations
-    assert "the stage has no trigger output, which a fly scan needs; use scan.mode: step" in said
+    assert "a fly scan needs a stage with a trigger output, but this stage has none. Use scan.mode: step" in said
     frames = _frames(small(f"devices.stage={EPICS}", *SHORT, "scan.mode=step"))
     views = [frame.angle for frame in frames if frame.kind is FrameKind.PROJECTION]
     assert np.degrees(views) == pytest.approx([0, 30, 60, 90, 120, 150], abs=1e-3)

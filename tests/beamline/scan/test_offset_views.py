@@ -1,4 +1,4 @@
-"""Offset views: the sample is stepped across the beam after the views, so that frames side by side show all of it."""
+"""Laterally offset projections: after the ordinary ones, the sample is moved across the beam to show all of it."""
 
 from pathlib import Path
 from typing import Any
@@ -125,8 +125,8 @@ def test_the_dry_run_counts_them() -> None:
         (("scan.offset_views=4",), "set sample.diameter_mm"),
         ((*WIDE, "devices.sample_mover={kind: stage, in_deg: 1, out_deg: 12, stage: "
           f"{{kind: epics, port: 'sim://epics', {COMMON}}}}}"), "set its kind to stage, and its mm_per_deg"),
-        (("scan.offset_views=4", "sample.diameter_mm=0.1"), "field of 0.184 mm shows all of a sample of 0.1 mm"),
-        ((*WIDE, motor(0.01)), r"place for -0.3312 mm aside, -32.12 is beyond the limits of its stage, -20 ... 25"),
+        (("scan.offset_views=4", "sample.diameter_mm=0.1"), "field of view of 0.184 mm shows all of a sample"),
+        ((*WIDE, motor(0.01)), r"for an offset of -0.3312 mm, -32.12 is beyond the limits of its stage, -20 ... 25"),
         (("scan.offset_views=4", "sample.diameter_mm=0"), "sample.diameter_mm"),
     ],
     ids=["no diameter", "no axis", "all in the field", "out of reach", "no size"],
@@ -139,7 +139,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(words: tuple[str, ...], said: s
 
 def test_a_cone_is_refused() -> None:
     cone = {**SCENE, "beam": {"photons_per_s": 1e5, "sod": 50.0, "sdd": 100.0}}
-    with pytest.raises(ConfigError, match="offset_views is for a parallel beam"):
+    with pytest.raises(ConfigError, match="offset_views needs a parallel beam"):
         dry_run(with_scene(asked(*WIDE), cone))
 
 

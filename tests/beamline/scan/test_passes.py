@@ -1,4 +1,4 @@
-"""A scan in passes: what is chosen after each is taken, nothing else, and the file says it."""
+"""A scan in passes: exactly what is chosen after each pass is measured, and the file records it."""
 
 import os
 import signal
@@ -232,7 +232,7 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     assert not stop.aborting and f"Stopped after {sizes[0]} of 12 projections: Ctrl-C was pressed." in str(ran.error)
     assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("to take, its missing offset views and flats of the end are taken now")
+        assert series.in_words.endswith("to take; its missing offset views and flats of the end are taken now")
     assert "--resume" in next_step(ran.folder / "scan.h5")
 
 
@@ -299,7 +299,7 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + VIEWS + 1: stop.abort}), *WORDS, *words, stop=stop)
     instrument.clock.sleep(1e4)
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("has all 12 views, its missing offset views of the end are taken now")
+        assert series.in_words.endswith("has all 12 views; its missing offset views of the end are taken now")
         run_scan(series.config, series, instrument=instrument.connected())
     frames = frames_of(ran.folder / "joined.h5")
     assert [frame.trigger for frame in frames[FIRST:]] == list(range(VIEWS + WIDE))
@@ -311,9 +311,19 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
     ("script", "cut", "missing", "words"),
     others_slow(
         [
-            ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in last flats
-            ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
-            ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
+            (
+                [Choice.ENOUGH],
+                FIRST + 3,
+                0,
+                "with 3 of 12 projections; the scan itself had decided to omit the others.",
+            ),  # in last flats
+            ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 projections."),  # another pass of three was to be taken
+            (
+                [Choice.AGAIN],
+                FIRST + 4,
+                7,
+                "with 5 of 12 projections.",
+            ),  # the first pass lacks a view of its second time
         ],
         2,
     ),
@@ -334,7 +344,9 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     instrument.at = {FIRST: stop.stop}
     resumed, chooser = open_for_resume(ran.folder), Scripted([])
     with choosing(monkeypatch, chooser), killed(monkeypatch), resumed as series, suppress(ScanStopped, DataError):
-        assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
+        assert (
+            f"lacks {missing} of the" in series.in_words or "has all the projections that it was to" in series.in_words
+        )
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
     _, part, joined = recover_run(ran.folder)[0]
     assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))
@@ -375,7 +387,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
         instrument.clock.sleep(1e4)
         again = Scripted([Choice.NEXT, Choice.ENOUGH])
         with choosing(monkeypatch, again, pass_views), open_for_resume(ran.folder) as series:
-            assert series.in_words.endswith(f"has {sizes[0]} of 12 views, {12 - sizes[0]} are taken")
+            assert series.in_words.endswith(f"has {sizes[0]} of 12 projections; {12 - sizes[0]} are taken now")
             run_scan(series.config, series, instrument=instrument.connected())
         assert [(len(passes.done), len(passes.to_come)) for passes in again.asked] == [
             (1, len(sizes) - 1),

@@ -1,4 +1,4 @@
-"""Dry run: the figures of the shipped scans, what it refuses, and what it does not load or touch."""
+"""Dry run: the figures of the shipped scans, its errors, and that it loads and touches nothing else."""
 
 import shutil
 import subprocess
@@ -45,8 +45,8 @@ def test_what_a_live_volume_takes_is_told() -> None:
         return [remark for remark in dry_run(shipped(name, *overrides)).timeline.remarks if "live volume" in remark]
 
     here = f"storage.folder={REPOSITORY.as_posix()}"
-    assert "`beamline recon` makes the full one" in said("instrument", here)[0]
-    assert "of 360 views of 144 x 160 pixels, in about" in said("simulated")[0]
+    assert "`beamline recon` makes the full volume" in said("instrument", here)[0]
+    assert "uses 360 projections of 144 x 160 pixels and about" in said("simulated")[0]
     assert said("simulated", "recon.live=false") == said("simulated", "recon.method=fbp") == []
 
 
@@ -61,9 +61,9 @@ def test_the_disk_is_that_of_the_run_that_goes_on(tmp_path: Path, monkeypatch: p
 def test_violations_are_refused_all_at_once() -> None:
     worked = dry_run(shipped("demo")).timeline
     refuse_violations(worked)
-    with pytest.raises(ConfigError, match=r"^a limit is violated, nothing was started: too fast\.$"):
+    with pytest.raises(ConfigError, match=r"^a limit is exceeded, nothing was started: too fast\.$"):
         refuse_violations(replace(worked, violations=("too fast",)))
-    with pytest.raises(ConfigError, match=r"^2 limits are violated, nothing was started:\n  too fast\n  too far$"):
+    with pytest.raises(ConfigError, match=r"^2 limits are exceeded, nothing was started:\n  too fast\n  too far$"):
         refuse_violations(replace(worked, violations=("too fast", "too far")))
 
 

@@ -1,4 +1,4 @@
-"""The recorder writes every frame in order, or says why it cannot, and never lets the camera wait for a dead disk."""
+"""The recorder writes every frame in order or says why it cannot; the camera never waits for a dead disk."""
 
 import re
 import threading
@@ -150,7 +150,7 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
     finally:
         free.set()
     assert isinstance(ran.error, DataError)
-    assert re.search(r"took no frame for 0\.05 s.*first [0-6] frames.*scan\.h5", str(ran.error)), ran.error
+    assert re.search(r"accepted no frame for 0\.05 s.*first [0-6] frames.*scan\.h5", str(ran.error)), ran.error
     ran.assert_safe()
 
 
@@ -198,7 +198,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     assert ran.error is None
     ran.assert_good_file(19, "complete")
     off, unjudged = ran.warnings
-    assert "monitor failed at frame 0" in off and "did not look at 19 frames (0-18)" in unjudged
+    assert "monitor failed at frame 0" in off and "did not check 19 frames (0-18)" in unjudged
 
 
 @pytest.mark.parametrize("checks", [(), ("timing",), ("blur",)])

@@ -1,4 +1,4 @@
-"""Bad darks and flats stop a scan before its first projection: a named end, a safe instrument, a readable file."""
+"""Bad darks and flats stop a scan before its first projection, with a reason, a safe instrument and a readable file."""
 
 from pathlib import Path
 
@@ -25,9 +25,9 @@ from tests.beamline.ran import Ran
 @pytest.mark.parametrize(
     ("light", "dark", "faults", "said"),
     [
-        (210, 200, Faults(), "The flats 3-4: there is no beam in them"),
-        (20000, 15000, Faults(), "The darks 0-2: there is light in them"),
-        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the views did not come"),
+        (210, 200, Faults(), "The flats 3-4: they show no beam"),
+        (20000, 15000, Faults(), "The darks 0-2: they were exposed to the beam"),
+        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the projections were not taken"),
     ],
 )
 def test_no_projection_is_taken_after_references_that_cannot_be_used(
@@ -56,14 +56,14 @@ def test_the_operator_may_want_the_scan_all_the_same(
     monkeypatch.setitem(fakes.LEVEL, False, 15000)
     ran = Ran(tmp_path, FakeInstrument(), wanted)
     assert ran.result.n_frames == 19
-    assert ["there is light" in text for text in ran.warnings] == [True] * told
+    assert ["they were exposed" in text for text in ran.warnings] == [True] * told
 
 
 def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     last_view = 16  # after three darks and two flats
     ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
     assert ran.result.reference_faults == tuple(ran.warnings)
-    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: there is no beam in them: the"]
+    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: they show no beam. Was the sh"]
 
 
 def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypat
     instrument = FakeInstrument(at={5: lambda: monkeypatch.setitem(fakes.LEVEL, True, 20000)})  # the first view
     ran = Ran(tmp_path, instrument, "scan.flats.at=start")
     (fault,) = ran.result.reference_faults
-    assert fault.startswith("The flats 3-4: they have 9.09% of the light of the views (limit 50%)")
+    assert fault.startswith("The flats 3-4: they have 9.09% of the intensity of the projections (limit 50%)")
     assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
 
 
@@ -134,7 +134,7 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
         "recon.live=false", "scan.exposure_s=0.05",
     )  # fmt: skip
     run_scan(config, tmp_path / "runs", [events.append])
-    told = [i for i, event in enumerate(events) if "Too little light" in str(event.data.get("message"))]
+    told = [i for i, event in enumerate(events) if "the beam is too weak" in str(event.data.get("message"))]
     views = [i for i, e in enumerate(events) if e.event == "block_started" and e.data["kind"] == "projection"]
     assert len(told) == 1 and told[0] < views[0]
     found = float(events[told[0]].data["message"].split("has ")[1].split(" photons")[0])

@@ -80,7 +80,7 @@ def _assert_whole(path: Path, references: int) -> None:
 def _assert_told_of_parts(run: Path) -> None:
     """Each part names the joined file, which speaks of no other, and is not reconstructed by itself."""
     for part in (run / "scan.h5", run / "part-2/scan.h5"):
-        line = f"This file is one of 2 parts of a scan: give {run / 'joined.h5'}, which has the frames of all."
+        line = f"This file is one of 2 parts of a scan: use {run / 'joined.h5'}, which has the frames of all parts."
         assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1
         with open_scan(part) as source, pytest.raises(DataError, match=re.escape(line)):
             accepting = Selection(steps=(Preparation(references="accept"),))
@@ -156,7 +156,7 @@ def test_references_of_the_end_alone_are_taken(
             lambda said: None,
         )
     assert len(prepared.projections.data) == VIEWS
-    with pytest.raises(ConfigError, match="all views that it was to take"):
+    with pytest.raises(ConfigError, match="all projections that it was to take"):
         go_on(run)
 
 
@@ -164,7 +164,7 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(tmp_path: 
     run = ended_run(tmp_path, "aborted", at=FIRST + VIEWS)
     stop = StopRequest()
     with open_for_resume(run) as series:
-        assert series.in_words.endswith("has all 12 views, its missing flats of the end are taken now")
+        assert series.in_words.endswith("has all 12 views; its missing flats of the end are taken now")
         with pytest.raises(BeamlineError, match="before the first frame"):
             run_scan(
                 series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,
@@ -207,9 +207,9 @@ def _other_camera(run: Path) -> None:
     ("change", "said"),
     [
         (_unreadable, "not the folder of a run"),
-        (_other_exposure, "another configuration: `exposure_s: 0.02`, not `exposure_s: 0.03`"),
+        (_other_exposure, "another configuration: `exposure_s: 0.02` instead of `exposure_s: 0.03`"),
         (_without_plan, "has no plan"),
-        (_other_camera, "another camera: model another one; now there is model fake camera"),
+        (_other_camera, "another camera: model another one; now it is model fake camera"),
     ],
 )
 def test_what_cannot_go_on_is_refused_in_one_line(run: Path, change: Callable[[Path], None], said: str) -> None:
@@ -224,10 +224,10 @@ def test_what_cannot_go_on_is_refused_in_one_line(run: Path, change: Callable[[P
 
 def test_a_run_that_another_process_holds_is_refused(run: Path) -> None:
     lock = WriterLock(run / "scan.h5")
-    with pytest.raises(DataError, match="open in a program that still runs"):
+    with pytest.raises(DataError, match="open in a program that is still running"):
         go_on(run)
     lock.release()
-    with open_for_resume(run), pytest.raises(ConfigError, match="another process goes on"):
+    with open_for_resume(run), pytest.raises(ConfigError, match="another process is continuing"):
         go_on(run)
     with (
         pytest.raises(ConfigError, match="configuration: `views: 12`"),

@@ -1,4 +1,4 @@
-"""In whatever order the parts of a run end, its joined file has the frames of all, or is refused and can be made."""
+"""In any order of endings, the joined file of a run has all frames, or there is an error and it can be made later."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views with an alarm are taken again after the last one: bounded, once, at their angles, and used in their place."""
+"""Projections with an alarm are repeated after the last one: limited in number, once, at their angles."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -74,7 +74,7 @@ def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
     assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
     (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
     assert found.severity == "info"
-    assert "Taken again: 3 views; the first (frames 8-9, 20) not used." in found.message
+    assert "Taken again: 3 projections; the first attempts (frames 8-9, 20) are not used." in found.message
     with h5py.File(path) as file:
         assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
         assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]
@@ -101,8 +101,8 @@ def test_one_attempt_is_made(tmp_path: Path) -> None:
     assert (ran.result.retaken, ran.result.alarmed_frames) == (2, 1)
     (found,) = [finding for finding in validate(ran.result.path) if finding.rule == "flags"]
     assert found.severity == "warning"
-    said = "A reconstruction (--flags use): Of 16 views 1 has an alarm and is left out"
-    assert f"Frames with an alarm beside these: 22. {said}" in found.message
+    said = "In a reconstruction (--flags use): Of 16 projections, 1 has an alarm and is left out"
+    assert f"Other frames with an alarm: 22. {said}" in found.message
 
 
 def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
 def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
-    assert "Frames 8 gave no frame" in ran.warnings[0]
+    assert "Frames 8: repeated, but again without a frame" in ran.warnings[0]
     with open_scan(ran.result.path) as source:
         assert source.table.kinds[8] == FrameKind.PROJECTION and source.table.kinds[10] == FrameKind.INVALID
 

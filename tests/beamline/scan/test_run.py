@@ -1,4 +1,4 @@
-"""A run leaves one folder with a readable file and the whole story, however it ends, and says what it must in time."""
+"""A run leaves one folder with a readable file and complete logs, however it ends, and reports in time."""
 
 import errno
 import io
@@ -68,7 +68,7 @@ def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
     lines = (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["event"] for line in lines] == [event.event for event in ran.events]
     log = (ran.folder / "user.log").read_text(encoding="utf-8")
-    assert "12 projection frames (fly, 0.02 s each)" in log
+    assert "Taking 12 projection frames (fly, exposure 0.02 s)" in log
     assert "Scan complete: 19 frames" in log
 
 
@@ -131,7 +131,7 @@ def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
     ran = Ran(tmp_path, instrument := FakeInstrument())
     assert isinstance(ran.error, DataError)
     assert re.search(
-        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
+        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing was moved", str(ran.error)
     )
     assert not instrument.is_open
 
@@ -163,8 +163,8 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
 
 
 def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = {"model": "m", "found_at_opening": "displaced while it stood (WM)"}
+    said = {"model": "m", "found_at_opening": "displaced while at rest (WM)"}
     monkeypatch.setattr(fakes.Stage, "describe", lambda stage: said)
     ran = Ran(tmp_path, FakeInstrument())
     (warning,) = ran.of("warning")
-    assert warning.data["message"] == "stage: before it was opened: displaced while it stood (WM)."
+    assert warning.data["message"] == "stage: settings before it was opened: displaced while at rest (WM)."

@@ -1,4 +1,4 @@
-"""A run's folder is its own, and so are its logs: nothing that is there is taken over or written over."""
+"""The folder of a run and its logs are new; no existing file is reused or overwritten."""
 
 from pathlib import Path
 

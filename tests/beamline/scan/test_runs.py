@@ -1,4 +1,4 @@
-"""Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
+"""The runs in a folder: their description, whatever happened to them; newest first; quickly."""
 
 import errno
 import os
@@ -158,7 +158,7 @@ def test_of_a_kill_in_the_last_fit_the_run_has_died_and_recover_says_that_it_is_
     write_record(run, replace(record, state=State.FINISHING, over=False, flags=flags))
     died = describe(run)
     assert (died.state, died.frames, died.flags) == ("died", FRAMES, flags)
-    assert f"`beamline recover {run}` ends the run" in died.next_step
+    assert f"`beamline recover {run}` marks the run as ended" in died.next_step
     recover_run(run)
     assert (describe(run).state, describe(run).frames, describe(run).next_step) == ("done", FRAMES, "")
     assert describe(run).flags == flags
@@ -171,11 +171,11 @@ def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_pa
             (run / "scan.h5").write_bytes(content)
         died = describe(run)
         assert (died.state, died.frames) == ("died", 0)
-        assert died.next_step == "It ended before its first frame: start the scan anew."
+        assert died.next_step == "It ended before its first frame: start the scan again."
     with pytest.raises(DataError, match=r"has no frame: .*Nothing was changed"):
         recover_run(run)
     (run / "config.resolved.yaml").write_text(resolved_yaml(small()))
-    with pytest.raises(NoFrame, match="run the scan anew"), open_for_resume(run):
+    with pytest.raises(NoFrame, match="start the scan again"), open_for_resume(run):
         pass
 
 
@@ -195,13 +195,13 @@ def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in
     run = _run(tmp_path, 9)
     file = RecordFile(run, RunRecord(State.FINISHING, sample="battery"))
     for take_up in (recover_run, open_for_resume):
-        with pytest.raises(ConfigError, match=r"still runs.*Nothing was changed"), ExitStack() as opened:
+        with pytest.raises(ConfigError, match=r"still running.*Nothing was changed"), ExitStack() as opened:
             taken = take_up(run)
             opened.enter_context(taken)  # type: ignore[arg-type]
     assert describe(run).state == "finishing"
     file.close()
     assert describe(run).state == "failed"  # by a process that ended without a word of how
-    with open_for_resume(run), pytest.raises(ConfigError, match="another process goes on with it or recovers it"):
+    with open_for_resume(run), pytest.raises(ConfigError, match="another process is continuing or recovering it"):
         assert describe(run).state == "preparing"
         recover_run(run)
     assert describe(run).state == "failed"

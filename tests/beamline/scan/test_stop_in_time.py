@@ -1,4 +1,4 @@
-"""Stop and abort from every surface, in every state of a scan, while other verbs are under way: within 2 s."""
+"""Stop and abort from everywhere, in every state of a scan, during other commands: within 2 s."""
 
 import asyncio
 import signal

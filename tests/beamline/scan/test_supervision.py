@@ -1,4 +1,4 @@
-"""Too little beam pauses a scan until it is back, and what it spoilt is taken again."""
+"""Too little beam pauses a scan until it is back, and spoilt projections are repeated."""
 
 import math
 import threading
@@ -60,7 +60,7 @@ def test_a_scan_without_beam_at_its_start_waits_for_it(tmp_path: Path) -> None:
     ran = Ran(tmp_path, Guarded(), beam)
     assert ran.error is None
     assert ran.states[:4] == [State.PREPARING, State.DARKS, State.PAUSED, State.DARKS]
-    assert "reads 0 mA, less than 50. The scan goes on by itself" in ran.of("state")[2].data["message"]
+    assert "reads 0 mA, less than 50. The scan continues automatically" in ran.of("state")[2].data["message"]
     ran.assert_good_file(19, "complete")
 
 

@@ -1,4 +1,4 @@
-"""The scintillator has light for the warm-up before each frame with light, whenever the shutter has been closed."""
+"""The scintillator is exposed for the warm-up time before each frame with beam, if the shutter was closed."""
 
 from dataclasses import replace
 
@@ -28,8 +28,8 @@ def test_frames_with_light_come_after_it_and_no_others(at: Place) -> None:
     kinds = [frame.kind for frame in warm.frames]
     lit = next(i for i, kind in enumerate(kinds) if kind is not FrameKind.DARK)
     assert late == pytest.approx([0.0] * lit + [WARM] * (len(kinds) - lit), abs=0.01)
-    (said,) = [data["message"] for event, data in warm.events if event == "state" and "warms" in data["message"]]
-    assert said == "The scintillator warms up for 30 s"
+    (said,) = [data["message"] for event, data in warm.events if event == "state" and "Warming" in data["message"]]
+    assert said == "Warming up the scintillator for 30 s"
     assert_safe(instrument)
 
 

@@ -1,4 +1,4 @@
-"""However a scan ends: with all its frames, or with an exit code that is not 0. A check or an output ends none."""
+"""A scan ends with all frames or with an exit code other than 0; no check or output ends a scan."""
 
 import tempfile
 import threading
@@ -160,5 +160,5 @@ def test_a_check_that_hangs_costs_no_frame_and_holds_up_no_end(
     assert type(ran.error) is (ScanAborted if aborted else type(None))
     ran.assert_good_file(n, "stopped" if aborted else "complete")
     off, unjudged = ran.warnings
-    assert "The check mass has not come back from frame 7" in off
-    assert f"The monitor did not look at {n - 7} frames (7-{n - 1})" in unjudged
+    assert "its check mass has not finished frame 7" in off
+    assert f"The monitor did not check {n - 7} frames (7-{n - 1})" in unjudged

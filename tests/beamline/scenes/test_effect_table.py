@@ -1,4 +1,4 @@
-"""The effects with their parameters, without a look at the source."""
+"""The table of effects and their parameters is complete, without reading the source."""
 
 from dataclasses import fields
 

@@ -1,4 +1,4 @@
-"""Scene files: volumes are sought beside the scene, wherever it is opened from, by the simulated instrument too."""
+"""Scene files: volumes are searched next to the scene, wherever it is opened from."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Small scans to write, read and break."""
+"""Small scans for tests to write, read and damage."""
 
 from __future__ import annotations
 

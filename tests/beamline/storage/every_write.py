@@ -1,8 +1,8 @@
-"""A program for test_every_write.py: it writes and recovers scans, each time with another write that fails or kills.
+"""A program for test_every_write.py: writes and recovers scans; each time another write fails or kills it.
 
-It is started under the library of tests/faulty_disk.py, forks once for each fault, and prints a JSON object a line.
-Many faults leave the same bytes behind: what the commands make of these is looked at once. Each state that is left is
-recovered and read; the findings of all rules, most of the time, are asked of every fourth.
+It is started with the library of tests/faulty_disk.py, forks once for each fault, and prints one JSON object per line.
+Many faults leave the same bytes; these are examined with the commands only once. Each state is recovered and read. The
+rules take most of the time, so they are applied only to every fourth state.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ _DISK.faulty_disk_arm.argtypes = [ctypes.c_long] * 3 + [ctypes.c_int] * 2
 
 Fault = tuple[int, int, int, int, int]  # kill at, fail from, fail at, errno, torn
 NONE: Fault = (0, 0, 0, 0, 0)
-_ERRORS = (errno.ENOSPC, errno.EIO, errno.EFBIG)  # in turn: nothing that writes a scan asks which it is
+# used in turn, because code that writes a scan does not distinguish them
+_ERRORS = (errno.ENOSPC, errno.EIO, errno.EFBIG)
 FAULTS: dict[str, Callable[[int], Fault]] = {  # by the number of the write
     "kill": lambda n: (n, 0, 0, 0, 0),
     "kill, torn": lambda n: (n, 0, 0, 0, 1),
@@ -66,7 +67,7 @@ FAULTS: dict[str, Callable[[int], Fault]] = {  # by the number of the write
 
 
 class Rig:
-    """A folder with the scan, and a child process for each thing that is done to it."""
+    """A folder with the scan, and a child process for each operation on it."""
 
     def __init__(self, folder: Path) -> None:
         self.scan, self._note, self._said = folder / "w" / "scan.h5", folder / "note", folder / "said"
@@ -76,7 +77,7 @@ class Rig:
         self._rules_asked = True
 
     def fresh(self, kept: Path | None = None) -> None:
-        """The scan is as in this file, or not there, and neither is anything else."""
+        """Reset the folder: it contains only this file as the scan, or nothing."""
         shutil.rmtree(self.scan.parent, ignore_errors=True)
         self.scan.parent.mkdir()
         if kept is not None:
@@ -85,7 +86,7 @@ class Rig:
     def do(
         self, what: Callable[[], Any], fault: Fault = NONE, limit: int | None = None, fast: bool = False
     ) -> dict[str, Any]:
-        """In a child: what it returned or raised, its exit, its messages, and how many writes it made."""
+        """Run something in a child: its result or error, exit code, messages and number of writes."""
         self._note.unlink(missing_ok=True)
         self._children += not fast
         child = os.fork()
@@ -106,8 +107,8 @@ class Rig:
             if fast:
                 os._exit(0)
             if self._children % 20 == 0:
-                sys.exit()  # as a program ends: HDF5 closes what is open
-            atexit._run_exitfuncs()  # the same without the end of Python, which takes seconds
+                sys.exit()  # end like a program, so that HDF5 closes open files
+            atexit._run_exitfuncs()  # the same without Python's shutdown, which takes seconds
             self.writer = None
             gc.collect()
             sys.stderr.flush()
@@ -117,12 +118,12 @@ class Rig:
         return {"value": None} | said | {"exit": code, "stderr": self._said.read_text()[-2000:]}
 
     def aged(self) -> None:
-        """As if nothing had happened to the scan for a while."""
+        """Make the scan look as if it had not changed for a while."""
         when = self.scan.stat().st_mtime - 2 * QUIET
         os.utime(self.scan, (when, when))
 
     def judged(self) -> dict[str, Any]:
-        """What each command makes of the scan: frames, or why it refuses."""
+        """The result of each command on the scan: frames, or its error."""
         content = hashlib.sha256()
         for path in sorted(self.scan.parent.iterdir()):
             content.update(f"{path.name} {path.stat().st_size} ".encode() + path.read_bytes())
@@ -136,7 +137,7 @@ class Rig:
         return self._judged[content.hexdigest()]
 
     def commands(self) -> dict[str, Any]:
-        """What each gives, or why it refuses."""
+        """The result of each command, or its error."""
         found: dict[str, Any] = {}
         for name, command in (
             ("info", self.info),
@@ -165,7 +166,7 @@ class Rig:
             return int(file[layout.COMMITTED][()])
 
     def after(self) -> list[int]:
-        """Frames of an ordinary file, all as they were given; views in its /exchange view."""
+        """The frames of an ordinary file, all as written; the projections in its /exchange view."""
         with h5py.File(self.scan) as file:
             views = len(file["exchange/data"]) if "exchange/data" in file else 0
         with open_scan(self.scan) as source:
@@ -178,19 +179,19 @@ class Rig:
         return [n, views]
 
     def write(self) -> int:
-        """A whole scan; its remarks."""
+        """Write a whole scan; returns its remarks."""
         self.writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock())
         return self.go_on(self.writer)
 
     def begin(self) -> Path:
-        """A scan beside that lacks the last frames, its writer waiting."""
+        """Start another scan without the last frames; its writer waits."""
         self.writer = NXtomoWriter(self._note.with_name("begun.h5"), INFO, SHAPE, clock=SystemClock())
         for frame, about in zip(FRAMES[:-2], DIGESTS, strict=False):
             self.writer.append(frame, about)
         return self.writer.path
 
     def end(self) -> int:
-        """Go on with the scan that `begin` began, in a copy of its file; its remarks."""
+        """Continue the scan that `begin` started, in a copy of its file; returns its remarks."""
         assert self.writer is not None
         copy = os.open(self.scan, os.O_RDWR)
         os.dup2(copy, self.writer._file.id.get_vfd_handle())
@@ -213,12 +214,12 @@ class Rig:
         return len(writer.remarks)
 
     def committed(self) -> int:
-        """Frames that the last `write` knew to be safe."""
+        """Number of frames that were committed in the last `write`."""
         said = self._note.with_name("committed").read_text().split()
         return int(said[-1]) if said else 0
 
     def died(self) -> Path:
-        """A scan whose writer was killed with rows that are not committed, to begin from."""
+        """A scan whose writer was killed with uncommitted rows, as a starting point."""
         self.fresh()
 
         def write() -> None:
@@ -234,7 +235,7 @@ class Rig:
 
 
 def _short(said: dict[str, Any]) -> Any:
-    """The value, or what went wrong in a line."""
+    """The value, or the error on one line."""
     if said["exit"]:
         return f"exit {said['exit']}"
     return said.get("refused") or said.get("traceback") or said["value"]
@@ -253,7 +254,7 @@ def close(rig: Rig) -> None:
             committed = max(rig.committed(), len(FRAMES) - 2)
             said(fault, n, done, rig.judged() | {"committed": committed})
     sys.stdout.flush()
-    os._exit(0)  # without the end of the writer
+    os._exit(0)  # without closing the writer
 
 
 def recovering(rig: Rig) -> None:
@@ -271,7 +272,8 @@ def recovering(rig: Rig) -> None:
 
 
 def cut(rig: Rig) -> None:
-    """The file system takes no file longer than a limit; `recover` under the same limit, and at each fourth without."""
+    """The file system limits the length of files; `recover` runs with the same limit, and for every fourth without
+    it."""
     rig.fresh()
     rig.do(rig.write)
     size = rig.scan.stat().st_size

@@ -1,4 +1,4 @@
-"""The tables of docs/file_layout.md, and what files hold, for tests that compare them."""
+"""The tables of docs/file_layout.md and the content of files, for tests that compare them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encodin
 
 
 def rows(title: str) -> list[list[str]]:
-    """Cells of the tables in a section of the page, without the heads; a row for each name in the first cell."""
+    """Cells of the tables in a section of the page without the headings; one row for each name in the first cell."""
     section = re.split(r"^#+ ", PAGE, flags=re.M)
     (text,) = [part for part in section if part.startswith(f"{title}\n")]
     lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
@@ -25,7 +25,7 @@ def names(title: str) -> list[str]:
 
 
 def unmatched(found: Iterable[str], named: Iterable[str]) -> tuple[set[str], set[str]]:
-    """What was found and is not on the page, and what the page names and was not found."""
+    """Names that were found but are not on the page, and names on the page that were not found."""
     found, pattern = set(found), {}
     for name in named:
         pattern[name] = re.compile(re.sub(r"<[^>]*>", "[^/]+", re.escape(name).replace(r"\ ", " ")) + r"\Z")
@@ -36,7 +36,7 @@ def unmatched(found: Iterable[str], named: Iterable[str]) -> tuple[set[str], set
 
 
 def paths(*files: Path) -> set[str]:
-    """Every dataset in HDF5 files, by every name that leads to it."""
+    """The paths of all datasets in HDF5 files, including links."""
     found: set[str] = set()
 
     def walk(group: h5py.Group) -> None:

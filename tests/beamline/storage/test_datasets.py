@@ -130,7 +130,9 @@ def test_a_chunk_that_the_memory_cannot_unpack_is_refused_before(
             del file[f"exchange/{name}"]
             file["exchange"].create_dataset(name, data=of, chunks=of.shape, compression=packed)
     if refused:
-        with pytest.raises(DataError, match=r"pieces of 2\.4 kB: to unpack one takes 4\.8 kB of memory, 1 kB are free"):
+        with pytest.raises(
+            DataError, match=r"chunks of 2\.4 kB: unpacking one needs 4\.8 kB of memory, and 1 kB are free"
+        ):
             open_scan(path)
     else:
         with open_scan(path) as scan:

@@ -1,4 +1,4 @@
-"""A disk that fails at any write, or holds something else: OSError, whatever HDF5 makes of it, and no half file."""
+"""A disk that fails at a write or contains something else: an OSError, whatever HDF5 reports, and no partial file."""
 
 from __future__ import annotations
 

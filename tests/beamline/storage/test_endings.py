@@ -1,4 +1,4 @@
-"""Every copy of a scan states how the scan ended, as the scan itself does; or it is refused."""
+"""Every copy of a scan states how the scan ended, as the scan itself does; otherwise there is an error."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_copy_states_how_its_scan_ended(scan: Callable[[str], Path], tmp_path:
             found.message for found in scan_ended(ScanEvidence(source))
         ]  # as validate, recon and its volume say it
     assert (ENDINGS[end].reason in "".join(warned)) and bool(warned) == (end != "complete")
-    assert all(f"with 4 of {VIEWS} views" in message for message in warned)
+    assert all(f"with 4 of {VIEWS} projections" in message for message in warned)
     if end != "failed":  # which states the most
         return
     again = tmp_path / "again.h5"

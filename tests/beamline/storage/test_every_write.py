@@ -1,4 +1,4 @@
-"""A scan file survives each of its last writes, and each write of `recover`: a kill there, or a disk that fails."""
+"""A scan file survives a kill or a disk error at each of its last writes, and at each write of `recover`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/file_layout.md names what is written, and nothing else."""
+"""docs/file_layout.md names exactly what is written."""
 
 from __future__ import annotations
 
@@ -104,7 +104,9 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         events += [json.loads(line) for line in done.stdout.splitlines()]
     record = read_reconstruction(tmp_path / "bars.h5")
-    assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
+    assert re.match(
+        "The scan ended with the status 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"])
+    )
     fitted, centres = read_reconstruction(tmp_path / "r2.h5"), np.ones((SCAN.angles.size, 3))
     rest = {"view_centres_mm": centres, "roi": "0:4,0:4,0:4", "roi_found": "4 of 8 slices", "frames_per_view": 2}
     rest |= dict.fromkeys(("frames_unmeasured_in_part", "rows_unmeasured"), np.arange(2))

@@ -1,4 +1,4 @@
-"""The legend in a file says which check each bit of the flags stands for, also to programs that know other checks."""
+"""The legend in a file gives the check for each flag bit, also for programs with other checks."""
 
 from __future__ import annotations
 

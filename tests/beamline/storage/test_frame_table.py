@@ -1,4 +1,4 @@
-"""FrameTable: index maps keep every fact of a frame with it."""
+"""FrameTable: selecting and reordering keeps every fact with its frame."""
 
 from __future__ import annotations
 

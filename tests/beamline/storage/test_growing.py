@@ -1,4 +1,4 @@
-"""A growing file: followed by others, left behind by a killed writer, locked by a stranger."""
+"""A growing file: followed by others, left by a killed writer, locked by another program."""
 
 from __future__ import annotations
 

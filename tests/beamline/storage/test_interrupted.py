@@ -1,4 +1,4 @@
-"""A run that ended early: every command says the same of it, and takes the folder of a run as its scan or volume."""
+"""A run that ended early: all commands describe it in the same way, and accept its folder as scan or volume."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def beamline(*words: Any) -> Result:
 
 def _both(run: Path) -> str:
     return (
-        f"`beamline scan --resume {run}` takes what is missing, `beamline recover {run}` makes an ordinary file of the "
-        "frames that are there."
+        f"`beamline scan --resume {run}` takes the missing projections, `beamline recover {run}` makes an ordinary "
+        "file of the complete frames."
     )
 
 
@@ -62,23 +62,27 @@ def test_all_commands_say_the_same_of_a_scan_that_died(
     monkeypatch.chdir(tmp_path)
     command, *options = words
     result = beamline(command, died.parent if command == "runs" else died, *options)
-    assert f"Its scan has died: {_both(died)}" in result.output
+    assert f"The process of its scan was killed: {_both(died)}" in result.output
 
 
 def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_recovered(
     died: Path, tmp_path: Path
 ) -> None:
     scan, alone = died / "scan.h5", tmp_path / "alone.h5"
-    assert next_step(scan) == f"Its scan has died: {_both(died)}"
+    assert next_step(scan) == f"The process of its scan was killed: {_both(died)}"
     shutil.copy2(scan, alone)
-    said = f"Its scan has died: `beamline recover {alone}` makes an ordinary file of the frames that are there."
+    said = (
+        f"The process of its scan was killed: `beamline recover {alone}` makes an ordinary file of the complete frames."
+    )
     assert next_step(alone) == said
     for file in (scan, alone):
         os.utime(file)
-    assert next_step(scan) == f"Its scan has died: {_both(died)}"
-    assert next_step(alone).startswith("Its scan has died, unless a program still writes to it: ")  # perhaps no locks
+    assert next_step(scan) == f"The process of its scan was killed: {_both(died)}"
+    assert next_step(alone).startswith(
+        "The process of its scan was killed, unless a program is still writing to it: "
+    )  # perhaps no locks
     for lock in (WriterLock(scan), WriterLock(died / "config.resolved.yaml", exclusive=True)):
-        assert next_step(scan).startswith(f"Its scan still runs: `beamline watch {died}`")
+        assert next_step(scan).startswith(f"Its scan is still running: `beamline watch {died}`")
         assert "recover" not in next_step(scan)
         lock.release()
 
@@ -87,7 +91,7 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
 @pytest.mark.parametrize("end", ["stopped", "aborted"])
 def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_path: Path, end: str) -> None:
     run = ended_run(tmp_path, end, at=AT)
-    said = f"It ended early: `beamline scan --resume {run}` takes what is missing."
+    said = f"It ended early: `beamline scan --resume {run}` takes the missing projections."
     assert next_step(run / "scan.h5") == said
     assert said in beamline("validate", run).output
     assert said in beamline("recon", run, "-m", "fbp", "-o", tmp_path / "part.h5", "--no-report").output
@@ -103,8 +107,8 @@ def test_nobody_is_told_to_continue_a_ride(tmp_path: Path) -> None:
         with (run / "config.resolved.yaml").open("a") as config:
             config.write("\nride: {image: pva://X:Pva1:Image}\n")
     died, stopped = (next_step(next((tmp_path / end).rglob("scan.h5"))) for end in ("killed", "stopped"))
-    assert died.startswith("Its scan has died: `beamline recover ") and "--resume" not in died
-    assert stopped == "It ended early, as a ride, which cannot be continued."
+    assert died.startswith("The process of its scan was killed: `beamline recover ") and "--resume" not in died
+    assert stopped == "It ended early. It recorded the scan of another program, so it cannot be continued."
 
 
 def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) -> None:
@@ -118,7 +122,7 @@ def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) ->
 
 
 def test_the_folder_of_a_run_is_its_volume(ended: Path) -> None:
-    with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes one"):
+    with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes it"):
         volume_file(ended)
     (ended / "recon.h5").touch()
     assert volume_file(ended) == ended / "recon.h5"
@@ -127,7 +131,7 @@ def test_the_folder_of_a_run_is_its_volume(ended: Path) -> None:
 def test_other_folders_and_files_are_what_they_are(ended: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=f"as {ended}"):
         scan_file(ended.parent)
-    with pytest.raises(DataError, match="is a folder of runs"):
+    with pytest.raises(DataError, match="contains several runs"):
         volume_file(ended.parent)
     (tmp_path / "slices").mkdir()
     for path in (tmp_path / "slices", tmp_path / "missing.h5"):

@@ -1,4 +1,4 @@
-"""File systems without locks, and files that another program holds: the cause and a way out, and nothing half made."""
+"""File systems without locks, and files open in another program: cause and remedy, no partial file."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_file_that_another_program_has_open_to_write(tmp_path: Path) -> None:
         [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout is not None and other.stdout.readline().strip() == "ready"
-        with pytest.raises(DataError, match=f"open to write.*{WITHOUT}"):
+        with pytest.raises(DataError, match=f"open for writing.*{WITHOUT}"):
             hdf5.open_hdf5(path)
         other.communicate("")
     with hdf5.open_hdf5(path) as file:
@@ -142,5 +142,5 @@ def test_all_of_it_in_one_process(shim: Path, finished: Path, tmp_path: Path) ->
     assert done.returncode == 0, done.stdout + done.stderr
     first, second, third = done.stdout.splitlines()
     assert "has no file locks (errno 37)" in first and "(errno 95)" in second and WITHOUT in first
-    assert "is held by another program" in third and WITHOUT in third
+    assert "is open for writing in another program" in third and WITHOUT in third
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""A scan that is open twice in a program is read as it was written, while it grows and afterwards: HDF5 shares it."""
+"""A scan opened twice in one program is read as written, while it grows and afterwards (HDF5 shares it)."""
 
 from __future__ import annotations
 
@@ -88,6 +88,6 @@ def test_a_file_open_by_h5py_itself_keeps_its_frames_and_gets_no_view(tmp_path: 
     with writer(path) as writing:
         mine = h5py.File(path, "r", swmr=True)
     mine.close()
-    assert "open by h5py" in writing.remarks[0]
+    assert "open with h5py" in writing.remarks[0]
     with open_scan(path) as source:
         assert is_as_written(source, N)

@@ -1,4 +1,4 @@
-"""Packed numbers are read as the values that CF and CIL say, in any dataset of a scan, or refused by name."""
+"""Packed numbers are read as the values that CF and CIL define, in any dataset, or end with an error by name."""
 
 from __future__ import annotations
 
@@ -142,5 +142,7 @@ def test_sources_of_a_virtual_dataset_that_are_packed(tmp_path: Path, said: bool
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), 0.5 * np.concatenate([stored, stored + 1]))
     else:
-        with pytest.raises(DataError, match=r"/d in .*s.h5 draws on d in .*part_0.h5, whose attributes \(scale_factor"):
+        with pytest.raises(
+            DataError, match=r"/d in .*s.h5 is a virtual.*d in .*part_0.h5, are packed \(attributes scale_factor"
+        ):
             open_scan(scan)

@@ -1,4 +1,4 @@
-"""What a library says of a file's content makes a damaged file; a mistake of a reader is a defect."""
+"""An error of a library about file content means a damaged file; an error of our reader is a defect."""
 
 from __future__ import annotations
 
@@ -59,6 +59,6 @@ def test_other_content_than_promised_is_a_damaged_file(ask: Callable[[h5py.File]
     with h5py.File(path, "w") as file:
         file.create_group("group").attrs["text"] = "words"
         file["list"], file["number"], file["word"], file["empty"] = np.zeros(3), 1.0, "words", h5py.Empty("f4")
-    told = r"s\.h5 is damaged, or its structure is unexpected"
+    told = r"s\.h5 is damaged or has an unexpected structure"
     with h5py.File(path) as file, pytest.raises(DataError, match=told), hdf5.readable(path):
         ask(file)

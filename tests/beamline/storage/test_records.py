@@ -1,4 +1,4 @@
-"""What a row of the frame log says of its frame has a checksum: a row that says something else is used by nobody."""
+"""Rows of the frame log have a checksum; a row that was changed is not used."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: 
         assert np.flatnonzero(source.table.kinds == FrameKind.INVALID).tolist() == [ROW]
         assert sum(1 for _ in replay(source)) == len(frames)  # and does not count to 2**61
     assert [f.severity for f in validate(path) if f.rule == "records"] == ["error"]
-    assert any("Look for a good copy" in said for said in describe(path)["findings"])
+    assert any("Look for an intact copy" in said for said in describe(path)["findings"])
     with h5py.File(path) as file:
         assert len(frames_in(file).numbers_taken()) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
-    with pytest.raises(DataError, match=rf"it: {ROW}\..* Nothing was written"):
+    with pytest.raises(DataError, match=rf"stored with them: {ROW}\..* Nothing was written"):
         ingest(path, path.with_name("copy.h5"))
 
 
@@ -61,7 +61,9 @@ def test_recover_says_it(path: Path, frames: list[Frame]) -> None:
     before = path.read_bytes()
     done = recover(path)
     assert (done.changed, done.altered) == (False, (ROW,))
-    assert f"with {len(frames)} frames; with another record than was written: frame {ROW};" in done.in_words()
+    assert (
+        f"with {len(frames)} frames; records differ from the checksum stored with them: frame {ROW}." in done.in_words()
+    )
     assert path.read_bytes() == before
 
 

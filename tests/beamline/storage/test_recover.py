@@ -1,4 +1,4 @@
-"""A file whose writer died becomes an ordinary one: every committed frame, nothing that was not, in any program."""
+"""The file of a killed writer becomes an ordinary one with exactly the committed frames, for any program."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: SteppedC
     writer = _written(tmp_path / "s.h5", frames[:5], clock)
     before = (tmp_path / "s.h5").read_bytes()
     _aged(tmp_path / "s.h5")  # its writer waits: for a motor, the operator, or a long exposure
-    with pytest.raises(DataError, match=r"that still runs.*Nothing was changed"):
+    with pytest.raises(DataError, match=r"that is still running.*Nothing was changed"):
         recover(tmp_path / "s.h5")
     assert (tmp_path / "s.h5").read_bytes() == before
     writer.close()
@@ -111,7 +111,7 @@ def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
         shutil.copy(tmp_path / "s.h5", tmp_path / "died.h5")
     done = recover(_aged(tmp_path / "died.h5"))
     assert (done.changed, done.altered) == (True, (4,))
-    assert "10 frames recovered; with another record than was written: frame 4." in done.in_words()
+    assert "10 frames recovered; records differ from the checksum stored with them: frame 4." in done.in_words()
 
 
 @pytest.mark.parametrize("ahead", [1e3, 1e6])
@@ -264,7 +264,7 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             np.testing.assert_allclose(source.table.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
         assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
         if (kept := folder / "s.h5.damaged").exists():
-            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.in_words()
+            assert kept.read_bytes() == state and f"The damaged file was renamed to {kept} now" in done.in_words()
             anew += 1
         assert not recover(folder / "s.h5").changed
     assert anew  # ways that HDF5 cannot end such a file by

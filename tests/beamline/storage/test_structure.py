@@ -1,4 +1,4 @@
-"""A file that draws on a pipe, is nested without end or claims more than a scan has is refused before it is read."""
+"""A file that reads from a pipe, is nested without end or claims impossible sizes ends with an error before reading."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_scan_that_draws_on_a_pipe(tmp_path: Path, path: Path, draw: Callable[
         draw(file, "pipe")
     open_scan(path).close()
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(DataError, match=r"links to .*or a pipe"):
+    with pytest.raises(DataError, match=r"has a link to .*or a pipe"):
         open_scan(path)
 
 
@@ -57,13 +57,13 @@ def test_values_that_are_the_bytes_of_another_file_and_claims_without_bytes(tmp_
     with h5py.File(path, "r+") as file:
         del file["entry/notes"]
         file.create_dataset("entry/notes", (2**31,), "u1", chunks=(2**31,), compression="gzip")
-    with pytest.raises(DataError, match=r"claims 2\.15 GB"):
+    with pytest.raises(DataError, match=r"states 2\.15 GB"):
         open_scan(path)
     with h5py.File(path, "r+") as file:  # a chunk of 512 MiB, of which the dataset shows ten values
         del file["entry/notes"]
         notes = file.create_dataset("entry/notes", (10,), "u1", chunks=(2**29,), maxshape=(None,), compression="gzip")
         notes.id.write_direct_chunk((0,), zlib.compress(bytes(10**6)))
-    with pytest.raises(DataError, match=r"claims 0\.537 GB"):
+    with pytest.raises(DataError, match=r"states 0\.537 GB"):
         open_scan(path)
 
 

@@ -1,4 +1,4 @@
-"""Volume files: what is written by other hands is read as it is, and what is no volume is refused by name."""
+"""Volume files: files of other programs are read; files that are not volumes end with an error by name."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ def test_arrays_tiffs_and_hdf5_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_volume(tmp_path / "two.npz", "b")[0], VALUES + 1)
     np.testing.assert_array_equal(read_volume(tmp_path / "v.h5", "entry/data/data")[0], VALUES)
     for name, dataset, said in (
-        ("two.npz", None, r"holds 2 volumes \(a, b\)"),
+        ("two.npz", None, r"contains 2 volumes \(a, b\)"),
         ("two.npz", "c", "has no array 'c'"),
         ("v.h5", "entry/data", "has no dataset 'entry/data'"),
-        ("v.npy", "volume", "holds one volume"),
+        ("v.npy", "volume", "contains one volume"),
         ("none.npy", None, "does not exist"),
     ):
         with pytest.raises(DataError, match=said):
@@ -109,7 +109,7 @@ def test_a_volume_that_memory_cannot_hold_is_refused_before_it_is_read(
         file["volume"] = VALUES
     read_volume(tmp_path / name)
     monkeypatch.setattr("beamline.storage.array_file.free_memory", lambda: VALUES.nbytes - 1)
-    with pytest.raises(DataError, match=r"holds 4\.8e-08 GB"):
+    with pytest.raises(DataError, match=r"states 4\.8e-08 GB"):
         read_volume(tmp_path / name)
 
 

@@ -1,4 +1,4 @@
-"""Causes: what loaders, operating systems and servers say, in a sentence and the way on."""
+"""Causes: messages of loaders, operating systems and servers as a sentence with a remedy."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from drivers.base.causes import of_bytes, of_library, of_port
 
 NOT_FOUND = "cannot open shared object file: No such file or directory"
 LOADERS = {
-    "{0}: wrong ELF class: ELFCLASS32": ("it is for 32 bits", "for this Python"),
-    f"{{0}}: {NOT_FOUND}": ("for another kind of computer", "for this computer"),
+    "{0}: wrong ELF class: ELFCLASS32": ("it is a 32-bit library", "for this Python"),
+    f"{{0}}: {NOT_FOUND}": ("for another processor", "for this processor"),
     f"libusb-1.0.so.0: {NOT_FOUND}": (
-        "it needs libusb-1.0.so.0, which is not found",
-        "Install what has libusb-1.0.so.0",
+        "it needs libusb-1.0.so.0, which was not found",
+        "Install the package that contains libusb-1.0.so.0",
     ),
-    "{0}: undefined symbol: dcam_new": ("dcam_new is missing", "for this system"),
-    "/lib/libc.so.6: version `GLIBC_2.38' not found (required by {0})": ("`GLIBC_2.38' is missing", "for this system"),
-    "{0}: invalid ELF header": ("no library that can be loaded", "Check the file"),
-    "{0}: file too short": ("no library that can be loaded", "Check the file"),
-    "[WinError 193] %1 is not a valid Win32 application": ("another kind of computer", "for this computer"),
+    "{0}: undefined symbol: dcam_new": ("dcam_new is missing", "for this operating system"),
+    "/lib/libc.so.6: version `GLIBC_2.38' not found (required by {0})": (
+        "`GLIBC_2.38' is missing",
+        "for this operating system",
+    ),
+    "{0}: invalid ELF header": ("not a library that can be loaded", "Check the file"),
+    "{0}: file too short": ("not a library that can be loaded", "Check the file"),
+    "[WinError 193] %1 is not a valid Win32 application": ("another processor", "for this processor"),
     "Could not find module '{0}' (or one of its dependencies).": ("a library that it needs", "with all its parts"),
     "dlopen({0}, 10): Library not loaded: @rpath/libusb.dylib": ("needs @rpath/libusb.dylib", "@rpath/libusb.dylib"),
-    "dlopen({0}, 10): (mach-o file, but is an incompatible architecture)": ("another kind", "for this computer"),
+    "dlopen({0}, 10): (mach-o file, but is an incompatible architecture)": ("another processor", "for this processor"),
 }
 
 
@@ -66,14 +69,14 @@ def test_the_group_that_owns_a_port_is_named(tmp_path: Path) -> None:
 
 
 PORTS = {
-    "another program": (serial.SerialException(errno.EBUSY, "busy"), "Another program holds it"),
-    "exclusive": (serial.SerialException(errno.EAGAIN, "Could not exclusively lock port"), "Another program holds it"),
+    "another program": (serial.SerialException(errno.EBUSY, "busy"), "Another program uses it"),
+    "exclusive": (serial.SerialException(errno.EAGAIN, "Could not exclusively lock port"), "Another program uses it"),
     "on Windows": (
         serial.SerialException("could not open port 'COM3': PermissionError(13, 'Zugriff verweigert', None, 5)"),
-        "Another program holds it",
+        "Another program uses it",
     ),
-    "not there": (serial.SerialException(errno.ENOENT, "no such file"), "Check the cable, the port's name"),
-    "a URL of another kind": (ValueError("invalid URL"), "Check the cable, the port's name"),
+    "not there": (serial.SerialException(errno.ENOENT, "no such file"), "Check the cable, the name of the port"),
+    "a URL of another kind": (ValueError("invalid URL"), "Check the cable, the name of the port"),
 }
 
 
@@ -86,7 +89,7 @@ def test_what_to_do_about_a_port_that_does_not_open(what: str) -> None:
 def test_a_server_that_refuses_is_told_from_a_cable() -> None:
     with pytest.raises(serial.SerialException) as refused:
         serial.serial_for_url("socket://127.0.0.1:1")
-    assert "takes no further client" in of_port("socket://127.0.0.1:1", refused.value)
+    assert "accepts no further client" in of_port("socket://127.0.0.1:1", refused.value)
 
 
 def test_bytes_of_telnet_are_noise_on_a_serial_line() -> None:

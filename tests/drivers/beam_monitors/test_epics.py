@@ -1,4 +1,4 @@
-"""The ring current from a process variable of an IOC of ours."""
+"""The ring current from a process variable of a test IOC."""
 
 from __future__ import annotations
 

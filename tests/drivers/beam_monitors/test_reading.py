@@ -1,4 +1,4 @@
-"""Beam monitors: a number out of text, over a local web server that misbehaves and an electrometer's wire."""
+"""Beam monitors: a number read from text, from a misbehaving local web server and from an electrometer."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_a_page(kind: str) -> None:
 @pytest.mark.parametrize(("status", "reason"), [(404, "404 Not Found"), (503, "503 Service Unavailable")])
 def test_a_page_that_is_an_error(status: int, reason: str) -> None:
     """Even where the error's own page holds a number."""
-    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answers {reason}"):
+    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answered {reason}"):
         ring(url).reading()
 
 

@@ -1,4 +1,4 @@
-"""Fixtures for tests of the DCAM driver: the fake library, the world around it, a camera."""
+"""Fixtures for tests of the DCAM driver: the fake library, its environment, a camera."""
 
 from __future__ import annotations
 

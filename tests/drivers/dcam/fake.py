@@ -1,4 +1,4 @@
-"""The fake DCAM library: compiled with gcc, and the hand that plays the world outside it."""
+"""The fake DCAM library, compiled with gcc, and the object that controls the world around it."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def test_a_library_that_would_end_or_hang_this_process_is_refused(
     source.write_text(text)
     command = [compiler(), "-w", "-shared", "-fPIC", str(source), "-o", str(library)]
     subprocess.run(command, check=True)
-    with pytest.raises(DeviceError, match=rf"library .*libfatal\.so {words}.*vendor's DCAM-API.*a process of its own"):
+    with pytest.raises(DeviceError, match=rf"library .*libfatal\.so {words}.*vendor's DCAM-API.*a separate process"):
         abi.Dcam(library, "camera")
 
 
@@ -140,12 +140,14 @@ def test_a_library_that_lacks_another_names_it(tmp_path: Path) -> None:
         command = [compiler(), "-w", "-shared", "-fPIC", str(file.with_suffix(".c")), "-o", str(file), *more]
         subprocess.run(command, check=True)
     needed.unlink()
-    with pytest.raises(DeviceError, match=r"needs libneeded\.so, which is not found .*Install what has libneeded\.so"):
+    with pytest.raises(
+        DeviceError, match=r"needs libneeded\.so, which was not found .*Install the package that contains libneeded\.so"
+    ):
         abi.Dcam(library, "camera")
 
 
 @pytest.mark.parametrize(
-    ("at", "byte", "words"), [(4, 1, "it is for 32 bits"), (18, 0xF3, "it is for another kind of computer")]
+    ("at", "byte", "words"), [(4, 1, "it is a 32-bit library"), (18, 0xF3, "it was built for another processor")]
 )
 def test_a_library_for_another_computer_is_named(
     fake_library: Path, tmp_path: Path, at: int, byte: int, words: str

@@ -1,4 +1,4 @@
-"""Acquisition over the fake library: every frame once, pixels right, every loss visible, nothing left open."""
+"""Acquisition with the fake library: every frame once, right pixels, every loss reported, everything closed."""
 
 from __future__ import annotations
 

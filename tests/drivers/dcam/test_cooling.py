@@ -1,4 +1,4 @@
-"""Waiting for the cold: until the cooler is ready, or where it does not say so, until the temperature is steady."""
+"""Waiting until the camera is cold: the cooler is ready or, if it does not report that, the temperature is steady."""
 
 from __future__ import annotations
 

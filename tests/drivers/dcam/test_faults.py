@@ -1,4 +1,4 @@
-"""Every call of the library fails in turn, or the cable comes out there: one error by name, and a new camera works."""
+"""Every library call fails in turn, or the cable is pulled there: one named error, and a new camera works."""
 
 from __future__ import annotations
 

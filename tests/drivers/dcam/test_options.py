@@ -1,4 +1,4 @@
-"""Options of the trigger and of counts: each reaches the camera, is read back, and does what it says."""
+"""Options for trigger and counts: each one reaches the camera, is read back, and has its effect."""
 
 from __future__ import annotations
 

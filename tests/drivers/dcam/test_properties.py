@@ -1,4 +1,4 @@
-"""Settings: applied, read back, refused without a trace; timing as the camera says."""
+"""Settings: applied, read back, or rejected without a change; timing as the camera reports it."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def test_exposure_is_the_value_that_the_camera_accepted(camera: DcamCamera) -> N
         ({"roi": (0, 0, 30, 40)}, r"set SUBARRAYVSIZE = 32 instead of 30\..* legal: 4 to 48 in steps of 4"),
         (
             {"roi": (32, 0, 32, 40)},
-            r"region \(32, 0, 32, 40\) .* does not lie on the sensor\. Expected a region within 48 x 72",
+            r"region \(32, 0, 32, 40\) .* extends beyond the sensor\. Expected a region within 48 x 72",
         ),
-        ({"roi": (0, 0, 96, 40)}, "does not lie on the sensor"),
+        ({"roi": (0, 0, 96, 40)}, "extends beyond the sensor"),
         ({"readout": "fast"}, r"no readout 'fast'\..* legal: standard, ultra_quiet"),
     ],
 )
@@ -76,7 +76,7 @@ def test_what_another_program_left_is_undone(
 
 def test_bundled_frames_are_refused(camera: DcamCamera, world: World) -> None:
     world.override(Property.FRAMEBUNDLE_MODE, 2)
-    with pytest.raises(DeviceRefused, match=r"bundles several frames.*larger region"):
+    with pytest.raises(DeviceRefused, match=r"combines several frames.*larger region"):
         camera.configure(EXTERNAL)
 
 

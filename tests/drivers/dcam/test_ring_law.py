@@ -1,4 +1,4 @@
-"""The law of the ring: whatever comes and whenever it is taken, a frame is handed out once, in order, or counted."""
+"""The ring buffer: each frame is handed out once, in order, or counted as lost, whatever the timing."""
 
 from __future__ import annotations
 

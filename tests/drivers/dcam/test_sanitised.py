@@ -1,4 +1,4 @@
-"""The suite again over a fake compiled with address and undefined-behaviour sanitisers: the ABI is used as C allows."""
+"""The same tests with a fake compiled with address and undefined-behaviour sanitisers: the ABI is used correctly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""USB preflight over a fake pyusb backend: real pyusb, invented bus."""
+"""USB preflight with a fake pyusb backend: real pyusb, invented bus."""
 
 from __future__ import annotations
 

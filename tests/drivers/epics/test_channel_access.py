@@ -1,4 +1,4 @@
-"""The same by Channel Access: aioca against a soft IOC of caproto, which is a program of its own."""
+"""The same over Channel Access: aioca with a soft IOC of caproto in a separate program."""
 
 from __future__ import annotations
 

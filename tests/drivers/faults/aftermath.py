@@ -1,4 +1,4 @@
-"""What must hold after any fault: one error with all its parts, an instrument at rest, a file, and the next scan."""
+"""What must hold after any fault: one complete error, an instrument at rest, a file, and a working next scan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PARTS = ("device", "problem", "request", "expected", "advice", "state")
 
 
 def assert_speaks(error: BaseException | None, device: str, replied: bool = True) -> None:
-    """It names the device, what was asked, what came back, what was expected, what to do, and what has (not) moved."""
+    """Assert that an error names device, request, reply, expectation, remedy, and what has (not) moved."""
     assert isinstance(error, DeviceError), error
     assert error.device == device
     wanted = (*PARTS, "reply") if replied else PARTS
@@ -27,14 +27,14 @@ def assert_speaks(error: BaseException | None, device: str, replied: bool = True
 
 
 def assert_reported_once(scanned: Scanned) -> None:
-    """The run fails once, with the words of the error that it raises, which is not among the warnings too."""
+    """Assert that the run fails once, with the words of its error, and that this error is not also a warning."""
     assert scanned.error is not None
     assert [event.data["message"] for event in scanned.of("failed")] == [str(scanned.error)]
     assert str(scanned.error) not in scanned.warnings
 
 
 def assert_at_rest(rig: Rig, scanned: Scanned) -> None:
-    """The stage stands, the shutter is closed, nothing of the library is open, and the run says that it is safe."""
+    """Assert that the stage stands still, shutter and library are closed, and the run reports a safe state."""
     assert not rig.moving
     assert not rig.shutter_open
     assert rig.world.live == 0
@@ -43,19 +43,19 @@ def assert_at_rest(rig: Rig, scanned: Scanned) -> None:
 
 
 def assert_known_to_be_unsafe(rig: Rig, scanned: Scanned) -> None:
-    """The line is gone, so nothing can be done: that is what the run must say."""
+    """Assert that the run says that it can do nothing, because the line is gone."""
     assert rig.world.live == 0
     messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.FINISHING]
     assert messages == [UNSAFE]
     text = " ".join([*scanned.warnings, str(scanned.error)])
-    assert "The device may still be doing what it did before" in text
+    assert "The device may still be carrying out the earlier request" in text
     if rig.shutter_open:
         assert "shutter: it could not be closed" in text
-        assert "look before anybody goes near the beam" in text
+        assert "before anybody goes near the beam" in text
 
 
 def assert_kept(scanned: Scanned, views: list[int] | None = None, invalid: int = 0) -> None:
-    """A readable file with darks, flats and these views (None: the first ones of the scan, however many)."""
+    """Assert a readable file with darks, flats and these projections (None: the first ones, any number)."""
     rows = scanned.rows()
     taken = rows[FrameKind.PROJECTION]
     assert taken == (list(range(len(taken))) if views is None else views)
@@ -74,20 +74,20 @@ def assert_complete(scanned: Scanned) -> None:
 
 
 def assert_next_scan_works(rig: Rig, runs: Path, tells: str = "") -> None:
-    """In the same process, over the same controller and library.
+    """Assert that the next scan works in the same process with the same controller and library.
 
     Args:
-        tells: regular expression of what the controller still has of the fault. The next scan warns of it, the one
-            after does not. "": no scan has a warning.
+        tells: regular expression for what the controller still remembers of the fault. The next scan warns about it,
+            the one after does not. "": no scan has a warning.
     """
-    rig.clock.sleep(30.0)  # a stage that could not be stopped stands by itself
+    rig.clock.sleep(30.0)  # a stage that could not be stopped comes to rest by itself
     rig.repair()
     for words in (tells, "") if tells else ("",):
         scanned = rig.scan(runs)
         assert_complete(scanned)
         if words:
             (warning,) = scanned.warnings
-            assert re.fullmatch(rf"stage: before it was opened: {words}\.", warning), warning
+            assert re.fullmatch(rf"stage: settings before it was opened: {words}\.", warning), warning
         else:
             assert scanned.warnings == []
         assert_at_rest(rig, scanned)

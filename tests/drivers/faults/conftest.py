@@ -13,11 +13,11 @@ from tests.drivers.faults.rig import Rig
 
 @pytest.fixture(scope="session")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Path of the compiled library; skips where there is no compiler."""
+    """Path of the compiled library; the test is skipped if there is no compiler."""
     return build(tmp_path_factory.mktemp("fakedcam"))
 
 
 @pytest.fixture
 def rig_of(library: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
-    """Makes the rig with a controller of that kind, and what else `Rig` takes."""
+    """Function that makes a rig with a controller of a kind, and further arguments of `Rig`."""
     return lambda kind, **settings: Rig(World(library), monkeypatch, kind, **settings)

@@ -1,4 +1,4 @@
-"""An instrument that breaks on request: real drivers, put together from a real configuration, on one virtual clock.
+"""An instrument that fails on request: real drivers, a real configuration, one virtual clock.
 
 The configuration names a serial port and a DCAM library; the port is a simulated controller behind a cable that can be
 disturbed or pulled out, the library is the fake one. A scan opens, runs and closes all of it, as at an instrument.

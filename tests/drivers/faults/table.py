@@ -1,4 +1,4 @@
-"""The fault table: what breaks, how a scan must end, and for each controller why a fault is not its own.
+"""The fault table: what breaks, how a scan must end, and which faults a controller cannot have.
 
 docs/faults.md has a row for each of these, with the same names; `test_page` keeps them the same.
 """
@@ -135,8 +135,8 @@ UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
 NOT_RESTORED: Mapping[str, str] = MappingProxyType(
     {
-        kind: f"a program that was killed, or lost this stage, left {settings}; "
-        "what stood there before is restored at the end"
+        kind: f"a program that was killed, or lost this stage, changed {settings}; "
+        "the values from before are restored at the end"
         for kind, settings in {
             "pm16c": r"RTE 042 for 024, SPDH \d+ for 1000",
             "pi_gcs": r"VEL \d+\.0{6} for 10\.0{6}, SPA 0xB 60\.0{6} for 100\.0{6}, SPA 0xC 60\.0{6} for 100\.0{6}",

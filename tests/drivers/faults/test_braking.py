@@ -1,4 +1,4 @@
-"""Noise on the trigger line while a stage brakes for a stop: every view that is kept was taken where the file says."""
+"""Noise on the trigger line while a stage brakes: every kept projection was taken at the angle in the file."""
 
 from __future__ import annotations
 

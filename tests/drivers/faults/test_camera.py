@@ -1,4 +1,4 @@
-"""Faults of the camera: at each call of its library, and what frames, triggers and links can do."""
+"""Camera faults: at each library call, and of frames, triggers and links."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_triggers_too_fast(rig: Rig, tmp_path: Path) -> None:
     reported = rig.world.value(Property.TIMING_MINTRIGGERINTERVAL)
     rig.at_frame[0] = lambda: rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, 0.15)
     scanned = rig.scan(tmp_path)
-    assert "a longer period_s leaves the camera more time" in str(scanned.error)
+    assert "A longer period_s gives the camera more time" in str(scanned.error)
     rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, reported)
     assert assert_lost(rig, scanned, tmp_path, "triggers too fast") == list(range(1, VIEWS, 2))
 

@@ -1,4 +1,4 @@
-"""Faults of the serial line on every controller, which share the phases of a scan; the plug is pulled in each."""
+"""Faults of the serial line for every controller, and a pulled plug, in each phase of a scan."""
 
 from __future__ import annotations
 

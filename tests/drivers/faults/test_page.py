@@ -1,4 +1,4 @@
-"""docs/faults.md has a row for each fault of the table and no other, with the words that tests find in the error."""
+"""docs/faults.md has exactly one row for each fault of the table, with the words of its error."""
 
 from __future__ import annotations
 

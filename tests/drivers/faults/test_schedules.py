@@ -1,4 +1,4 @@
-"""Seeded schedules of ports that die, for good or for a while, cameras that are unplugged, lost pulses, pauses, stops.
+"""Random schedules (seeded) of failing ports, unplugged cameras, lost pulses, pauses and stops.
 
 Every scan ends in a named state, as safe as its dead ports allow, without a thread, and with a file that says the
 truth.

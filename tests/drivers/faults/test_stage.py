@@ -30,7 +30,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     row.breaks(rig)
     scanned = rig.scan(tmp_path)
     assert_speaks(scanned.error, "stage")
-    assert re.search(rf"{row.words} 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
+    assert re.search(rf"{row.words} 38\.0000 deg.*It is at 2[1-5]\.", str(scanned.error))
     assert re.search(row.says[kind], str(scanned.error))
     assert_reported_once(scanned)
     assert scanned.warnings == []
@@ -65,7 +65,7 @@ def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     scanned = rig.scan(tmp_path)
     assert isinstance(scanned.error, LedgerError)
     assert row.words in str(scanned.error)
-    assert "Repeat these views, or reconstruct without them" in str(scanned.error)
+    assert "Repeat these projections, or reconstruct without them" in str(scanned.error)
     assert [index - table.FIRST_VIEW for index in scanned.error.missing] == list(row.missing)
     assert_reported_once(scanned)
     assert_at_rest(rig, scanned)

@@ -1,4 +1,4 @@
-"""Serial line with other framings: ends of lines, replies of several lines, checksums, control bytes, transcripts."""
+"""Serial line with other framings: line endings, multi-line replies, checksums, control bytes, transcripts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves."""
+"""Serial line: framing, timeouts and resynchronisation on a disturbed wire."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def test_a_device_that_never_stops_sending_is_named() -> None:
     line = connect(Echo({0: [(0.01 * k, b"x\r\n") for k in range(400)]}))
     with pytest.raises(DeviceError):
         ask(line, 1)
-    with pytest.raises(DeviceTimeout, match="without pause"):
+    with pytest.raises(DeviceTimeout, match="continuously"):
         ask(line, 2)
 
 

@@ -1,4 +1,4 @@
-"""Serial line: the end of it (closed, also by another thread), and that nothing stays open where it does not open."""
+"""Serial line: closing it (also from another thread); nothing stays open if opening fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fuzz of the serial line: whatever arrives, calls end in time, with a DeviceError or not, and step is found again."""
+"""Fuzzing the serial line: calls always end in time, with a DeviceError or not, and resynchronise."""
 
 from __future__ import annotations
 

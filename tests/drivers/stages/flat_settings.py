@@ -1,4 +1,4 @@
-"""Settings of a stage and builds of its simulated controller from keywords, for tests that change a few of them."""
+"""Settings of a stage and its simulated controller from keywords, for tests that change a few of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated controllers of all stages under one roof, for tests that every driver must pass."""
+"""The simulated controllers of all stages, for tests that every driver must pass."""
 
 from __future__ import annotations
 

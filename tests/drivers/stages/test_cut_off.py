@@ -1,4 +1,4 @@
-"""Every stage: a line that dies under a move, and a program that died before this one opens the stage."""
+"""Every stage: a line that fails during a move, and a start after a program that died."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every stage: figures that no stage has, other makers' controllers, a second program."""
+"""Every stage: impossible values, controllers of other makers, a second program."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_figures_that_no_stage_has_are_refused_before_anything_is_sent(rig_of: R
     rig.receive = lambda data: (heard.append(data), receive(data))[1]  # type: ignore[method-assign]
     value: Any
     for name, value in FIGURES:
-        with pytest.raises(ValueError, match=rf"{name}|rad is not|no room|float can resolve"):
+        with pytest.raises(ValueError, match=rf"{name}|rad is impossible|no room|float can resolve"):
             rig.open(**{name: value})
     assert heard == []
     rig.open().close()
@@ -121,7 +121,7 @@ def test_the_configured_serial_number_is_required(maker: str) -> None:
     serial = str(stage.describe()["serial"])
     stage.close()
     rig.open(serial=serial).close()
-    with pytest.raises(DeviceRefused, match=rf"another device answers.*{serial}.*42.*swapped.*Nothing has moved"):
+    with pytest.raises(DeviceRefused, match=rf"another device answered.*{serial}.*42.*swapped.*Nothing has moved"):
         rig.open(serial="42")
 
 

@@ -1,4 +1,4 @@
-"""Fuzz of every stage's driver: whatever its controller seems to say, calls end in time, by DeviceError at worst."""
+"""Fuzzing every stage driver: whatever the controller answers, calls end in time, with a DeviceError at worst."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Controllers without an answer to settings: a command that is lost, or arrives otherwise, is noticed at once."""
+"""Controllers that do not answer to settings: a lost or changed command is noticed at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers import pm16c_rig
 from tests.drivers.stages import pi_gcs_rig
 
-NOT_TAKEN = "was not taken.*{}.*Nothing has moved"
+NOT_TAKEN = "did not accept a setting.*{}.*Nothing has moved"
 LOST = [
     *(("pm16c", "open", lost, "", lost) for lost in ("RTE", "SETCH")),
     *(("pm16c", "move", lost, "", r"SPD\w+|ABS") for lost in ("SPDHB2500", "SPDHB", "ABSB")),
@@ -22,7 +22,7 @@ LOST = [
     *(("pm16c", "search", lost, "", lost) for lost in ("TMGC", "SPDH", "FDHP")),
     *(("pm16c", "end of a search", lost, "", lost) for lost in ("GTHP", "PSB")),
     *(("pi_gcs", "open", lost, "", NOT_TAKEN.format(lost)) for lost in ("ACC 1 60", "DEC 1 60", "SVO 1 1")),
-    *(("pi_gcs", "move", lost, "", f"was not taken.*{lost}") for lost in ("VEL 1 20", "MOV 1 30")),
+    *(("pi_gcs", "move", lost, "", f"did not accept a setting.*{lost}") for lost in ("VEL 1 20", "MOV 1 30")),
     *(
         ("pi_gcs", "arm", sent, arrives, rf"{sent}.*Nothing has moved")
         for sent, arrives in (
@@ -32,7 +32,7 @@ LOST = [
         )
     ),
     ("pi_gcs", "disarm", "TRO 2 0", "", "TRO 2 0"),
-    ("pi_gcs", "end of a search", "FRF 1", "", r"\(no reason given\).*not those"),
+    ("pi_gcs", "end of a search", "FRF 1", "", r"\(no reason given\).*do not count from"),
 ]  # fmt: skip
 """Controller, what is done, the command that is lost, what arrives instead, and what the error says."""
 

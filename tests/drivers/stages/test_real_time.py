@@ -1,4 +1,4 @@
-"""Every stage on real time, by pseudo-terminal and TCP: a search, a train, the plug."""
+"""Every stage in real time, over pseudo-terminal and TCP: homing, a trigger train, a pulled plug."""
 
 from __future__ import annotations
 
@@ -222,9 +222,9 @@ def test_a_plug_pulled_in_the_middle_of_a_move_is_one_error_that_says_so(kind: K
         stage.start_move(math.radians(90), math.radians(1))
         said = str(wait_and_unplug(real))
         assert "the port failed" in said
-        assert "may still be doing" in said
+        assert "may still be carrying out" in said
         for again in (stage.position, stage.moving, stage.stop, stage.abort):
-            with pytest.raises(DeviceError, match=r"may still be doing|no whole reply|still no answer"):
+            with pytest.raises(DeviceError, match=r"may still be carrying out|no whole reply|still no answer"):
                 again()
         stage.close()
     gc.collect()

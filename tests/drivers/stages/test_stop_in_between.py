@@ -1,4 +1,4 @@
-"""Every stage: a stop or an abort from another thread at any moment of a move's beginning wins."""
+"""Every stage: a stop or abort from another thread at any moment at the start of a move takes effect."""
 
 from __future__ import annotations
 

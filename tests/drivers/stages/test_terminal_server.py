@@ -1,4 +1,4 @@
-"""Stages behind a terminal server that does otherwise than pass bytes on: who speaks, or is silent, is named."""
+"""Stages behind a terminal server that does not just pass bytes: the message names who answers or is silent."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ FOREIGN = {
         {"first": b"Port already in use\r\n", "answer": b""},
         ("another client holds", "Close the other program"),
     ),
-    "serves another": ({"answer": b""}, ("no whole reply", "serve one client: another program may hold this port")),
+    "serves another": ({"answer": b""}, ("no whole reply", "allow one client only: another program may use this port")),
 }
 
 

@@ -1,4 +1,4 @@
-"""Travel: how near pulses may be, which trains a stage is given, and when it is seen to stand."""
+"""Travel: the least distance of pulses, the trains that a stage gets, and when it counts as standing still."""
 
 from __future__ import annotations
 

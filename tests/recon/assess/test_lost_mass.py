@@ -1,4 +1,4 @@
-"""Lost mass: weak matter that only FBP shows, above its own air."""
+"""Lost mass: weakly absorbing material that only FBP shows, above its own air level."""
 
 from __future__ import annotations
 

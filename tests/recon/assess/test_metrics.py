@@ -1,4 +1,4 @@
-"""Metrics against closed forms and against skimage."""
+"""Metrics compared with closed forms and with skimage."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def test_bad_input_is_refused() -> None:
         ssim2d(ones, ones)
     with pytest.raises(ValueError, match="z, y, x"):
         ssim3d(ones[0], ones[0])
-    with pytest.raises(ValueError, match="all voxels are 1"):
+    with pytest.raises(ValueError, match="all voxels have the value 1"):
         kmeans_mask(ones)
     with pytest.raises(ValueError, match="NaN"):
         kmeans_mask(ones * np.nan)

@@ -1,4 +1,4 @@
-"""Times are read and said in any unit."""
+"""Times are read and written in s, min and h."""
 
 from __future__ import annotations
 

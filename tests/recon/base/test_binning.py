@@ -1,4 +1,4 @@
-"""Binned pixels against sums written out, and against the geometry that goes with them."""
+"""Binned pixels compared with explicit sums, and with the geometry of binned pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wrong values of settings and arguments: the sentence names the setting, its value and what is expected."""
+"""Wrong values of settings and arguments: the message names the setting, its value and what is expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The empirical constants of recon: few, each with its evidence, and each used."""
+"""The empirical constants of recon: their number is limited, each states its evidence, and each is used."""
 
 from __future__ import annotations
 

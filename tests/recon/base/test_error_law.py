@@ -1,4 +1,4 @@
-"""The law of the error: gains in dB, against the error itself and as inequalities."""
+"""Error model: gains in dB compared with the error itself, and inequalities."""
 
 from __future__ import annotations
 

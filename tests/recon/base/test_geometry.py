@@ -1,4 +1,4 @@
-"""Geometry: that choosing, cutting and binning keep every ray where it was, and that nothing of it is lost."""
+"""Geometry: selecting, cropping and binning keep every ray at its position."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.recon.trigonometry import pixel_of
 def test_a_single_view_is_a_list_of_one_and_none_is_refused() -> None:
     views = Geometry.parallel([0.1, 0.2, 0.3], (2, 2))
     assert views.select(np.array([False, True, False])).angles.tolist() == [0.2]
-    with pytest.raises(ValueError, match="no views"):
+    with pytest.raises(ValueError, match="no projections"):
         views.select([])
 
 

@@ -1,4 +1,4 @@
-"""Rays of views: the convention, and the field that they see."""
+"""Rays of projections: the sign convention, and the field of view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grey windows separate the classes of a volume: air, matrix, dense matter, metal."""
+"""Grey windows separate the classes of a volume: air, matrix, dense material, metal."""
 
 from __future__ import annotations
 

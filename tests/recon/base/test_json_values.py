@@ -1,4 +1,4 @@
-"""What JSON has no type for becomes what it has, and numbers of Python's own JSON come back as they were."""
+"""Values without a JSON type are converted, and numbers of Python's JSON are read back unchanged."""
 
 from __future__ import annotations
 

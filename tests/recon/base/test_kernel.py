@@ -1,4 +1,4 @@
-"""The kernels' constants against integrals of their profiles, and their names and exponents in files."""
+"""The constants of the kernels compared with integrals of their profiles; their names and exponents in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Libraries are loaded whole: whenever a signal comes, its handler is called, and what was imported is not half."""
+"""Libraries are loaded completely: a signal during an import is handled after it."""
 
 import os
 import re

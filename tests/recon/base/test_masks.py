@@ -1,4 +1,4 @@
-"""Pixels that tell nothing: what stands in for them, and what they weigh."""
+"""Masked pixels: the values that replace them, and their weights."""
 
 from __future__ import annotations
 

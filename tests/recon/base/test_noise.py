@@ -1,4 +1,4 @@
-"""Noise of a scan: white noise, noise blurred after it arose, texture, scans of few rows."""
+"""Noise of a scan: white noise, blurred noise, texture, scans with few rows."""
 
 from __future__ import annotations
 

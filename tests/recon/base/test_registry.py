@@ -1,4 +1,4 @@
-"""What other packages add to a registry, and what is left out with a warning."""
+"""Additions of other packages to a registry, and additions that are left out with a warning."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def test_the_plug_ins_of_a_kind_come_by_name(announced: list[EntryPoint]) -> Non
 @pytest.mark.parametrize(
     ("points", "said"),
     [
-        ([("old", "math:e")], r"'old' \(math:e\) was left out: .*taken by splatline"),
-        ([("twice", "math:e"), ("twice", "math:tau")], r"taken by another plug-in"),
+        ([("old", "math:e")], r"'old' \(math:e\) was left out: .*used by splatline"),
+        ([("twice", "math:e"), ("twice", "math:tau")], r"used by another plug-in"),
         ([("gone", "no_such_module:thing")], r"The volume format 'gone' .*ModuleNotFoundError"),
         ([("wrong", "math:no_such_thing")], r"AttributeError"),
-        ([("odd", "math:inf")], r"OverflowError.*all else works without it"),
+        ([("odd", "math:inf")], r"OverflowError.*Everything else works without it"),
     ],
 )
 def test_what_does_not_load_or_fit_or_has_a_name_that_is_taken_is_left_out_with_a_warning(
@@ -57,7 +57,10 @@ def test_what_does_not_load_or_fit_or_has_a_name_that_is_taken_is_left_out_with_
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (RuntimeError("a\x1b[2Jb\nbeamline: all is well"), r"RuntimeError: a\\x1b\[2Jb beamline: all is well\. Mend"),
+        (
+            RuntimeError("a\x1b[2Jb\nbeamline: all is well"),
+            r"RuntimeError: a\\x1b\[2Jb beamline: all is well\. Everything",
+        ),
         (SystemExit(0), r"SystemExit: 0\."),
         (ValueError("x" * 10**6), r"^.{1,1200}$"),
     ],
@@ -83,7 +86,7 @@ def test_a_registry_is_ours_with_the_additions_and_asks_for_them_at_its_first_us
 ) -> None:
     registry = Registry("volume_format", {"two": 2.0}, lambda name, found: found / 2, reserved=("auto",))
     announced += [_point(name, "math:tau", "volume_format") for name in ("pi", "auto")]
-    with pytest.warns(UserWarning, match="'auto'.*taken by splatline"):
+    with pytest.warns(UserWarning, match="'auto'.*used by splatline"):
         assert dict(registry) == {"two": 2.0, "pi": math.pi}
     assert registry.ours == {"two": 2.0} and len(registry) == 2 and "auto" not in registry
 
@@ -114,5 +117,5 @@ def test_an_add_on_that_is_installed_and_broken_says_what_broke(
     with pytest.warns(UserWarning, match="left out"), pytest.raises(UnknownNameError) as refused:
         Registry("method", {})["naf"]
     said = str(refused.value)
-    assert "is installed, but does not work" in said and r"libcudart.so.12: no such file\x1b[2J" in said
+    assert "is installed, but does not load" in said and r"libcudart.so.12: no such file\x1b[2J" in said
     assert "--force-reinstall splatline-neural" in said

@@ -1,4 +1,4 @@
-"""Slabs: they cover the volume, and the rows that show them see of the volume what the whole views see."""
+"""Slabs: they cover the volume, and their rows see the same part of it as whole projections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stop: asked and deadline, alone and together."""
+"""Stop: a request and a deadline, alone and together."""
 
 from __future__ import annotations
 

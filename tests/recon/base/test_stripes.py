@@ -1,4 +1,4 @@
-"""Stripes: what stays in a pixel over all views, and layers of the sample, which do on both sides of the axis."""
+"""Stripes: constant offsets of pixels, and sample layers around the axis, which appear on both sides of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Degrees for radians and counts for line integrals are told from what is right, also where that is unusual."""
+"""Degrees instead of radians, and counts instead of line integrals, are detected; unusual correct data are not."""
 
 from __future__ import annotations
 

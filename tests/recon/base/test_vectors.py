@@ -1,4 +1,4 @@
-"""Geometries of vectors: against rays traced by the vectors alone, and back to the vectors."""
+"""Geometries from vectors: compared with rays traced with the vectors, and converted back."""
 
 from __future__ import annotations
 
@@ -115,20 +115,20 @@ def test_views_that_no_such_detector_has_are_refused_with_the_view_and_by_how_mu
     rng = np.random.default_rng(2)
     cone = free_cone(rng, 3)
     cone[1, 6:9] *= 1.02
-    with pytest.raises(ValueError, match=r"view 1: .* off by 0\.[0-9]+ pixels"):
+    with pytest.raises(ValueError, match=r"projection 1: .* off by 0\.[0-9]+ pixels"):
         geometry_of_vectors(cone, SHAPE, cone=True)
     cone = free_cone(rng, 3)
     cone[2, 9:] *= -1
-    with pytest.raises(ValueError, match=r"view 2: .* mirrored .* reverse"):
+    with pytest.raises(ValueError, match=r"projection 2: .* mirrored .* reverse"):
         geometry_of_vectors(cone, SHAPE, cone=True)
-    with pytest.raises(ValueError, match="lies 10 mm"):
+    with pytest.raises(ValueError, match="is 10 mm from the sources"):
         geometry_of_vectors([(0, -10, 0, 0, -5, 0, 0.1, 0, 0, 0, 0, 0.1)], SHAPE, cone=True)
     oblique = free_parallel(rng, 2)
     oblique[1, :3] = oblique[1, 6:9] * 5 + np.cross(oblique[1, 9:], oblique[1, 6:9]) * 9
-    with pytest.raises(ValueError, match="view 1: its detector pixels are not square"):
+    with pytest.raises(ValueError, match="projection 1: the detector pixels must be squares"):
         geometry_of_vectors(oblique, SHAPE, cone=False)
-    with pytest.raises(ValueError, match="view 1: u and v"):
+    with pytest.raises(ValueError, match="projection 1: u and v"):
         oblique[1, :3] = oblique[1, 6:9]
         geometry_of_vectors(oblique, SHAPE, cone=False)
-    with pytest.raises(ValueError, match=r"shape \(2, 9\)"):
+    with pytest.raises(ValueError, match=r"got \(2, 9\)"):
         geometry_of_vectors(oblique[:, :9], SHAPE, cone=False)

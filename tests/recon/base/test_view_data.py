@@ -1,4 +1,4 @@
-"""Views: which are held out, and the weights of their rays."""
+"""Views: which projections are held out, and the weights of rays."""
 
 from __future__ import annotations
 

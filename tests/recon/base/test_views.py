@@ -1,4 +1,4 @@
-"""Selections of views: what each form picks, and that nothing else is accepted."""
+"""Selections of projections: the result of each form, and errors for anything else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The box of a fit: it holds what the views see however they are shifted, whatever volume is wanted of it."""
+"""The box of a fit contains everything that projections see, however they are shifted."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> 
 
 def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
     views = Geometry.parallel(TURN, (1, 32))
-    with pytest.raises(ValueError, match="joined_pixels=2 joins 2 x 2"):
+    with pytest.raises(ValueError, match="joined_pixels=2 is larger than the detector, 1 x 32"):
         reconstruct(np.zeros((48, 1, 32)), views, R2(steps=5, fit=FitSettings(joined_pixels=2)))
 
 
@@ -203,7 +203,7 @@ def test_a_volume_is_saved_with_its_places_and_nothing_is_overwritten(tmp_path: 
     np.testing.assert_array_equal(loaded.volume.data, volume.data)
     assert (loaded.volume.grid, loaded.volume.data.dtype) == (grid, np.float32)
     assert (loaded.method, loaded.settings) == ("r2", {})
-    with pytest.raises(FileExistsError, match="not overwritten"):
+    with pytest.raises(FileExistsError, match="does not overwrite"):
         volume.save(tmp_path / "v.npz")
     with pytest.raises(ValueError, match="beamline export"):
         volume.save(tmp_path / "v.tif")

@@ -1,4 +1,4 @@
-"""The archive of compiled kernels: current, whole, and no more than a saving of time."""
+"""The archive of compiled kernels is current and intact, and only saves time."""
 
 from __future__ import annotations
 

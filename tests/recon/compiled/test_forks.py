@@ -1,4 +1,4 @@
-"""A process that is forked after kernels have run computes the same, on one thread; a fork waits for a compilation."""
+"""A process forked after kernels have run computes the same on one thread; a fork waits for a compilation."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""A threading layer that numba lacks is replaced by another one, with a word."""
+"""A threading layer that numba lacks is replaced by another one, with a warning."""
 
 import os
 import subprocess

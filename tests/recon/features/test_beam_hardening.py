@@ -1,4 +1,4 @@
-"""Curves of beam hardening: what several energies do to line integrals is undone."""
+"""Beam-hardening curves: the effect of several energies on line integrals is corrected."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_what_shows_no_curve_is_refused() -> None:
     path = rng.uniform(3, 60, 500)
     with pytest.raises(NoCurveError, match=r"the line integrals"):
         curve_of_paths(rng.uniform(0, 2, 500), path, 2.0)
-    with pytest.raises(NoCurveError, match="12 rays"):
+    with pytest.raises(NoCurveError, match="material: 12"):
         curve_of_paths(np.ones(12), np.ones(12), 1.0)
     with pytest.raises(ValueError, match="ascending"):
         Curve(np.array([0.0, 1.0]), np.array([0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""Axis and tilt of balls that are projected by hand about an axis that leans in the detector's plane."""
+"""Axis and tilt of balls that are projected analytically about a tilted axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernels that a hard case runs on. Files that use them say `slow`: a run of slow tests skips those that do not."""
+"""The kernels for a hard case. Files that use them say `slow`: a run of slow tests skips those that do not."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import pytest
 
 from tests.recon.hard_cases.on import On, cpu, gpu
 
-# The interpreter is numpy, which warns of an infinity that a GPU just makes; tests/recon/kernels/gpu is quick.
+# The interpreter uses numpy, which warns about infinities that a GPU produces silently; tests/recon/kernels/gpu is
+# quick.
 INTERPRETED = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of each law the first case is interpreted in the gate, the others before a release."""
+    """In the gate, only the first case of each test is interpreted; the others run before a release."""
     seen = set[tuple[Path, str]]()
     for item in items:
         if isinstance(item, pytest.Function) and hasattr(item, "callspec") and item.callspec.params.get("on") is gpu:

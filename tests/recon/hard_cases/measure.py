@@ -17,22 +17,22 @@ from tests.recon.helpers import as_leaves, gradients, in_double
 from tests.recon.kernels.reference import on_grid as voxelize
 from tests.recon.kernels.reference import project
 
-WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and reference sum the same terms
+WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # nothing is cut off, so that kernel and reference sum the same terms
 STEP = 2.0**-24  # half a float32 step, relative: the error of one rounding
-RECURRENCE = 1e-5  # of a footprint's weight, stated in `cpu.project`
-ROUNDINGS = 12  # of a position on the detector: sums of three products, turned into pixels
+RECURRENCE = 1e-5  # share of a footprint's weight, as stated in `cpu.project`
+ROUNDINGS = 12  # roundings in a position on the detector: sums of three products, converted to pixels
 
 
 @dataclass(frozen=True)
 class Found:
-    """One comparison.
+    """Result of one comparison.
 
     Attributes:
-        image: the kernel's picture or volume.
-        value: largest error of it, of the largest value or the largest single weight, whichever is more.
-        gradients: largest error of the gradients by parameter, of the largest gradient of that parameter, or of the
-            largest that a Gaussian's whole weight would make.
-        slopes: the kernel's gradients.
+        image: image or volume of the kernel.
+        value: its largest error, divided by the largest value or the largest single weight, whichever is larger.
+        gradients: largest error of the gradients for each parameter, divided by the largest gradient of that parameter
+            or by the largest one that the whole weight of a Gaussian would make.
+        slopes: gradients of the kernel.
     """
 
     image: Tensor
@@ -53,9 +53,9 @@ def compare(
     seed: int = 0,
     device: torch.device | None = None,
 ) -> Found:
-    """Kernel against reference, on a picture or a volume weighed by random numbers; asserts that all of it is finite.
+    """Compare kernel and reference on an image or volume weighted by random numbers; asserts that all is finite.
 
-    The kernel is the GPU's where a `device` is given, else the CPU's.
+    It is the GPU kernel if a `device` is given, otherwise the CPU kernel.
     """
     fast, double = as_leaves(g, device), in_double(g)
     gpu = device is not None
@@ -75,7 +75,7 @@ def compare(
         assert torch.isfinite(values).all(), name
     top = max(float(expected.detach().abs().max()), weight)
     off = float((found - expected).detach().abs().max()) / top
-    # The size of a gradient is at least what one Gaussian's whole weight makes, even where symmetry cancels it.
+    # The scale of a gradient is at least what the whole weight of one Gaussian makes, even if symmetry cancels it.
     pull = (exact["raw_densities"] / torch.sigmoid(double.raw_densities.detach()) * g.densities / g.density_unit).abs()
     size = {
         "means": float((pull / g.scales.amax(1)).max()),
@@ -91,17 +91,18 @@ def compare(
 
 
 def bound(far: float, thin: float) -> float:
-    """Largest error of G: where a float32 position `far` from the origin may be off, times the steepest slope.
+    """Largest error of G: the error of a float32 position at the distance `far` from the origin, times the steepest
+    slope.
 
-    |∂G/∂δ| <= exp(-1/2) / σ; both in the same unit, pixels, voxels or mm. `thin` is the least standard deviation that
-    the picture has anywhere.
+    |∂G/∂δ| <= exp(-1/2) / σ; both in the same unit (pixels, voxels or mm). `thin` is the smallest standard deviation in
+    the image.
     """
     return RECURRENCE + math.exp(-0.5) * ROUNDINGS * STEP * far / thin
 
 
 def gradient_bound(far: float, thin: float) -> float:
-    """The same for first and second moments, which weigh the flanks: sup |δ|²G' is some three times as large.
+    """The same for first and second moments, which weight the flanks: sup |δ|²G' is about three times as large.
 
-    Of the largest gradient; random weights of the pixels cancel by at most another factor of three in these sets.
+    As a share of the largest gradient. Random pixel weights cancel by at most another factor of three in these sets.
     """
     return 9 * bound(far, thin)

@@ -1,4 +1,4 @@
-"""Where a hard case runs: the CPU's kernels, or Triton's (on CUDA where there is one, else interpreted and small)."""
+"""Where a hard case runs: the CPU kernels, or Triton's (on CUDA if there is one, otherwise interpreted and small)."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class On:
-    """Kernels, and set-ups of a size that they take in a test's time.
+    """Kernels, and set-ups small enough for a test.
 
     Attributes:
-        device: of Triton's kernels; None: the CPU's.
-        beams: of pixels of 0.5 mm, by name; `grid`: of voxels of 0.6 mm.
-        view: of pixels of 1 mm: x is the column, z the row. `source`: of a cone, at y = -10 mm.
-        far: px: no pixel is farther from the middle of the detector, or from a centre in it. `reach`: so in voxels.
-        extent: mm, within which centres lie.
-        many: Gaussians at a time.
+        device: device of the Triton kernels; None: CPU kernels.
+        beams: geometries with pixels of 0.5 mm, by name; `grid`: voxels of 0.6 mm.
+        view: geometry with pixels of 1 mm; x is the column, z the row. `source`: a cone with its source at y = -10 mm.
+        far: largest distance, in px, of a pixel from the middle of the detector or from a centre in it. `reach`: the
+            same in voxels.
+        extent: centres are within this, mm.
+        many: number of Gaussians at a time.
     """
 
     device: torch.device | None
@@ -56,14 +57,14 @@ class On:
     def shown(
         self, g: Gaussians, where: Geometry | Grid, model: RayModel | None = None, *, whole: bool = False
     ) -> Tensor:
-        """A picture or a volume of leaves; `whole`: as `compare` has it, which cuts nothing off."""
+        """An image or a volume of leaves; `whole`: without cut-off, as in `compare`."""
         cut, gpu = WHOLE if whole else Truncation(), self.device is not None
         if isinstance(where, Grid):
             return voxelize(g, where, truncation=cut, gpu=gpu)
         return project(g, where, truncation=cut, model=model, gpu=gpu)
 
     def some(self, shape: Place, n: int = 12, seed: int = 1) -> Gaussians:
-        """n Gaussians of one shape, in any orientation; of Triton's 8 at most."""
+        """n Gaussians of one shape, in any orientation; at most 8 for Triton."""
         n = n if self.device is None else min(n, 8)
         rng = np.random.default_rng(seed)
         means = (rng.random((n, 3)) - 0.5) * self.extent
@@ -73,7 +74,7 @@ class On:
 
 
 def at(places: list[Place], sigma: float = 1.1, density: float = 0.8) -> Gaussians:
-    """Slightly different, slightly turned Gaussians at (x, y, z)."""
+    """Slightly different, slightly rotated Gaussians at (x, y, z)."""
     n = len(places)
     rng = np.random.default_rng(5)
     shapes = sigma * rng.uniform(0.7, 1.4, (n, 3))
@@ -85,7 +86,7 @@ def _view(shape: tuple[int, int]) -> Geometry:
 
 
 def cpu() -> On:
-    """A view is no multiple of the 4 rows and 16 columns that the kernels take at a time."""
+    """The detector size is not a multiple of the 4 rows and 16 columns that the kernels process at a time."""
     angles, shape, axis = (0.3, 0.7, 2.5, -4.0), (24, 30), 13.3
     beams = {
         "parallel": Geometry.parallel(angles, shape, pixel_pitch=PITCH, axis_col=axis),
@@ -101,7 +102,7 @@ def cpu() -> On:
 
 
 def gpu() -> On:
-    """A view is no multiple of a tile."""
+    """The detector size is not a multiple of a tile."""
     device = importlib.import_module("tests.recon.kernels.gpu.on_gpu").DEVICE
     shape, axis = (11, 13), 5.3
     beams = {

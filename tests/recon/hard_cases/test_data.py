@@ -1,4 +1,4 @@
-"""Difficult data: nothing, constants, counts of 0 and saturated, values that are not finite, few and odd views."""
+"""Difficult data: empty, constant, zero or saturated counts, values that are not finite, few projections."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def a_few(seed: int = 0) -> Gaussians:
 
 def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_there() -> None:
     nothing = np.zeros((32, *SHAPE), np.float32)
-    with pytest.raises(ValueError, match="no matter"):
+    with pytest.raises(ValueError, match="no material"):
         reconstruct(nothing, VIEWS, R2(steps=1))
     assert not reconstruct(nothing, VIEWS, "fbp").volume.data.any()
     start = a_few()

@@ -1,4 +1,4 @@
-"""What is hard for the Triton kernels alone: tiles, tables of footprints, their losses and parameters."""
+"""Hard cases only for the Triton kernels: tiles, footprint tables, losses and parameters."""
 
 from __future__ import annotations
 

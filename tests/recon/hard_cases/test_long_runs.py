@@ -1,4 +1,4 @@
-"""Many steps on data that a model can explain exactly: nothing drifts or grows, what is not pulled does not move."""
+"""Many steps on data that a model can explain exactly: nothing drifts or grows."""
 
 from __future__ import annotations
 

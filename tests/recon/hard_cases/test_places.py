@@ -1,4 +1,4 @@
-"""Gaussians at difficult places and of difficult weight: borders, far outside, the source, nothing, piles, ranges.
+"""Gaussians at difficult positions or with difficult weights: borders, far outside, at the source, piles, ranges.
 
 On the CPU's kernels, and in slow tests on Triton's.
 """

@@ -1,4 +1,4 @@
-"""Gaussians of difficult shape: needles, discs, dots, giants, singular covariances, quaternions without a length.
+"""Gaussians of difficult shape: needles, discs, points, very large ones, singular covariances, zero quaternions.
 
 On the CPU's kernels, and in slow tests on Triton's.
 """

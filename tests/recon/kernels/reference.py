@@ -1,22 +1,22 @@
-"""Reference implementation, written to be read: the fast kernels for Gaussians are tested against it.
+"""Reference implementation, written for reading; the fast kernels for Gaussians are compared with it.
 
 Projection and voxelisation are dense float64 sums over all Gaussians:
 
     density   σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),   Σ = R S² Rᵀ          (Zha et al. 2024)
     ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))       (parallel beam: exact; cone: affine)
 
-The covariance is taken to the detector by the Jacobian of the projection at the centre, with a third row along the ray.
-It is split as [[Σ₂, v], [vᵀ, f]]. Then the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)). This is the Schur
-complement, the square of the last pivot of Σ' = L Lᵀ. L comes from J R S itself by orthogonal steps (QR): a needle of
-aspect 10⁴ would leave nothing of the difference even in float64. The exact ray of a cone needs no projection: with H =
-S⁻¹Rᵀ, δ from the source to the centre and D along the ray of a pixel,
+The covariance is mapped to the detector with the Jacobian of the projection at the centre, with a third row along the
+ray. It is split as [[Σ₂, v], [vᵀ, f]]. Then the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)). This is the Schur
+complement, the square of the last pivot of Σ' = L Lᵀ. L is computed from J R S by orthogonal steps (QR), because for a
+needle with an aspect ratio of 10⁴ the difference would vanish even in float64. The exact ray of a cone needs no
+projection: with H = S⁻¹Rᵀ, δ from the source to the centre and D along the ray of a pixel,
 
     ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
 
-Where rays have a width, Σ₂ grows by it, and μ falls so that the mass stays (`cpu.wide_footprints`).
-Another `Kernel` replaces exp(-q/2) of the squared distance q in standard deviations, in an image by its line integral,
-and sqrt(2π) by its own length.
-Losses follow below. Everything is plain torch, so autograd gives the gradients to compare with.
+If rays have a width, Σ₂ grows by it, and μ falls so that the mass is conserved (`cpu.wide_footprints`). Another
+`Kernel` replaces exp(-q/2), with q the squared distance in standard deviations (in an image: its line integral), and
+sqrt(2π) by its own length. The losses are below. Everything is plain torch, so that autograd gives the gradients for
+comparison.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def project(
     gaussians: Gaussians, geometry: Geometry, views: Any = None, *, model: RayModel | None = None,
     gpu: bool = False, **how: Any,
 ) -> Tensor:  # fmt: skip
-    """`recon.splatting.splat.project`, which float64 Gaussians take by this module, not truncated.
+    """`recon.splatting.splat.project`; for float64 Gaussians, the implementation of this module without truncation.
 
     Args:
-        gpu: take the GPU's kernels, which may be interpreted on tensors of the CPU.
+        gpu: True: use the GPU kernels, which may be interpreted on CPU tensors.
     """
     if gaussians.means.dtype == torch.float32:
         with _kernels(gaussians, gpu):
@@ -66,7 +66,8 @@ def project(
 
 
 def on_grid(gaussians: Gaussians, grid: Grid, *, gpu: bool = False, **how: Any) -> Tensor:
-    """`recon.splatting.splat.voxelize`, which float64 Gaussians take by this module, not truncated; `gpu` as above."""
+    """`recon.splatting.splat.voxelize`; for float64 Gaussians, that of this module without truncation. `gpu`: as
+    above."""
     if gaussians.means.dtype == torch.float32:
         with _kernels(gaussians, gpu):
             return splat.voxelize(gaussians, grid, **how)
@@ -88,7 +89,7 @@ def density_profile(q: Tensor, kernel: Kernel) -> Tensor:
 
 
 def shadow_profile(q: Tensor, kernel: Kernel) -> Tensor:
-    """Line integral of a kernel over that through its centre, at squared distances q of the line."""
+    """Line integral of a kernel, divided by that through its centre, at squared distances q of the line."""
     return _profile(q, kernel, kernel.exponent + 0.5)
 
 
@@ -124,7 +125,7 @@ def project_view(
     length: float = 0.0,  # mm, replaces μ if not 0: the uncorrected factor
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Tensor:
-    """Line integrals [row, col] of one view: every Gaussian on every pixel, not truncated.
+    """Line integrals [row, col] of one projection: every Gaussian on every pixel, without truncation.
 
     Args:
         parameters: means [n, 3] mm (x, y, z), standard deviations [n, 3] mm, quaternions [n, 4], densities [n] 1/mm.
@@ -172,7 +173,7 @@ def affine_error(
 
 
 def pixels(geometry: Geometry, view: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Columns [col] and rows [row] relative to the pixel of the object's origin."""
+    """Columns [col] and rows [row], relative to the pixel of the object's origin."""
     rows, cols = geometry.detector_shape
     col, row = geometry.origin(view)
     return torch.arange(cols, dtype=like.dtype) - col, torch.arange(rows, dtype=like.dtype) - row
@@ -223,7 +224,7 @@ def _affine(
 
 
 def _widened(lower: Tensor, jacobian: Tensor, in_view: Tensor, geometry: Geometry, view: int) -> Tensor:
-    """L [n, 2, 2] of the covariance on the detector, with that of the pixel and of the centre's path."""
+    """L [n, 2, 2] of the covariance on the detector, including that of the pixel and of the path of the centre."""
     axes = in_view.new_tensor(geometry.axes(view))
     x, y, _ = (in_view @ axes).unbind(1)
     path = jacobian[:, :2] @ (torch.stack((-y, x, torch.zeros_like(x)), 1) @ axes.T)[:, :, None]
@@ -258,7 +259,7 @@ def voxelize(
     axes: tuple[Tensor, Tensor, Tensor],  # z [nz], y [ny], x [nx] in mm
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Tensor:
-    """Density [z, y, x] at voxel centres: every Gaussian in every voxel, not truncated."""
+    """Density [z, y, x] at voxel centres: every Gaussian in every voxel, without truncation."""
     z, y, x = axes
     grid = torch.stack(torch.broadcast_tensors(x[None, None, :], y[None, :, None], z[:, None, None]), -1)
     offset = grid[None] - means[:, None, None, None, :]
@@ -306,7 +307,7 @@ def projection_loss(
 ) -> Tensor:
     """mean w (D(image, target) + ssim_weight (1 - SSIM)), weights w [row, col] >= 0; None: all 1.
 
-    Zha et al. 2024 take D = |image - target|. Pixels of weight 0 count as zeros in both images in SSIM's windows, like
+    Zha et al. 2024 use D = |image - target|. In SSIM's windows, pixels of weight 0 count as zeros in both images, like
     pixels outside the image.
     """
     if weights is None:
@@ -323,7 +324,8 @@ def total_variation(volume: Tensor) -> Tensor:
 
 
 def sparse_patches(volume: Tensor, threshold: float) -> Tensor:
-    """The mean of all blocks of [a, b, c], each without cosine coefficients up to `threshold`; see `cpu.patches`."""
+    """The mean of all blocks of [a, b, c], after cosine coefficients up to `threshold` are removed; see
+    `cpu.patches`."""
     sizes = (4, 4, 4 if volume.shape[2] >= 4 else 1)
     beyond = volume
     for axis, size in enumerate(sizes):

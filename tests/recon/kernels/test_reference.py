@@ -1,4 +1,4 @@
-"""The reference implementation against integrals along rays, finite differences, and laws of every projection."""
+"""The reference implementation compared with integrals along rays, finite differences and projection laws."""
 
 from __future__ import annotations
 

@@ -14,9 +14,9 @@ def system_matrix(geometry: Geometry, grid: Grid) -> sparse.csr_array:
     """Line integrals as a matrix [view * row * col, z * y * x], mm: `matrix @ volume.ravel()` is the projections.
 
     Each ray is sampled once in every plane of voxels across one axis, bilinearly between the four nearest voxels of the
-    plane (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192, in 3-D), and every sample weighs the length of the ray
-    from plane to plane. The axis is the one that the ray in the middle of the detector's column follows most closely,
-    of straight views x or y. What lies outside the box is zero.
+    plane (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192, in 3-D), and every sample has the weight of the ray's
+    length between planes. The axis is the one that is nearest to the direction of the ray in the middle of the
+    detector's column (for straight projections x or y). Outside the box the volume is zero.
     """
     sizes, voxels, edges = grid.shape, grid.coordinates(), grid.spacing  # (z, y, x)
     rows, cols = geometry.detector_shape

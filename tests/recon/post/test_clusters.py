@@ -1,4 +1,4 @@
-"""Clusters of grey values: the best ones by trying all, the elbow, the threshold."""
+"""Clusters of grey values: the best ones found by trying all, the elbow, the threshold."""
 
 from __future__ import annotations
 

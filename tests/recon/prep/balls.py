@@ -1,4 +1,4 @@
-"""Balls, seen by exact chords on a detector that may be turned about the beam: views and volume with a known answer."""
+"""Balls projected with exact chords on a detector that may be rotated about the beam."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from recon.base.volume import Grid
 
 @dataclass(frozen=True)
 class Balls:
-    """Balls in a cylinder: lengths in pixels, of 1/50 a pixel.
+    """Balls in a cylinder: lengths in pixels, attenuation 1/50 per pixel.
 
     Attributes:
         angles: [view], radians.
         shape: (rows, cols).
-        axis_col: where the axis crosses the middle row.
-        tilt_deg: by which the axis leans in the detector's plane, column growing with the row.
-        seed, count: of the balls.
+        axis_col: column of the axis in the middle row.
+        tilt_deg: in-plane tilt of the axis; its column grows with the row.
+        seed, count: random seed and number of the balls.
     """
 
     angles: NDArray[np.float64]
@@ -40,7 +40,7 @@ class Balls:
         return np.stack([away * np.cos(turn), away * np.sin(turn), z, radius], axis=1)
 
     def views(self, only: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
-        """Line integrals [view, row, col], of all rows or `only` some."""
+        """Line integrals [view, row, col] of all rows, or `only` some."""
         rows, cols = self.shape
         seen = np.arange(rows) if only is None else only
         x, y = np.meshgrid(np.arange(cols) - (cols - 1) / 2, seen - (rows - 1) / 2)
@@ -55,7 +55,7 @@ class Balls:
         return out.astype(np.float32)
 
     def truth(self, grid: Grid) -> NDArray[np.float32]:
-        """1/pixel, on a grid in pixels."""
+        """The ground truth in 1/pixel, on a grid in pixels."""
         out, at = np.zeros(grid.shape), grid.coordinates()
         for bx, by, bz, radius in self.places:
             near = [np.flatnonzero(np.abs(along - c) < radius + 1) for along, c in zip(at, (bz, by, bx), strict=True)]

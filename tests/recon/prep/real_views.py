@@ -1,4 +1,4 @@
-"""Corrected views of real scans, for tests of what follows the correction."""
+"""Corrected projections of real scans, for tests of later steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a can of balls with air beside it, by exact chords, with the fringes that transport of light gives them."""
+"""Projections of a can of balls next to air (exact chords), with the phase fringes of propagation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, laplace
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 
-SUB = 3  # rays a pixel, along rows and columns
+SUB = 3  # rays per pixel, along rows and columns
 
 
 def views_of_can(
@@ -22,13 +22,14 @@ def views_of_can(
     gains: float = 0.0,
     seed: int = 1,
 ) -> tuple[F32, Geometry]:
-    """Line integrals [view, row, col] of a can `over` times as wide as the field, and their geometry.
+    """Line integrals [view, row, col] of a can `over` times as wide as the field of view, and their geometry.
 
     Args:
-        fringes: share of the Laplacian that light loses, pixels²: the square of Paganin's length.
-        noise: of a pixel's light, as a share of the open beam.
-        blur: sigma in pixels, of the light.
-        gains: spread of the pixels' gains, which flats do not hold.
+        fringes: factor of the Laplacian that is subtracted from the transmission, in pixels²: the square of Paganin's
+            length.
+        noise: noise of the intensity in a pixel, as a share of the open beam.
+        blur: sigma in pixels, of the intensity.
+        gains: spread of pixel sensitivities that the flats do not contain.
     """
     n, rows, cols = shape
     rng = np.random.default_rng(seed)

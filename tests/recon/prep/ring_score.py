@@ -1,4 +1,4 @@
-"""How strong the rings of a slice are."""
+"""Measures the strength of the rings in a slice."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from scipy.ndimage import median_filter
 
 
 def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: int = 9) -> float:
-    """Rings of a slice: standard deviation of means along circles about the axis, less their median over `width` radii.
+    """Ring strength: standard deviation of the means along circles about the axis, minus their median over `width`
+    radii.
 
     Args:
         image: [y, x].
-        axis: (y, x) in voxels, on which the rings are centred.
+        axis: (y, x) in voxels, centre of the rings.
     """
     y, x = np.indices(image.shape)
     radius = np.rint(np.hypot(y - axis[0], x - axis[1])).astype(int)
@@ -22,5 +23,5 @@ def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: in
     means = np.bincount(radius[inside], image[inside], minlength=reach) / np.maximum(count, 1)
     off = (means - median_filter(means, 2 * (width // 2) + 1, mode="nearest"))[
         width:
-    ]  # short circles about the axis are structure
+    ]  # short circles near the axis are left out, because they show structure
     return float(off.std())

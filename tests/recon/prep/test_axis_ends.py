@@ -1,4 +1,4 @@
-"""The rotation axis by the ends of half a turn: samples wider than the field, and scans whose ends show nothing."""
+"""The axis from the ends of a 180° scan: samples wider than the field, and scans whose ends show nothing."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_noise_of_flats_that_the_views_share_is_no_matter() -> None:
 @pytest.mark.parametrize("part", [slice(0, 100), np.delete(np.arange(120), range(40, 44)), slice(0, 31)])
 def test_a_sector_a_gap_and_few_views_have_no_ends_that_join(part: slice | NDArray[np.int_]) -> None:
     views, angles = grains(4, 1.5, half_turn(120), 47.5), half_turn(120)
-    with pytest.raises(ValueError, match="half a turn in 32 even steps"):
+    with pytest.raises(ValueError, match="180° in 32 or more even steps"):
         axis_from_ends(views[part], angles[part])
 
 

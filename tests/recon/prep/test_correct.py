@@ -1,4 +1,4 @@
-"""Counts to line integrals: Beer-Lambert comes back, and nothing bad gets through or spreads."""
+"""Counts to line integrals: Beer-Lambert is recovered, and bad values neither pass nor spread."""
 
 from __future__ import annotations
 
@@ -354,21 +354,21 @@ def test_bad_input_is_refused_with_its_values() -> None:
     counts, references = good()
     at = positions(counts)
     dark, flat = references.dark, references.flats[0][1]
-    with pytest.raises(ValueError, match="no flat"):
+    with pytest.raises(ValueError, match="without a flat"):
         correct(counts, at, References(dark, ()))
-    with pytest.raises(ValueError, match=r"flat <= dark.*exchanged"):
+    with pytest.raises(ValueError, match=r"exchanged.*flat <= dark"):
         correct(counts, at, References(flat, ((0.0, dark),)))
     with pytest.raises(ValueError, match=r"dark has shape \(16, 47\)"):
         correct(counts, at, References(dark[:, 1:], references.flats))
-    with pytest.raises(ValueError, match="each of 6 views"):
+    with pytest.raises(ValueError, match="each of the 6 projections"):
         correct(counts, at[1:], references)
     with pytest.raises(ValueError, match=r"shape \(16, 48\)"):
         correct(counts[0], at, references)
     with pytest.raises(ValueError, match=r"got \[3"):
         correct(counts, at, References(dark, ((3.0, flat), (3.0, flat))))
-    with pytest.raises(ValueError, match=r"\(40, 9\) do not fit 48"):
+    with pytest.raises(ValueError, match=r"\(40, 9\) do not fit into 48"):
         correct(counts, at, references, CorrectionSettings(air=(40, 9)))
-    with pytest.raises(ValueError, match=r"positions of views \[2\]"):
+    with pytest.raises(ValueError, match=r"positions of projections \[2\]"):
         correct(counts, np.where(at == 2, np.nan, at), references)
     with pytest.raises(ValueError, match=r"\(16, 48\), got \(5, 5\)"):
         correct(counts, at, references, masked=np.zeros((5, 5), bool))
@@ -387,10 +387,10 @@ def test_views_without_values_or_beam_are_named() -> None:
     at = positions(counts)
     lost = counts.copy()
     lost[4] = np.nan
-    with pytest.raises(ValueError, match="view 4: 768 of 768"):
+    with pytest.raises(ValueError, match="projection 4: 768 of its 768"):
         correct(lost, at, references)
     counts[2] = references.dark
-    with pytest.raises(ValueError, match=r"1 of 6 views \(\[2\]"):
+    with pytest.raises(ValueError, match=r"without beam: 1 of 6 \(\[2\]"):
         correct(counts, at, references, CorrectionSettings(air=(4, 4)))
 
 

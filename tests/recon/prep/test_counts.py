@@ -1,4 +1,4 @@
-"""Counts: their likelihood as line integrals and weights; the estimate of photons."""
+"""Photon counts: their likelihood as line integrals and weights; the estimate of the gain."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_photon_transfer_finds_gain_and_dark_noise() -> None:
 
 def test_shapes_that_disagree_with_the_geometry_are_refused() -> None:
     counts = Counts(np.ones((2, 4, 4)), np.full((4, 4), 10.0))
-    with pytest.raises(ValueError, match="counts have shape"):
+    with pytest.raises(ValueError, match="counts must have shape"):
         recon.reconstruct(counts, VIEWS)
 
 

@@ -1,4 +1,4 @@
-"""Dynamic flats against beams whose true flat is known, and against flats that differ by noise alone."""
+"""Dynamic flats for beams with a known true flat, and for flats that differ only by noise."""
 
 from __future__ import annotations
 

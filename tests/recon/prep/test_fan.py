@@ -1,4 +1,4 @@
-"""The fan of a full turn is found from rays that are measured from both sides."""
+"""The fan angle of a 360° scan is found from rays that are measured from both sides."""
 
 from __future__ import annotations
 

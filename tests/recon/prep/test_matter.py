@@ -1,4 +1,4 @@
-"""Delta, beta and tubes: against xraylib, and against the simulator, which reads the same tables."""
+"""Delta, beta and tube spectra compared with xraylib and with the simulator, which reads the same tables."""
 
 from __future__ import annotations
 

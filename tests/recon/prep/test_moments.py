@@ -1,4 +1,4 @@
-"""Moments of exact views of balls say the axis, heights and angles that the views were made with, and nothing else."""
+"""Moments of exact projections of balls show the axis, heights and angles of the scan, and nothing else."""
 
 from __future__ import annotations
 

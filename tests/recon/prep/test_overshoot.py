@@ -1,4 +1,4 @@
-"""Overshoot: fringes are seen at outer edges; no blur, noise, ring or cut sample is taken for them."""
+"""Overshoot: phase fringes are found at outer edges; blur, noise, rings and truncated samples are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of the same rays at two times tell how a sample changed; those of one at rest tell of nothing."""
+"""Projections of the same rays at two times show how a sample changed; a sample at rest shows no change."""
 
 from __future__ import annotations
 

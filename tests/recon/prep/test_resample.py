@@ -1,4 +1,4 @@
-"""Resampling: a grid seen through a lens lies where it is, a turned detector is straight, a slab is the whole's."""
+"""Resampling: a distorted grid becomes regular, a rotated detector straight, a slab equals part of the whole."""
 
 from __future__ import annotations
 

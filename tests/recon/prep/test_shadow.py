@@ -1,4 +1,4 @@
-"""A part of the instrument that stands in the beam of all views is found; what a sample can do is not taken for one."""
+"""A part of the instrument in the beam of all projections is found; a sample is not mistaken for one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spots of a single view are filled, and nothing that a sample, a detector or noise shows."""
+"""Zingers in a single projection are filled; sample, detector and noise are not changed."""
 
 from __future__ import annotations
 

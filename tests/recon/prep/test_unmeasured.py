@@ -1,4 +1,4 @@
-"""Pixels that measured nothing: what moved in, is not finite, or comes and goes; and what is of the sample."""
+"""Pixels without data: moved in, not finite, or an object that comes and goes; the sample itself is kept."""
 
 from __future__ import annotations
 

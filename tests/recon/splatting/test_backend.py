@@ -1,4 +1,4 @@
-"""The CPU backend keeps the protocol's promises: copies, shared memory, sums; and which device gets which backend."""
+"""The CPU backend follows the protocol: copies, shared memory, sums; and which device gets which backend."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: n
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(backend_for("cpu"), Cpu)
     for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
-        with pytest.raises(ValueError, match=rf"'{unknown}' was.*'cpu'.*one of these"):
+        with pytest.raises(ValueError, match=rf"must be 'cpu' or 'cuda', got '{unknown}'"):
             backend_for(unknown)
     for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
         monkeypatch.delitem(sys.modules, name)
@@ -111,5 +111,5 @@ def test_a_cuda_device_that_is_not_there_is_said_by_name(device: str) -> None:
 
     if gpu.interpreted():
         pytest.skip("the interpreter stands in for any device")
-    with pytest.raises(RuntimeError, match=rf"{device} was.*CUDA.*on the cpu"):
+    with pytest.raises(RuntimeError, match=rf"{device}.*CUDA.*cpu"):
         backend_for(device)

@@ -1,4 +1,4 @@
-"""Which volume of a growing scan is shown: the one that predicts views held out better, in the volume's measure."""
+"""The volume that is shown during a scan: the one that predicts held-out projections better."""
 
 from __future__ import annotations
 

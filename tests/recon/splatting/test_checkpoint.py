@@ -1,4 +1,4 @@
-"""A checkpoint brings a fit back to the bit, and says what is wrong with one that cannot."""
+"""A checkpoint restores a fit bit for bit; an invalid one is reported with its error."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:
         state_from({**arrays, "second.raw": arrays["second.raw"][:-1]})
     with pytest.raises(ValueError, match="kernel_exponent"):
         state_from({**arrays, "kernel_exponent": np.ones(2)})
-    with pytest.raises(ValueError, match="no kernel has exponent 7"):
+    with pytest.raises(ValueError, match="unknown kernel exponent 7"):
         state_from({**arrays, "kernel_exponent": np.array(7.0)})
     with pytest.raises(ValueError, match="not finite"):
         state_from({**arrays, "parameters.raw": np.full(5, np.nan, np.float32)})

@@ -1,4 +1,4 @@
-"""Clone, split and prune: what they keep, and what they refuse."""
+"""Clone, split and prune: what they conserve, and their errors."""
 
 from __future__ import annotations
 

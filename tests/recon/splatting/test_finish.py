@@ -1,4 +1,4 @@
-"""Finish: a small system by hand, nothing to add where nothing is missing, edges won, boxes inside the field."""
+"""Voxel refinement: a small system by hand, no change if nothing is missing, sharper edges, boxes in the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a volume to Gaussians: they sit in the matter, explain the data's scale, and refuse what is not a volume."""
+"""From a volume to Gaussians: they are in the sample, match the scale of the data; wrong volumes are errors."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
 
 
 def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:
-    with pytest.raises(ValueError, match="no matter"):
+    with pytest.raises(ValueError, match="no material"):
         sample_gaussians(Volume(np.zeros((4, 4, 4), np.float32), Grid((4, 4, 4))), 10, rng, field_radius=5)
 
 

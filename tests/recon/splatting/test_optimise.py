@@ -1,4 +1,4 @@
-"""The fit as a whole: it converges, repeats bit for bit, and its gradient is the loss's slope."""
+"""The fit as a whole: it converges, repeats bit for bit, and its gradient is that of the loss."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def test_the_misfit_of_all_views_is_the_root_mean_square_of_theirs(random_gaussi
 
 def test_a_model_without_gaussians_or_with_bad_ones_is_refused(random_gaussians: Make) -> None:
     g = random_gaussians(3)
-    with pytest.raises(ValueError, match="no Gaussians"):
+    with pytest.raises(ValueError, match="at least one Gaussian"):
         fit.init(g.select(torch.zeros(3, dtype=torch.bool)), 0)
     with pytest.raises(ValueError, match=r"means .* 9 values"):
         fit.init(replace(g, means=g.means * torch.nan), 0)

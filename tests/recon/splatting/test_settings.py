@@ -1,4 +1,4 @@
-"""Settings of a fit: what is out of range is refused, and total variation follows the noise and the grid."""
+"""Settings of a fit: values out of range are errors; total variation follows the noise and the grid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CPU kernels against the float64 reference, and this against closed forms and finite differences."""
+"""The CPU kernels compared with the float64 reference, which is compared with closed forms and finite differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""StreamingFit: views that arrive one by one end in the same quality as all of them at once."""
+"""StreamingFit: projections one by one give the same quality as all at once."""
 
 from __future__ import annotations
 
@@ -166,14 +166,14 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
         model.add_views(data[:2], ANGLES[:3])
     bad = data[:1].copy()
     bad[0, 3, 3] = np.inf
-    with pytest.raises(ValueError, match="nothing was changed"):
+    with pytest.raises(ValueError, match="were not added"):
         model.add_views(bad, ANGLES[:1])
-    with pytest.raises(ValueError, match="nothing was changed"):
+    with pytest.raises(ValueError, match="were not added"):
         model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])
     assert model.n_views == 0
     with pytest.raises(ValueError, match="at least one Gaussian"):
         StreamingFit(VIEWS, GRID, gaussians=0)
-    with pytest.raises(ValueError, match="no view"):
+    with pytest.raises(ValueError, match="no projection"):
         model.finish(0.1)
 
 
@@ -187,9 +187,9 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
     assert model.started and model._problem is not None and model.n_views == 22
     np.testing.assert_allclose(model._problem.projections, data[:22], atol=1e-5)
     np.testing.assert_allclose(model._problem.geometry.angles, ANGLES[:22])
-    with pytest.raises(ValueError, match="no view to replace"):
+    with pytest.raises(ValueError, match="no projection to replace"):
         StreamingFit(VIEWS, GRID).replace_newest(data[0])
-    with pytest.raises(ValueError, match="nothing was changed"):
+    with pytest.raises(ValueError, match="were not added"):
         model.replace_newest(np.full(SHAPE, np.nan, np.float32))
 
 

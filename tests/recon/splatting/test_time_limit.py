@@ -1,4 +1,4 @@
-"""In time: the seconds of a fit are those of the whole run."""
+"""Time limit: the seconds of a fit cover the whole run."""
 
 from __future__ import annotations
 

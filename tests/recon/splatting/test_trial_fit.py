@@ -1,4 +1,4 @@
-"""A fit in a trial: it ends early where voxels lead, and knows no view held out."""
+"""A test fit: it ends early if voxel methods lead, and never uses held-out projections."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: Recon
     choice = Auto((Fbp(), FistaTv(), PnpDct(), poor)).choose(problem, RunControl())
     assert choice.at in (1, 2) and choice.prior is not None and choice.prior.weight > 0
     assert poor.views == [26]  # views held out are not fitted
-    assert "r2 stopped after 25% of its steps" in choice.reason and "a full trial: about" in choice.reason
+    assert "r2 stopped after 25% of its steps" in choice.reason and "a full test takes about" in choice.reason
     poor.views.clear()
     choice = Auto((FistaTv(), poor), least_gain=0.0).choose(problem, RunControl())
     assert choice.at == 0 and poor.views == [26, 26] and "stopped" not in choice.reason

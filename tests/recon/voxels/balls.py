@@ -1,4 +1,4 @@
-"""Balls whose line integrals are known, and which may move during the scan: an oracle without voxels."""
+"""Balls with known line integrals, which may move during the scan: an independent check without voxels."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ def ball_views(
     seed: int = 0,
     count: int = 25,
 ) -> NDArray[np.float32]:
-    """[view, row, col] of balls around the axis in the middle of the detector, pixels of 1.
+    """Projections [view, row, col] of balls around the axis in the middle of the detector, with pixels of size 1.
 
     Args:
-        turn: radians, shift: pixels x, y, z on the stage, of each view: the sample is first turned, then shifted.
+        turn, shift: radians, and pixels (x, y, z) on the stage, for each projection: the sample is first rotated, then
+            shifted.
     """
     rng = np.random.default_rng(seed)
     rows, cols = shape
@@ -31,7 +32,7 @@ def ball_views(
     dx, dy, dz = (np.broadcast_to(np.asarray(s, float).reshape(-1, 1), theta.shape) for s in shift)
     u = x * np.cos(turned) + y * np.sin(turned) + dx * np.cos(theta) + dy * np.sin(theta)
     v = z + dz
-    fine = (np.arange(2) + 0.5) / 2 - 0.5  # a pixel is a mean of four rays
+    fine = (np.arange(2) + 0.5) / 2 - 0.5  # a pixel is the mean of four rays
     out = np.zeros((len(theta), rows, cols))
     for a in fine:
         for b in fine:

@@ -1,4 +1,4 @@
-"""Both ways of back-projection against a plain sum, and against each other where there is detail of every size."""
+"""Both back-projectors compared with a plain sum, and with each other for detail of every size."""
 
 from __future__ import annotations
 

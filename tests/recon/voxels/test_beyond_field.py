@@ -1,4 +1,4 @@
-"""A sample wider than the field: how far it reaches, and the volume in a box that holds all of it."""
+"""A sample wider than the field of view: its measured width, and the volume in a box that contains all of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rule of every choice, on residuals by hand, and the search for a strength."""
+"""The decision rule, on given residuals, and the search for a regularisation weight."""
 
 from __future__ import annotations
 

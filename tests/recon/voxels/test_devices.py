@@ -1,4 +1,4 @@
-"""Solvers make the same volumes on a GPU as on the CPU, to rounding. Without a GPU, Triton's interpreter stands in."""
+"""Solvers give the same volumes on GPU and CPU, to rounding. Without a GPU, Triton's interpreter is used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a sample that slipped lies is found from its views, against balls whose views are known."""
+"""The displacement of a sample that slipped is found from its projections, for balls with known projections."""
 
 from __future__ import annotations
 

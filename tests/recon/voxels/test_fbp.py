@@ -1,4 +1,4 @@
-"""FBP against closed forms, an independent implementation and the project's convention."""
+"""FBP compared with closed forms, an independent implementation and the project's convention."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sample wider than the field: views that end in matter go on beyond it; those that end in air do not."""
+"""Truncated projections: they are extrapolated if they end in the sample, and not if they end in air."""
 
 from __future__ import annotations
 

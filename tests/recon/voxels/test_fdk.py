@@ -1,4 +1,4 @@
-"""FDK against closed forms: chords of balls, the square of the magnification, absolute values in 1/mm."""
+"""FDK compared with closed forms: chords of balls, squared magnification, absolute values in 1/mm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What trials prefer, by their scores, and on which part of a scan they are made."""
+"""The scores of test reconstructions, and the part of a cone scan on which they are made."""
 
 from __future__ import annotations
 

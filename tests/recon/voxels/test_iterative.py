@@ -1,4 +1,4 @@
-"""The iterative methods against explicit matrices, an independent least-squares solver and slow references."""
+"""Iterative methods compared with explicit matrices, a least-squares solver and slow references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The law of the error, measured: against the error beside a known truth, and its refusals."""
+"""The measured error model, compared with the error for a known ground truth; and its errors."""
 
 from __future__ import annotations
 

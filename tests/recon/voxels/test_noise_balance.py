@@ -1,4 +1,4 @@
-"""The weight of total variation by noise: its first value, how it follows the residual, and what it makes of a scan."""
+"""The weight of total variation from noise: its first value, its update from the residual, and its effect."""
 
 from __future__ import annotations
 

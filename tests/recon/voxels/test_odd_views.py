@@ -1,4 +1,4 @@
-"""Views of which a part is not in the volume: a speck is named with its place, noise and misfits are not."""
+"""Projections that show something outside the volume: a particle is located; noise and misfits are not reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PnP-DCT: what its steps minimise, and what slabs and sides see of it; test_nothing_lost.py has what must stay."""
+"""PnP-DCT: the minimum of its steps, slabs and mirror images; test_nothing_lost.py has what must stay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filtered back-projection along the rays of rolled and tilted views, against truth, FBP and FDK."""
+"""FBP along the rays of rolled and tilted projections, compared with ground truth, FBP and FDK."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The voxel projector against closed forms, an explicit matrix, its own transpose and another implementation."""
+"""The voxel projector compared with closed forms, an explicit matrix, its transpose and another implementation."""
 
 from __future__ import annotations
 

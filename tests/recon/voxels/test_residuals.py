@@ -1,4 +1,4 @@
-"""Residuals: what a volume leaves of views, view by view."""
+"""Residuals of a volume for each projection."""
 
 from __future__ import annotations
 

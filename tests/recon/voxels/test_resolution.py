@@ -1,4 +1,4 @@
-"""Resolution: how much blurrier voxels are than views, and that model and views are compared at one resolution."""
+"""Resolution: how much blurrier voxels are than projections; both are compared at one resolution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Three slices of the views so far are those of the whole volume by FBP."""
+"""Three slices from the projections so far equal those of the whole FBP volume."""
 
 from __future__ import annotations
 

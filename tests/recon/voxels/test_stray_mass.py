@@ -1,4 +1,4 @@
-"""Stray mass: density where views show that nothing is, in a ball with and without a blob beside it."""
+"""Stray mass: density in regions that projections show to be empty, in a ball with and without a blob."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views held out: the rule, and the weight it finds: lighter than the one by the noise, or much heavier."""
+"""Held-out projections: the rule, and the weight it finds, compared with the weight from the noise."""
 
 from __future__ import annotations
 

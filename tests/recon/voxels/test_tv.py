@@ -1,4 +1,4 @@
-"""The proximal step of TV against its optimality condition and closed forms."""
+"""The proximal step of TV compared with its optimality condition and closed forms."""
 
 from __future__ import annotations
 

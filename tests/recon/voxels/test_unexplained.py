@@ -1,4 +1,4 @@
-"""Structure left in the residual: none in noise, rings or a true volume; a filled crack is seen, and where it is."""
+"""Unexplained structure in the residual: none for noise, rings or a true volume; a filled crack is located."""
 
 from __future__ import annotations
 

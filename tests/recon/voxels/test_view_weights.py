@@ -1,4 +1,4 @@
-"""Weights of views and rays: all cover what was measured, the two rays of a line share its weight."""
+"""Weights of projections and rays: together they cover what was measured; the two rays of a line share its weight."""
 
 from __future__ import annotations
 

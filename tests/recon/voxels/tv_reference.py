@@ -1,4 +1,4 @@
-"""Total variation in plain numpy and float64: the reference implementation of the kernels."""
+"""Total variation in plain numpy and float64: the reference implementation for the kernels."""
 
 from __future__ import annotations
 

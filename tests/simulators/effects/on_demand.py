@@ -18,12 +18,12 @@ from tests.simulators import shots
 from tests.simulators.effects.parameters import entry
 
 FRAMES = (0, 1, 4)
-"""A dark, a flat and view 2 of those that begin with frame 2; every effect shows in one of them."""
+"""A dark, a flat and projection 2 (projections begin with frame 2); every effect is visible in one of these frames."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A round Gaussian cloud: the least sample that obeys a pose, without a compiled kernel."""
+    """A round Gaussian cloud: the simplest sample that follows a pose, without a compiled kernel."""
 
     place: tuple[float, float, float] = (0.1, 0.05, 0.02)
     sigma: float = 0.08
@@ -45,13 +45,13 @@ class Cloud:
 
 
 def scene(names: Sequence[str]) -> Scene:
-    """A cloud in 4000 photons a frame and these effects, in the catalogue's order."""
+    """A cloud with 4000 photons per frame and these effects, in the order of the catalogue."""
     chosen = [entry(name) for name in CATALOGUE if name in names]
     return replace(shots.scene(*chosen, flux=4000.0), sample=Cloud())
 
 
 def shot(frame: int) -> Shot:
-    """1 s of a stage that turns slowly backwards, on a camera whose rows start late."""
+    """A shot of 1 s with a stage that turns slowly backwards, and a camera whose rows start late."""
 
     def stage(time: float) -> float:
         return 0.4 - 0.05 * (time - 1000.0)
@@ -78,5 +78,5 @@ def frames(of: Scene, numbers: Sequence[int] = FRAMES) -> list[NDArray[np.uint16
 
 
 def same(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> bool:
-    """Whether frames are equal to the last bit."""
+    """Whether frames are bit-identical."""
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))

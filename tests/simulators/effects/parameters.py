@@ -1,6 +1,6 @@
 """Parameters: for every effect of the catalogue, the least that it needs to show in a small frame (shots.shot()).
 
-Who adds an effect adds its line here; test_on_demand.py then proves of it that a scene without it pays nothing for it.
+A new effect gets its line here; test_on_demand.py then proves that a scene without the effect takes no time for it.
 """
 
 from __future__ import annotations
@@ -50,5 +50,5 @@ PARAMETERS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 
 
 def entry(name: str) -> dict[str, Any]:
-    """The effect as a scene names it."""
+    """The effect in the form of a scene."""
     return {"kind": name, **PARAMETERS[name]}

@@ -44,7 +44,7 @@ def test_a_share_of_the_light_is_detected(effect: dict[str, float], share: float
 
 
 def test_what_is_no_expectation_is_refused() -> None:
-    with pytest.raises(ValueError, match="expectations must lie in 0"):
+    with pytest.raises(ValueError, match="expected values must be 0"):
         PhotonNoise().apply(np.full((60, 80), -1.0), shots.shot())
 
 

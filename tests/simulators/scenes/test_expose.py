@@ -155,13 +155,13 @@ def test_a_converter_of_ones_own_has_its_electrons_a_count() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(IndexError, match=r"scan's 0 \.\.\. 10"):
+    with pytest.raises(IndexError, match=r"which has 0 \.\.\. 10"):
         _scan().frame(11)
     with pytest.raises(ValueError, match="got 0"):
         _scan(views=0)
     for changes, words in (
-        ({"detector": {"shape": [2400, 100]}}, "do not lie on the sensor of 2304 x 4096"),
-        ({"detector": {"shape": [1200, 100], "binning": 2}}, "do not lie on the sensor"),
+        ({"detector": {"shape": [2400, 100]}}, "do not fit on the sensor of 2304 x 4096"),
+        ({"detector": {"shape": [1200, 100], "binning": 2}}, "do not fit on the sensor"),
         ({"detector": {"binning": 3}}, "binning is 3; expected 1 | 2 | 4"),
         ({"detector": {"electrons_per_count": 0}}, "electrons_per_count is 0; expected a number > 0"),
         ({"detector": {"exposure_s": 0}}, "exposure_s is 0; expected a number > 0"),

@@ -89,7 +89,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
         (
             _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
-            "scene.phantom (battery): only",
+            "scene.phantom (battery): lower fill",
         ),
         (_with(phantom={"kind": "solids"}), "scene.phantom (solids).solids is missing; expected a list of"),
         (
@@ -111,7 +111,7 @@ def _with(**changes: Any) -> dict[str, Any]:
             "effect 'photon_noise' acts on photons and cannot follow 'offset', which acts on counts; "
             "the order is motion, optical depth, photons, electrons, counts",
         ),
-        (_with(effects=["offset", "offset"]), "effect 'offset' is named twice"),
+        (_with(effects=["offset", "offset"]), "effect 'offset' is given twice"),
         (
             _with(effects=["photon_noise", {"kind": "ring_current", "lifetime": 9}]),
             "effect 'ring_current' must come before 'photon_noise', which ends the photons",

@@ -39,7 +39,7 @@ class ElectrometerConfig(BeamMonitorSection):
     setup: tuple[str, ...] = setting((), "Commands without a reply, sent once at the start.")
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
     baudrate: int = setting(9600, gt=0)
-    transcript: str | None = setting(None, "As the stage's.")
+    transcript: str | None = setting(None, "As for the stage.")
 
     @property
     def simulated(self) -> bool:

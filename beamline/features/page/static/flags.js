@@ -27,7 +27,7 @@ export class Timeline {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.font = "12px system-ui"; context.fillStyle = style.getPropertyValue("--faint");
     const checks = this.checks || [], left = 80, width = box.width - left - 8, line = Math.min(22, (box.height - 20) / Math.max(1, checks.length));
-    if (!checks.length) context.fillText(this.monitored ? "no frame is flagged" : "no monitor looked at these frames: beamline monitor FILE does", 8, 20);
+    if (!checks.length) context.fillText(this.monitored ? "no frame is flagged" : "the monitor did not check these frames: beamline monitor FILE checks them", 8, 20);
     checks.forEach((check, i) => context.fillText(check, 6, 14 + i * line));
     for (const flag of this.flags) {
       context.fillStyle = style.getPropertyValue(flag.alarm ? "--bad" : "--warn");

@@ -85,7 +85,7 @@ async function fetchFlags() {
 let strip = { row: null, lines: [], views: [], order: [], cols: 0, busy: false };
 const sinogram = new Picture($("sinogram"), {
   stretch: true,
-  point: (line, col, value) => { const view = strip.order[line]; $("sinogram-value").textContent = view === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
+  point: (line, col, value) => { const view = strip.order[line]; $("sinogram-value").textContent = view === undefined ? "" : `projection ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
 });
 
 async function fetchSinogram() {
@@ -107,7 +107,7 @@ async function fetchSinogram() {
       sinogram.window = usualWindow(tile);
       sinogram.show(tile, shape);
     }
-    $("sinogram-name").textContent = `of row ${row}, ${mine.views.length} views${mine.order.some((view, line) => view !== line) ? ", by angle" : ""}`;
+    $("sinogram-name").textContent = `row ${row}, ${mine.views.length} projections${mine.order.some((view, line) => view !== line) ? ", sorted by angle" : ""}`;
   } catch (error) { $("sinogram-name").textContent = error.message; }
   mine.busy = false;
 }
@@ -143,7 +143,7 @@ function dial(context, [first, last]) {
   context.fillStyle = context.strokeStyle = "#d29922"; context.font = "12px sans-serif"; context.textAlign = "right";
   context.beginPath(); context.arc(x, y, radius, 0, 2 * Math.PI); context.stroke();
   for (const half of [90, 270]) { context.beginPath(); context.moveTo(x, y); context.arc(x, y, radius, (first + half) * Math.PI / 180, (last + half) * Math.PI / 180); context.fill(); }
-  context.fillText(`rays to come: ${(last - first).toFixed(0)} of 180 degrees`, x - radius - 6, y + 4);
+  context.fillText(`not measured yet: ${(last - first).toFixed(0)} of 180 degrees`, x - radius - 6, y + 4);
 }
 
 function place(axis, row, col) {
@@ -158,7 +158,7 @@ async function fetchVolume() {
   if (!answer.ok) return;
   const before = volume;
   [volume] = await answer.json();
-  $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `views 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}${volume.because ? `; ${volume.because}` : ""}`;
+  $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `projections 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}${volume.because ? `; ${volume.because}` : ""}`;
   const changed = !before || before.shape.join() !== volume.shape.join();
   for (let axis = 0; axis < 3; axis++) {
     $(`at${axis}`).max = volume.shape[axis] - 1;
@@ -193,7 +193,7 @@ async function fetchModel() {
 }
 
 // --- curves ------------------------------------------------------------------------------------------------------
-const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"], error: ["views", "error along views held out"] };
+const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["projections", "residual"], error: ["projections", "error in held-out projections"] };
 
 async function fetchTrace() {
   if (!region) return;
@@ -234,13 +234,13 @@ function onRun(event) {
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
     case "progress": if (data.steps !== undefined) work = data; if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
-    case "pass_ended": passes.end(data); log(data, `Pass ${data.passes ?? data.number} is over, ${data.n_views} views so far`); break;
-    case "next_chosen": if (data.choice === "enough") ended = `Ended after pass ${data.passes ?? data.number} by the choice enough of the ${data.by}: ${data.reason}. ${data.dropped ?? 0} planned frames were not taken.`; passes.choose(data); log(data, `After pass ${data.passes ?? data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
+    case "pass_ended": passes.end(data); log(data, `Pass ${data.passes ?? data.number} has ended, ${data.n_views} projections so far`); break;
+    case "next_chosen": if (data.choice === "enough") ended = `Ended after pass ${data.passes ?? data.number} because the ${data.by} chose enough: ${data.reason}. ${data.dropped ?? 0} planned frames were not taken.`; passes.choose(data); log(data, `After pass ${data.passes ?? data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
     case "warning": log(data, data.message, "warning"); break;
     case "failed": log(data, data.message, "failed"); break;
     case "scan_done": rate = null; log(data, `Scan ${data.status}: ${data.n_frames} frames in ${data.seconds.toFixed(0)} s, ${data.missing.length} missing`); break;
-    case "recon_done": log(data, `Volume ${data.shape.join(" x ")} of ${data.n_views} views`); break;
+    case "recon_done": log(data, `Volume ${data.shape.join(" x ")} from ${data.n_views} projections`); break;
   }
 }
 
@@ -313,7 +313,7 @@ function header(now) {
   if (now.status === "running") shown["last frame"] = `${now.age_s.toFixed(0)} s ago`;
   if (curves.beam.y.length) shown.beam = `${curves.beam.y[curves.beam.y.length - 1].toPrecision(4)} ${curves.beam.unit}`;
   if (fit && now.status === "running") shown.volume = `${fit.n_views} views${fit.waiting ? `, ${fit.waiting} wait` : ""}, ${(fit.step / fit.views).toFixed(1)} steps a view, ${fit.n_gaussians} Gaussians`;
-  else if (work && work.steps && work.step < work.steps) shown.volume = `last round: ${work.step} of ${work.steps} ${work.unit || "steps"}${work.eta_s === null ? "" : `, ${duration(work.eta_s)} left for this step`}`;
+  else if (work && work.steps && work.step < work.steps) shown.volume = `final fit: ${work.step} of ${work.steps} ${work.unit || "steps"}${work.eta_s === null ? "" : `, ${duration(work.eta_s)} left for this step`}`;
   shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
   $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
   const over = now.status !== "running" && now.status !== "preparing";
@@ -340,7 +340,7 @@ for (const button of document.querySelectorAll("#verbs button")) button.addEvent
 });
 async function send(verb) {
   if (verb === "pause" || verb === "resume") pausing = verb === "pause";  // resume takes back a pause that has not begun
-  $("said").textContent = verb === "pause" ? "pause: sent. The scan pauses as soon as the frame, or the wait, that is under way has ended. Until then Resume takes the pause back." : `${verb}: sent`;
+  $("said").textContent = verb === "pause" ? "pause: sent. The scan pauses when the current frame, or the current wait, has ended. Until then Resume cancels the pause." : `${verb}: sent`;
   const answer = await fetch(`api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
   const data = await answer.json().catch(() => ({}));
   if (!answer.ok && verb === "pause") pausing = false;
@@ -370,7 +370,7 @@ document.addEventListener("visibilitychange", () => { if (over) return; feed.clo
 setInterval(() => {
   const silent = (Date.now() - lastSeen) / 1000, lost = !over && !document.hidden && feed.readyState !== EventSource.OPEN;
   document.body.classList.toggle("lost", lost && silent > 3);
-  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; $("said").textContent = `${nextStep || "The scan does not need its page."} ${again()}`; }
+  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; $("said").textContent = `${nextStep || "The scan continues without its page."} ${again()}`; }
 }, 1000);
 
 function element(name, text, kind = "") { const made = document.createElement(name); made.textContent = text; if (kind) made.className = kind; return made; }

@@ -1,6 +1,6 @@
 // What can be measured after a pass, side by side; buttons that answer while the scan asks; what was chosen so far.
 
-const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", offset: "offset views", retake: "bad views again", enough: "no further pass" };
+const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", offset: "offset projections", retake: "bad projections again", enough: "no further pass" };
 const CHOSEN_BY = { program: "program", operator: "operator", plan: "nobody: as planned" };
 
 export class Passes {
@@ -36,9 +36,9 @@ export class Passes {
     const find = (name) => this.box.querySelector(name), asks = this.asks && this.runs, { ended } = this;
     this.box.hidden = !ended && !this.decisions.length;
     find("thead + tbody").replaceChildren(...(ended ? ended.options : []).map((option) => this.rowOf(option, asks && this.mayAct)));
-    find("small").textContent = ended ? `pass ${ended.passes ?? ended.number} is over, ${ended.n_views} views so far` : "";
+    find("small").textContent = ended ? `pass ${ended.passes ?? ended.number} has ended, ${ended.n_views} projections so far` : "";
     const how = this.mayAct ? "Choose above" : "beamline decide CHOICE";
-    const question = asks ? `The scan asks what is next. ${how}; after ${ended.wait.toFixed(0)} s without an answer the plan goes on.` : "";
+    const question = asks ? `The scan waits for your decision on what to measure next. ${how}; after ${ended.wait.toFixed(0)} s without an answer it continues its plan.` : "";
     find(".asks").textContent = [ended?.remark, question].filter(Boolean).join(" ");
     find(".decisions").hidden = !this.decisions.length;
     find(".decisions tbody").replaceChildren(...this.decisions.map((decision) => row([decision.passes ?? decision.number, decision.choice, CHOSEN_BY[decision.by] ?? decision.by, db(decision.predicted), db(decision.gained) + rangeOf(decision.gained_low, decision.gained_high), decision.reason])).reverse());

@@ -19,10 +19,10 @@ export async function showScan(facts, draw) {
   $("names").textContent += `; ${told.said}`;
   $("mean-of").append(...told.means.map((name) => new Option(name)));
   $("mean-of").addEventListener("change", showMean);
-  draw("angles", "view", "degrees", number, [{ name: "angle", values: facts.angles }], { x: { time: false } });
+  draw("angles", "projection", "degrees", number, [{ name: "angle", values: facts.angles }], { x: { time: false } });
   const light = async () => {
     const values = (await json("api/scan")).light, known = number.filter((i) => values[i] !== null);
-    draw("light", "view", "mean", known, [{ name: "mean", values: known.map((i) => values[i]) }], { x: { time: false } });
+    draw("light", "projection", "mean", known, [{ name: "mean", values: known.map((i) => values[i]) }], { x: { time: false } });
     await showMean();
     if (known.length < number.length && $("reading").textContent) setTimeout(light, 3000);
   };
@@ -36,7 +36,7 @@ async function showMean() {
 
 // --- the axis ------------------------------------------------------------------------------------------------------
 async function showAxis(opposite) {
-  $("pair-name").textContent = opposite ? `view ${opposite[0]} less view ${opposite[1]}, mirrored about the axis${Math.abs(opposite[2]) > 0.01 ? ` (they miss half a turn by ${opposite[2].toFixed(2)}°)` : ""}: grey alone where the axis is right` : "No two views are half a turn apart: judge by the slice.";
+  $("pair-name").textContent = opposite ? `projection ${opposite[0]} minus projection ${opposite[1]} mirrored about the axis${Math.abs(opposite[2]) > 0.01 ? ` (their angles differ from 180° by ${opposite[2].toFixed(2)}°)` : ""}: uniformly grey if the axis is right` : "No two projections are 180° apart: judge by the slice.";
   if (opposite) views = await Promise.all(opposite.slice(0, 2).map((view) => fetchTile(`api/slice/0/0/${view}`)));
   try {
     const found = await json(`api/axis/${row()}`);
@@ -94,7 +94,7 @@ async function showSlice(moving) {
         slice.settled = true;
       }
       slice.show(tile, [n, n], tile.region);
-      $("fbp-name").textContent = `slice of row ${row()} by FBP, axis ${axis}${tilt ? `, tilt ${tilt}°` : ""}: arcs and doubled edges go where the axis is right`;
+      $("fbp-name").textContent = `FBP slice of row ${row()}, axis ${axis}${tilt ? `, tilt ${tilt}°` : ""}: arcs and double edges disappear if the axis is right`;
       $("fbp").dataset.shown = `${axis} ${tilt} ${(performance.now() - began).toFixed(0)}`;
     } catch (error) { $("fbp-name").textContent = error.message; }
   }

@@ -1,3 +1,3 @@
-"""Beam hardening taken back, by a spectrum or by the views themselves."""
+"""Beam hardening correction, from a stated spectrum or from the projections themselves."""
 
 STEPS = {"Hardening": "beam_hardening.hardening"}

@@ -1,4 +1,6 @@
-"""Beam hardening: line integrals by the curve of a stated material and beam, or of what the views themselves show."""
+"""Beam hardening: corrects line integrals with the curve of a stated material and beam, or with a curve fitted to
+the projections.
+"""
 
 from __future__ import annotations
 
@@ -27,22 +29,25 @@ if TYPE_CHECKING:
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
-_LEAST_SEEN = 0.01  # growth of the largest line integral, as a share, from which on there is hardening
-_FEWEST, _BUSIEST = 30, 8  # views, and binned rows, by which hardening is sought where nobody asked
-_EVENED, _MATTERS = 0.5, 0.05  # a quarter of the variance, which of 30 views is no chance (F: 1e-4); share of density
-_AS_EVEN = 1e-3  # that the mass may vary more: the correction amplifies noise, too
-_CURVED = 16  # float32 copies of a view while a curve corrects it
-_RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
-_NODE = 40_000  # bytes of a curve for each energy
-_RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
+_LEAST_SEEN = 0.01  # relative increase of the largest line integral from which on there is hardening
+_FEWEST, _BUSIEST = 30, 8  # projections, and binned rows, in which hardening is searched for if the user did not ask
+# Reported without being asked: if the correction halves the spread of the total absorption (a quarter of the variance;
+# with 30 projections that is not chance, F test 1e-4), and if it changes densities by this share
+_EVENED, _MATTERS = 0.5, 0.05
+# by how much more the total absorption may vary afterwards, because the correction also amplifies noise
+_AS_EVEN = 1e-3
+_CURVED = 16  # float32 copies of a projection while a curve corrects it
+_RAYS, _VOLUMES = 10, 3  # float32 copies of the projections and of the volume during the fit of a curve
+_NODE = 40_000  # bytes of a curve per energy
+_RIM = 2.0  # voxels: shorter paths through the material are mostly its edges, which are blurred
 
 
 def _model(text: str) -> str | None:
     """`fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
-            f"{text!r} is not known; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or "
-            "Al:FILE)"
+            f"{text!r} is unknown; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a "
+            "tube behind 1 mm Al; or Al:FILE)"
         )
     return None if text == "none" else text
 
@@ -52,9 +57,9 @@ class Hardening:
     """Settings of the beam hardening correction.
 
     Attributes:
-        model: "fit": by a curve that is fitted on the views; `material:beam` as the user said it; None: not at all.
-        spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
-            light; None: that of `model`.
+        model: "fit": a curve fitted to the projections; `material:beam` as the user gave it; None: no correction.
+        spectrum: the material's attenuation, in any unit, at the energies of the beam, and the share of each energy
+            in the detected intensity; None: that of `model`.
     """
 
     name: ClassVar[str] = "hardening"
@@ -62,9 +67,10 @@ class Hardening:
     model: str | None = option(
         "--hardening",
         "none",
-        "Correct beam hardening of a sample of one material. fit: by a curve fitted to its views. MATERIAL:BEAM: by "
-        "attenuation, where BEAM is a tube (60kV), a tube behind mm of filters (60kV,Al=1,Cu=0.1), or a text file with "
-        "a line 'keV weight' for each energy.",
+        "Correct beam hardening of a sample of one material. none: no correction. fit: with a curve "
+        "fitted to the projections. MATERIAL:BEAM: with the attenuation of the material, where BEAM is a "
+        "tube (60kV), a tube behind mm of filters (60kV,Al=1,Cu=0.1), or a text file with a line 'keV "
+        "weight' for each energy.",
         parse=_model,
         metavar="none|fit|MATERIAL:BEAM",
     )
@@ -80,7 +86,11 @@ class Hardening:
 
     @property
     def needs_finished(self) -> str:
-        return "" if self.model is None else "--hardening is for a finished scan: its curve is fitted to all views."
+        return (
+            ""
+            if self.model is None
+            else "--hardening needs a finished scan, because its curve is fitted to all projections."
+        )
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory(alone=0 if self.model is None else curve_memory(part.geometry, self))
@@ -100,16 +110,16 @@ class Hardening:
 
 def in_beam(material: str, beam: str) -> tuple[F64, F64]:
     """Mass attenuation of a material at the energies of a beam, cm²/g, and the share of each energy in the detected
-    light.
+    intensity.
 
     Args:
         material: a known one, or a chemical formula.
         beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
-            weight, with the detector's response and in any unit. A filter needs its density: it is
-            one of the known materials.
+            weight, in any unit; the weight includes the detector's response. Filters must be known materials,
+            because their density is needed.
 
     Raises:
-        ValueError: what is wrong with either.
+        ValueError: material or beam is unknown or wrong; the message says which.
     """
     from recon.prep.matter import mass_attenuation, tube_spectrum
 
@@ -123,7 +133,9 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
         except (OSError, ValueError) as error:
             raise ValueError(f"{beam} is neither a tube such as 60kV,Al=1 nor a table of keV and weight") from error
         if table.shape[1] != 2 or not (table >= 0).all() or not table[:, 1].any():
-            raise ValueError(f"{beam} must hold two columns, keV and weight, 0 or more, and not all weights 0")
+            raise ValueError(
+                f"{beam} must have two columns, keV and weight, with values of 0 or more and not all weights 0"
+            )
         energies, weights = table[table[:, 1] > 0].T
     return mass_attenuation(material, energies), weights
 
@@ -141,16 +153,20 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
         try:
             curve, explained, _ = fit_curve(views, geometry)
         except NoCurveError as error:
-            return None, f"Hardening: not determined by the views ({error}); none corrected."
-        how = f"fitted on the views; one material explains {explained:.1%} of them"
+            return None, (
+                f"Beam hardening was not corrected, because the projections do not determine the curve ({error})."
+            )
+        how = f"fitted to the projections; one material explains {explained:.1%} of them"
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
     if corrected < (1 + _LEAST_SEEN) * highest:
-        return None, f"Hardening: none seen ({how}); none corrected."
-    return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
+        return None, f"Beam hardening: none was found ({how}), so nothing was corrected."
+    return curve, (
+        f"Beam hardening was corrected with the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
+    )
 
 
 def curve_memory(geometry: Geometry, step: Hardening) -> int:
-    """Peak memory in bytes of finding the hardening curve of such views and applying it."""
+    """Peak memory in bytes of finding the hardening curve of such projections and applying it."""
     from recon.voxels.fbp import fbp_memory
 
     view = _CURVED * 4 * math.prod(geometry.detector_shape)
@@ -162,7 +178,7 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 
 def _clearly_seen(views: PreparedProjections) -> str:
-    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else ""."""
+    """A sentence if the rows with the most material show hardening although nobody asked for a correction; else ""."""
     from recon.voxels.field_edges import FieldEdges, busiest_rows
 
     data, geometry = views.centred.projections.data, views.centred.geometry
@@ -172,7 +188,7 @@ def _clearly_seen(views: PreparedProjections) -> str:
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
     if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _AS_EVEN:
         return ""
-    from recon.features.beam_hardening import NoCurveError  # here, because it loads scipy.optimize
+    from recon.features.beam_hardening import NoCurveError  # imported here, because it loads scipy.optimize
 
     try:
         curve, _, evened = fit_curve(data[:, rows], geometry.rows(rows.start, rows.stop))
@@ -182,28 +198,32 @@ def _clearly_seen(views: PreparedProjections) -> str:
     if evened > _EVENED or corrected < (1 + _MATTERS) * highest:
         return ""
     return (
-        f"Hardening: line integrals of {highest:.3g} would be {corrected:.3g} by the curve of one material, and the "
-        f"mass of a row would vary {1 / evened:.2g} times less from view to view; nothing was corrected. Give "
-        "--hardening fit if the sample is of one material"
+        "Give --hardening fit if the sample is of one material, because the projections show beam "
+        f"hardening: the curve of one material would raise line integrals of {highest:.3g} to "
+        f"{corrected:.3g}, and the total absorption of a row would vary {1 / evened:.2g} times less "
+        "between projections. Nothing was corrected"
     )
 
 
 def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     """Fit the curve to path lengths from a first reconstruction, assuming one material.
 
-    The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of
-    views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).
+    The path lengths are those through voxels above the middle between material and air. The volume of the next round
+    is made of projections corrected with the last curve, until the curve no longer changes (after Krumm, Kasperl &
+    Franz 2008, NDT & E Int. 41, 242).
 
-    A sample that is denser outside than inside looks the same in any one view. But all views of a row hold the same
-    mass (the first of the Helgason-Ludwig conditions), and a wrong curve spoils that.
+    In a single projection, a sample that is denser outside than inside looks like hardening. But all projections of
+    a row have the same total absorption (the first of the Helgason-Ludwig conditions), and a wrong curve violates
+    that.
 
     Returns:
-        The curve, the share of the line integrals that path lengths explain, and the variation of the masses of
-        corrected views over that of the views.
+        The curve, the share of the line integrals that path lengths explain, and the variation of the total
+        absorption of corrected projections divided by that of the uncorrected ones.
 
     Raises:
-        NoCurveError: the sample is of several materials, the curve does not settle, or it makes masses differ more. Or
-            the beam is a cone, whose views need not hold the same mass.
+        NoCurveError: the sample is of several materials, the curve does not converge, or it makes the total
+            absorption vary more. Or the beam is a cone, in which the total absorption need not be the same in all
+            projections.
     """
     from recon.features.beam_hardening import NoCurveError, curve_of_paths
     from recon.post import k_means
@@ -212,7 +232,8 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
 
     if geometry.is_cone:
         raise NoCurveError(
-            "a fit needs a parallel beam, in which all views show the same mass: state material and beam"
+            "a fit needs a parallel beam, in which the total absorption is the same in all projections. "
+            "State material and beam"
         )
     some, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
@@ -231,15 +252,16 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
             uneven, after = _unevenness(measured), _unevenness(now)
             if after > uneven + _AS_EVEN:
                 raise NoCurveError(
-                    f"corrected views agree less with each other: their mass varies by {after:.2%} instead of "
-                    f"{uneven:.2%}, as where a sample is denser outside"
+                    "after the correction the projections agree less with each other: their total "
+                    f"absorption varies by {after:.2%} instead of {uneven:.2%}, for example because the "
+                    "sample is denser outside"
                 )
             return curve, explained, after / max(uneven, 1e-30)
     raise NoCurveError(f"the curve does not converge in {_ROUNDS} iterations")
 
 
 def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
-    """Views and a binning that are enough for a curve, and the geometry that they have."""
+    """Projections and a binning that are enough for a curve, and their geometry."""
     n, (rows, cols) = geometry.n_views, geometry.detector_shape
     some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
     factor = max(1, min(round(cols / _COLS), rows))
@@ -247,7 +269,9 @@ def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
 
 
 def _unevenness(views: F32) -> float:
-    """How much the mass of a row varies from view to view, as a share: the median over the rows that hold some."""
+    """How much the total absorption of a row varies between projections, as a share: the median over the rows with
+    material.
+    """
     mass = views.sum(axis=2, dtype=np.float64)
     mean = mass.mean(axis=0)
     filled = mean > 0.1 * mean.max()

@@ -1,3 +1,3 @@
-"""Geometry and gains learnt from the views themselves."""
+"""Calibration: geometry and pixel sensitivities, found from the projections themselves."""
 
 STEPS = {"Calibrate": "calibration.calibrate"}

@@ -1,4 +1,4 @@
-"""Calibration: learns geometry and pixel gains from the views."""
+"""Calibration: finds the geometry and the pixel sensitivities from the projections."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     GeometryOf = Callable[[ScanSelection, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
-GAINS = "gains"  # the term that changes line integrals
-_COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
+GAINS = "gains"  # the one term that changes line integrals, not the geometry
+_COPIES = 24  # float32 copies of the projections used while their geometry is found
 
 
 def _terms(text: str) -> tuple[str, ...]:
-    """A list of terms without "none"; in the order in which they are learnt."""
+    """A list of terms without "none", in the order in which they are calibrated."""
     names = [name.strip() for name in text.split(",")]
     if names == ["none"]:
         return ()
@@ -47,7 +47,7 @@ def _terms(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Which terms of the geometry, and whether gains of pixels, are learnt from the views.
+    """Which terms of the geometry, and whether pixel sensitivities, are found from the projections.
 
     Attributes:
         terms: names; none: nothing.
@@ -59,9 +59,10 @@ class Calibrate:
     terms: tuple[str, ...] = option(
         "--calibrate",
         "none",
-        "Learn these from the views, separated by commas: axis, roll (lean of the axis in the detector's plane), tilt "
-        "(lean along the beam), shifts (of each view), gains (of pixels). Views are not resampled. What held-out views "
-        "do not confirm is not changed.",
+        "Find these from the projections, separated by commas: axis (its column), roll (tilt of the axis "
+        "in the detector's plane), tilt (tilt of the axis along the beam), shifts (of each projection), "
+        "gains (pixel sensitivity). Projections are not resampled. A parameter changes only if the "
+        "held-out projections agree better with the new value.",
         parse=_terms,
         metavar="LIST",
     )
@@ -73,15 +74,17 @@ class Calibrate:
 
     @property
     def may_lean(self) -> bool:
-        """Whether the calibration may find a roll or tilt of the views: a detector row then shows several slices."""
+        """True if the calibration may find a roll or tilt of the projections: a detector row then shows several
+        slices.
+        """
         return not self.geometry.isdisjoint({"roll", "tilt"})
 
     @property
     def needs_finished(self) -> str:
-        return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
+        return "--calibrate needs a finished scan, because it uses all projections." if self.terms else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
-        if not self.terms:  # nothing of it is loaded
+        if not self.terms:  # nothing of the calibration is loaded
             return StepMemory()
         from recon.features.calibration.gains import gains_memory
 
@@ -89,7 +92,7 @@ class Calibrate:
         return StepMemory(alone=max(_search_memory(part, self.geometry), gains))
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
-        """Raise DataError for terms that need more views, or more binned columns, than the scan has."""
+        """Raise DataError for terms that need more projections, or more binned columns, than the scan has."""
         if not self.terms:
             return
         from recon.features.calibration import gains
@@ -101,8 +104,8 @@ class Calibrate:
                 least, wide, views = gains.LEAST_VIEWS, gains.LEAST_COLS, used
             if views < least or cols < wide:
                 raise DataError(
-                    f"--calibrate {term}: {views} views of {cols} columns are too few; {least} of {wide} are needed. "
-                    "Leave it out. No view was read."
+                    f"Omit --calibrate {term}: the scan has {views} projections of {cols} columns, and "
+                    f"{term} needs {least} projections of {wide} columns. Nothing was read."
                 )
 
     def learn(
@@ -131,16 +134,17 @@ class Calibrate:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """The calibrated geometry of some views.
+    """The calibrated geometry of some projections.
 
     Attributes:
         frames: rows of the file, in order.
         change: in pixels of the detector, about the middle row of the band.
         pitch: mm of such a pixel.
-        off_middle: rows from the middle of the band to that of the detector, about which views roll and tilt.
-        pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
+        off_middle: rows from the middle of the band to that of the detector, about which projections roll and tilt.
+        pivot: row of the detector about which projections are rolled and tilted, binned and counted from the first
+            one used.
         binning: of the pixels of the band.
-        learnt: with what views held out say of it.
+        learnt: with the residuals in held-out projections.
     """
 
     frames: I64
@@ -183,7 +187,7 @@ def calibrated(
         progress: how many steps are done, of how many at most.
 
     Raises:
-        DataError: too few views, or nothing in the beam.
+        DataError: too few projections, or nothing in the beam.
     """
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
@@ -199,9 +203,7 @@ def calibrated(
             views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
-        raise DataError(
-            f"{source.path}: the geometry could not be calibrated: {error}. Leave out --calibrate."
-        ) from error
+        raise DataError(f"{source.path}: the geometry could not be calibrated: {error}. Omit --calibrate.") from error
     looked, middle = band.detector_rows, (source.shape[0] - 1) / 2
     whole = replace(selection, binning=1, rows=None).geometry(0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
@@ -210,7 +212,7 @@ def calibrated(
 
 
 def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
-    """Bytes that `calibrated` takes at most."""
+    """Bytes that `calibrated` needs at most."""
     if not terms:
         return 0
     from beamline.projections.correction import at_once_memory
@@ -224,7 +226,7 @@ def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
 def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
     """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
 
-    Of the rows around a region it takes those of the whole volume, for which the region is cut out of it.
+    For a region of interest, the rows around it are those of the whole volume, and the region is cut out.
     """
     from recon.features.calibration.learn import COLS, ROWS
 
@@ -237,26 +239,30 @@ def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
-    """Correct the views for pixel gains if held-out views confirm them, see `learn_gains`."""
+    """Correct the projections for pixel sensitivities if held-out projections confirm them, see `learn_gains`."""
     from recon.features.calibration.gains import NEAR_AXIS, learn_gains
 
     try:
         learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
     except ValueError as error:
-        raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
+        raise DataError(f"--calibrate gains: {error}. Omit it, or give --rings.") from error
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
-    judged = f"views held out are left {learnt.without:.4g} without them and {learnt.left:.4g} with them"
+    judged = (
+        f"the residual in held-out projections is {learnt.without:.4g} without the correction and "
+        f"{learnt.left:.4g} with it"
+    )
     if learnt.without == 0:
-        judged = "no stripes are seen in the views that are the detector's"
+        judged = "the projections show no stripes that come from the detector"
     if not learnt.confirmed:
-        sentence = f"Gains learnt with the volume: none taken off; {judged}."
+        sentence = f"Pixel sensitivities were not corrected: {judged}."
         return StepDone(sentence, {"learnt_gains": sentence, **values})
     for view in views.projections.data:
         view -= learnt.pixels
     if views.held_out is not None:
         views.held_out.data[...] -= learnt.pixels
     sentence = (
-        f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
-        f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."
+        f"Pixel sensitivities were corrected by {float(learnt.pixels.std()):.4f} in line integral "
+        f"(standard deviation); {judged}. Columns within {NEAR_AXIS:g} of the axis were not corrected, "
+        "because there a sensitivity looks like an object on the axis."
     )
     return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

@@ -1,3 +1,3 @@
-"""Views after the sample moved on its stage."""
+"""Projections after the sample moved on its stage."""
 
 STEPS = {"Jumps": "jumps.jumps"}

@@ -1,4 +1,6 @@
-"""Jumps: of a scan in which the sample jumped the longest run of views is used; whether it did, the views say."""
+"""Jumps of the sample: checks in the projections whether the sample jumped, and uses the longest part of the scan
+between jumps.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,23 @@ if TYPE_CHECKING:
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
-LEAST = 6  # views on a side that say whether the sample jumped there
-ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits has no more
-_ADDS = 0.005  # share of the deviation of the longest part's views that a part which fits may add
-_COLS, _ROWS, _VIEWS = 128, 16, 360  # binned pixels and views looked at, at most; parts of `_SHORT` views have all
+LEAST = 6  # projections on a side that are enough to decide whether the sample jumped there
+# times the deviation of the longest part's projections: a part in which the sample is in the same place has no more
+ALIKE = 1.5
+# share of the deviation of the longest part's projections by which a part may raise it and still count as the same
+# place
+_ADDS = 0.005
+# upper limits for binned pixels and projections; of parts of `_SHORT` projections all are used
+_COLS, _ROWS, _VIEWS = 128, 16, 360
 _SHORT = 40
-_REPAIRED = "`--calibrate shifts` takes all views, and learns where each stood."
+_REPAIRED = "`--calibrate shifts` uses all projections and finds the position of the sample in each."
 
 
 @dataclass(frozen=True)
 class Jumps:
-    """Leaves out views after a jump, see `find_jumps`; none where the place of each view is stated or learnt."""
+    """Leaves out projections after a jump, see `find_jumps`; none if the position of the sample in each projection
+    is stated or calibrated.
+    """
 
     name: ClassVar[str] = "jumps"
     follows: ClassVar[tuple[str, ...]] = ("tilt", "phase")
@@ -60,11 +68,11 @@ class Jumps:
 
 @dataclass(frozen=True, eq=False)
 class SampleJumps:
-    """The views of a scan in which the sample jumped, that belong together.
+    """The projections that belong together, of a scan in which the sample jumped.
 
     Attributes:
         frames: int64 [view], the rows that are used.
-        sentence: what was done, in a line; empty where there was no jump.
+        sentence: what was done, in a line; empty if there was no jump.
     """
 
     frames: I64
@@ -87,15 +95,16 @@ def find_jumps(
     axis_col: float,
     progress: Callable[[int, int], None] = lambda n, most: None,
 ) -> SampleJumps:
-    """The longest run of views in which the sample stood in one place.
+    """The longest run of projections in which the sample stayed in one place.
 
-    A jump is one where views held out of the longer side are predicted worse by both sides than by that side, or those
-    of the other side far worse than these. The clearest one is sought first, then others on its sides.
+    A jump is real in two cases: held-out projections of the longer side are predicted worse by both sides together
+    than by that side alone, or those of the other side are predicted far worse than these. The clearest jump is
+    searched for first, then others on its sides.
 
     Args:
         frames: rows of the file that are to be used.
-        jumps: rows from which on the sample is elsewhere, as the monitor saw.
-        progress: how many jumps were looked at, of at most how many.
+        jumps: rows after which the sample moved, according to the monitor.
+        progress: how many jumps were checked, of at most how many.
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
@@ -104,12 +113,13 @@ def find_jumps(
         where = frames_text(jumps)
         return SampleJumps(
             frames,
-            f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
-            "not moved. Choose those of one side with --views.",
+            "Use --views to choose the projections before or after the jump: the monitor reports that "
+            f"the sample jumped at {where}. In a cone beam jumps cannot be checked, so all projections "
+            "are used as if the sample had not moved.",
         )
     runs, most = [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
-    steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
+    steady = frames[np.bincount(part)[part] >= LEAST]  # projections between two alarms are left out of the comparison
     real, at, n = list[int](), 0, 0
     while at < len(runs):
         run, clearest, best = np.intersect1d(runs[at], steady), 1.0, 0
@@ -125,31 +135,31 @@ def find_jumps(
         else:
             at += 1
     kept = max(runs, key=len)
-    if real:  # nor are they known to belong to one side
+    if real:  # it is not known to which side these belong either
         inner = np.intersect1d(kept, steady)
         kept = kept[(kept >= inner[0]) & (kept <= inner[-1])]
     return SampleJumps(kept, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - kept.size))
 
 
 def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
-    """What was done at the jumps, and at which alarms the views show none."""
+    """What was done at real jumps, and the alarms at which the projections show no jump."""
     text = list[str]()
     if lost:
         verb = "is" if lost == 1 else "are"
         text.append(
-            f"The sample jumped at {frames_text(real)}. {count(lost, 'view')} {verb} left out: the sample stood "
-            f"elsewhere in them. {_REPAIRED}"
+            f"The sample jumped at {frames_text(real)}. {count(lost, 'projection')} {verb} left out, "
+            f"because the sample had another position in them. {_REPAIRED}"
         )
     if (none := np.setdiff1d(jumps, real)).size:
         text.append(
-            f"At the alarm of motion at {frames_text(none)} the other views show no jump: the views on both sides are "
-            "used as they are."
+            f"The monitor reported motion at {frames_text(none)}, but the projections show no jump of the "
+            "sample: those on both sides are used as they are."
         )
     return " ".join(text)
 
 
 def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, frames: I64, row: int) -> float:
-    """How clearly the sample stood elsewhere from `row` on in these rows of the file; 1 is the limit."""
+    """How clearly the sample was in another place from `row` on in these rows of the file; 1 is the limit."""
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
     from recon.voxels.displacement import Displacement, judge
@@ -166,7 +176,7 @@ def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, fr
 
 
 def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
-    """Binned pixels, and rows around the middle of those that are used, also outside them."""
+    """Binned pixels, and rows around the middle of those that are used, also beyond them."""
     width, height = source.shape[1] // selection.binning, source.shape[0]
     binning = selection.binning * max(1, math.ceil(width / _COLS))
     used = selection.detector_rows
@@ -176,7 +186,7 @@ def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
 
 
 def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
-    """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
+    """Bytes that `find_jumps` needs at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
     from beamline.storage.rules.evidence import ScanEvidence
     from recon.voxels.displacement import SWEEPS

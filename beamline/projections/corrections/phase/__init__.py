@@ -1,3 +1,3 @@
-"""Phase retrieved from one distance."""
+"""Phase retrieval from one distance."""
 
 STEPS = {"Phase": "phase.phase"}

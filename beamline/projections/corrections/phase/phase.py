@@ -1,4 +1,6 @@
-"""Phase retrieval of a scan: its filter, by what the file and the options say of material, energy and distance."""
+"""Phase retrieval of a scan: chooses the filter from material, energy and distance, as the file and the options
+state them.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,16 @@ if TYPE_CHECKING:
     from recon.prep.projections import Projections
 
 _AUTO = "auto"
-_NO_FILTER = "No filter predicts views held out (of 16 or more) better; give --phase paganin:RATIO for delta/beta."
+_NO_FILTER = (
+    "No filter predicts the held-out projections better (of 16 or more); give --phase paganin:RATIO for delta/beta."
+)
 
 
 def _material(text: str) -> str | None:
-    """What `paganin:` is followed by, or "auto"; None for "none"."""
+    """The part after `paganin:`, or "auto"; None for "none"."""
     way, _, material = text.partition(":")
     if text not in ("none", _AUTO) and (way != "paganin" or not material):
-        raise ValueError(f"{text!r} is not known; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
+        raise ValueError(f"{text!r} is unknown; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
     return _AUTO if text == _AUTO else material or None
 
 
@@ -37,7 +41,7 @@ def _unsharp(text: str) -> tuple[float, float]:
     except ValueError:
         sigma = weight = math.nan
     if not (0 < sigma < math.inf and 0 <= weight < math.inf):
-        raise ValueError(f"{text!r} is not SIGMA:WEIGHT with SIGMA > 0 in pixels, e.g. 1.5:2")
+        raise ValueError(f"{text!r} is wrong; expected SIGMA:WEIGHT with SIGMA > 0 in pixels, e.g. 1.5:2")
     return sigma, weight
 
 
@@ -46,25 +50,26 @@ class Phase:
     """Settings of the phase retrieval.
 
     Attributes:
-        material: the ratio of delta to beta, or a material, as the user said it; "auto": the filter follows from the
-            views, where their outer edges overshoot; None: it is not retrieved.
-        distance_mm: from the sample to the detector; None takes the file's.
-        energy_kev: None takes the file's.
+        material: the ratio of delta to beta, or a material, as the user gave it; "auto": the filter is chosen from
+            the projections if the outer edges of the sample overshoot; None: no phase retrieval.
+        distance_mm: from the sample to the detector; None: the file's value.
+        energy_kev: None: the file's value.
         unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
-        length: of the filter, in pixels as they are used, that the views show; None: none, or they were not looked at.
-        explanation: of what the views show; empty: nothing certain.
+        length: of the filter found from the projections, in pixels as they are used; None: none found, or not
+            searched for.
+        explanation: what the projections show; empty: nothing certain.
     """
 
     name: ClassVar[str] = "phase"
     follows: ClassVar[tuple[str, ...]] = ("tilt",)
     needs_finished: ClassVar[str] = ""
-    blurs: ClassVar[Literal[True]] = True  # what looks for fine detail leaves it out
+    blurs: ClassVar[Literal[True]] = True  # corrections that look for fine detail run without this one
     material: str | None = option(
         "--phase",
         _AUTO,
-        "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a chemical formula, or "
-        "a name that scenes use. auto: where outer edges of the sample overshoot, the filter that predicts views held "
-        "out best.",
+        "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a "
+        "chemical formula, or a name that scenes use. none: no filter. auto: if the outer edges of the "
+        "sample show phase fringes, use the filter length that predicts held-out projections best.",
         parse=_material,
         metavar="auto|none|paganin:X",
     )
@@ -98,7 +103,7 @@ class Phase:
 
     @property
     def _ratio(self) -> float | None:
-        """Delta over beta, where it was said as a number."""
+        """Delta over beta, if the user gave it as a number."""
         try:
             return float(self.material or "")
         except ValueError:
@@ -125,7 +130,9 @@ class Phase:
     def estimated(
         self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
     ) -> Phase | None:
-        """This step with what these views show; None where it was said, or where nothing is certain."""
+        """This step with the filter that these projections show; None if the user stated the filter, or if nothing
+        is certain.
+        """
         from recon.features.phase import LEAST_DROP, length_by_held_out_views
         from recon.prep.overshoot import Overshoot
 
@@ -139,22 +146,24 @@ class Phase:
             return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
         if filter.gain < LEAST_DROP:
             why = (
-                f"A filter over {filter.length:.3g} pixels lowers the residual of views held out by {filter.gain:.0%}, "
-                f"and blurs cracks; it takes {LEAST_DROP:.0%} to be applied unasked. --phase paganin:RATIO applies one."
+                f"No phase filter was applied. A filter over {filter.length:.3g} pixels would lower the "
+                f"residual in held-out projections by {filter.gain:.0%}, but it blurs cracks, so it is "
+                f"applied by default only from {LEAST_DROP:.0%}. --phase paganin:RATIO applies one."
             )
             return replace(self, explanation=f"{overshoot.in_words()} {why}")
         why = (
-            f"Views held out choose the square of the filter's length within {filter.factor - 1:.0%}, and their "
-            f"residual is {filter.gain:.0%} lower. --phase none leaves the filter out."
+            "A phase filter was applied, because it lowers the residual in held-out projections by "
+            f"{filter.gain:.0%}. They determine the square of the filter's length within "
+            f"{filter.factor - 1:.0%}. --phase none omits the filter."
         )
         return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
 
     def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
             why = self.explanation or (
-                self.unsharp and "Without a filter --unsharp is not used; give --phase paganin:RATIO."
+                self.unsharp and "--unsharp has no effect without a phase filter; give --phase paganin:RATIO."
             )
-            return None, StepDone(f"Phase: not retrieved. {why}" if why else "", {"phase": "not retrieved"})
+            return None, StepDone(f"No phase retrieval. {why}" if why else "", {"phase": "not retrieved"})
         paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
@@ -167,12 +176,12 @@ class Phase:
         """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
-            ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.
+            ConfigError: distance, energy or pixel size are unknown, or give a filter that is wider than the frame.
         """
         from recon.features.phase import Paganin, length_of
 
         if source.row_pitch_mm is not None:
-            raise ConfigError(f"--phase needs square pixels; those of {source.path} are not square.")
+            raise ConfigError(f"--phase needs square pixels; the pixels of {source.path} are not square.")
         cone, pitch = selection.cone, selection.pixel_size_mm
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm
@@ -181,8 +190,8 @@ class Phase:
         values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
         missing = [option for option, value in values.items() if value is None]
         if missing and self.length is None:
-            raise ConfigError(f"--phase needs {' and '.join(missing)}, which {source.path} does not say.")
-        length, sentence = self.length or 0.0, "by views held out"
+            raise ConfigError(f"--phase needs {' and '.join(missing)}, which {source.path} does not state.")
+        length, sentence = self.length or 0.0, "from held-out projections"
         if not missing:
             assert distance is not None and energy is not None and pitch is not None
             near, scale = (1.0, 1.0) if cone is None else (cone[0] / (cone[0] + distance), cone[0] / cone[1])
@@ -196,17 +205,22 @@ class Phase:
         paganin = Paganin(length, self.unsharp)
         if paganin.length > max(source.shape) / selection.binning:
             raise ConfigError(
-                f"--phase: {sentence}, is a filter over {paganin.length:.4g} pixels; {source.path} has "
-                f"{source.shape[0]} x {source.shape[1]}. Check ratio, energy (keV) and distance (mm)."
+                f"Check ratio, energy (keV) and distance (mm) of --phase: {sentence}, gives a filter over "
+                f"{paganin.length:.4g} pixels, but {source.path} has only {source.shape[0]} x "
+                f"{source.shape[1]} pixels."
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
-        sentence = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
+        sentence = f"Phase retrieval with Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
         if paganin.length < 1:
-            sentence += " It is shorter than a pixel and changes next to nothing: check energy, distance, pixel size."
+            sentence += (
+                " Check energy, distance and pixel size: the filter is shorter than a pixel and changes almost nothing."
+            )
         return paganin, f"{sentence} {self.explanation}".rstrip()
 
 
 def _stated(source: ScanSource) -> float | None:
-    """mm from the sample to the detector by the file; none of 0, which is where nobody measured it."""
+    """mm from the sample to the detector according to the file. 0 counts as unknown, because programs write it if
+    nobody measured the distance.
+    """
     stated = source.attributes.get("distance_mm")
     return stated if isinstance(stated, float) and stated > 0 else None

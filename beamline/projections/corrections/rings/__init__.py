@@ -1,3 +1,3 @@
-"""Stripes of the sinograms, which make rings, removed."""
+"""Removal of stripes in sinograms, which make rings in slices."""
 
 STEPS = {"Rings": "rings.rings"}

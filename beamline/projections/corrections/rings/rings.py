@@ -1,4 +1,4 @@
-"""Rings: stripes of the sinograms are removed, see `recon.features.rings`."""
+"""Rings: removes stripes from the sinograms, see `recon.features.rings`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Rings:
     way: Way = option(
         "--rings",
         "none",
-        "Remove stripes of the sinograms, which make rings. sort: small stripes. vo: dead columns, large and small "
-        "stripes. auto: the kinds that it detects. Layers of the sample around "
-        "the axis are kept.",
+        "Remove the stripes in sinograms that make rings in slices. none: do not. sort: small stripes. "
+        "vo: dead columns, large and small stripes. auto: the kinds that it detects. Layers of the "
+        "sample around the axis are kept.",
         choices=get_args(Way),
     )
 

@@ -1,4 +1,4 @@
-"""Scans of images: a folder or .zip of them, or one TIFF with a page a frame."""
+"""Scans stored as images: a folder or .zip of them, or one TIFF with a page for each frame."""
 
 FORMATS = {
     "tiff_series": "beamline.storage.readers.images.tiff_series",

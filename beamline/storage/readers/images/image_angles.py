@@ -1,4 +1,4 @@
-"""Angles in the names of image files, and why they may be none."""
+"""Angles in the names of image files, and why a number in a name may not be an angle."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _MINUS = re.compile(r"minus|neg|[-\u2013\u2212mn]", re.IGNORECASE)
 _THOUSANDTHS = re.compile(r"_(?P<mark>)(?P<value>(?P<whole>\d{3})_(?P<part>\d{3}))(?=_\d+$)")
 _FOLLOWING = re.compile(r"[-_ ]?(\d{1,4})(?!\d)")  # more digits are of a date or a time
 _PRECEDING = re.compile(r"(?<!\d)(\d{1,4})[-_ ]?$")
-_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
+_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from projection to projection
 _FARTHEST = 3600.0  # degrees
 _TURN = 360.0  # degrees; a number with a sign but no word goes no further as an angle
 _EVEN, _ALIKE = 0.8, 0.3  # of the steps are alike, to so much of one: some images may be lost, angles are rounded
-_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some views at its end
+_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some projections at its end
 
 
 class NamedAngles(NamedTuple):
@@ -34,7 +34,7 @@ class NamedAngles(NamedTuple):
 
     Attributes:
         plain: the names without them.
-        radians: float64 [file]; None where the names state none, or may be read in two ways.
+        radians: float64 [file]; None if the names state none, or can be read in two ways.
         doubt: which ways these are; "" otherwise.
     """
 
@@ -62,13 +62,13 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
     doubt = _doubt_of_series(chosen, np.unique(degrees), doubt, words=words, another=another)
     if doubt:
-        doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
+        doubt = f"angles in names such as {stems[-1]} are not used, because {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
     return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
 
 
 def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
-    """The number in each name that may be its angle (fewer if some have none), and whether a word marks it."""
+    """The number in each name that may be its angle (fewer if some names have none), and whether a word marks it."""
     worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
     if any(worded):
         return [row[0] for row in worded if len(row) == 1], True
@@ -78,22 +78,24 @@ def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[
 def _doubt_of_series(
     chosen: list[re.Match[str]], distinct: NDArray[np.float64], doubt: str, *, words: bool, another: bool
 ) -> str:
-    """Why the numbers of a series may be no angles; "" where they are.
+    """Why the numbers of a series may not be angles; "" if they are.
 
     Args:
         distinct: degrees, ascending.
-        doubt: of their signs and decimals.
-        words: a word stands beside them.
-        another: another number differs from name to name, and counts no images.
+        doubt: about their signs and decimals.
+        words: a word stands next to them.
+        another: another number differs from name to name, and does not count images.
     """
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
     if words and counted:
-        return "the number beside the word counts the images"
+        return "the number next to the word counts the images"
     if not words and uneven:
-        return doubt or "the numbers that have signs are in no even steps within a turn"
+        return doubt or "the numbers with signs are not evenly spaced within 360 degrees"
     if distinct.size < _DISTINCT * len(chosen):
-        return doubt or f"{len(chosen)} names give only {distinct.size} angles; are signs or decimals lost?"
+        return (
+            doubt or f"{len(chosen)} names give only {distinct.size} different angles. Are signs or decimals missing?"
+        )
     return doubt
 
 
@@ -104,7 +106,7 @@ def _without(name: str, angle: re.Match[str]) -> str:
 
 
 def _with_signs(numbers: list[list[re.Match[str]]]) -> list[re.Match[str]]:
-    """The one number that has a minus in some names and none in others; empty where there is no such, or several."""
+    """The one number that has a minus in some names and none in others; empty if there are none or several."""
     alike = len({len(row) for row in numbers}) == 1
     columns = [[*column] for column in zip(*numbers, strict=True)] if alike else []
     signed = [column for column in columns if 0 < sum(map(_is_minus, column)) < len(column)]
@@ -116,7 +118,7 @@ def _is_minus(number: re.Match[str]) -> bool:
 
 
 def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
-    """Degrees, and why they may be others; "" where they are sure."""
+    """Degrees, and why they may be different; "" if they are certain."""
     degrees = np.array([float(re.sub("[,p_]", ".", each["value"].lower())) for each in chosen])
     before = [each.string[: each.start("mark" if each["mark"] else "value")] for each in chosen]
     minus = np.array([*map(_is_minus, chosen)])
@@ -125,11 +127,11 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
             minus[:] = False
         elif (mark := _mark(chosen[0])) in "mn-\u2013":
             what = mark if mark in "mn" else "hyphen"
-            return degrees, f"the {what} before the number may be a minus sign, or separate"
+            return degrees, f"the {what} before the number may be a minus sign or a separator"
     if doubt := _doubt_of_decimals(chosen, before):
         return degrees, doubt
     if len({re.sub(r"\d+", "", text) for text in before}) > 1:
-        return degrees, "names differ before the angle, as by a sign that was replaced"
+        return degrees, "the names differ before the angle, for example because a sign was replaced"
     return np.where(minus, -degrees, degrees), ""
 
 
@@ -138,8 +140,9 @@ def _mark(number: re.Match[str]) -> str:
 
 
 def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
-    """Whether the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
-    stands before 0. A hyphen in some names only is a sign."""
+    """True if the mark before all numbers is a separator, as between a word and numbers of one width from 0 on, because
+    there is no sign before 0. A hyphen in only some names is a sign.
+    """
     wholes = [each["whole"] for each in chosen]
     padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
     return all(text[-1:].isalnum() for text in before) and (_mark(chosen[0]) in "mn" or (zero and padded))
@@ -149,16 +152,18 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
     """Why the digits beside a point, or beside the number, may or may not be decimals; "" if that is clear."""
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
-        return "one side of their point or comma counts the images"
+        return "the digits on one side of their point or comma count the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
     for beside in (following, [_PRECEDING.search(text) for text in before]):
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
-            return "the number beside each counts no images; are the two a whole number and its decimals?"
+            return (
+                "the number next to each angle does not count images; are the two numbers an integer and its decimals?"
+            )
     return ""
 
 
 def _in_even_steps(ascending: NDArray[Any]) -> bool:
-    """Whether the steps of all numbers but a few are alike; some images may be lost."""
+    """True if the steps of all numbers but a few are alike; some images may be lost."""
     steps = np.diff(ascending)
     return bool(steps.all() and np.mean(np.abs(steps - np.median(steps)) < _ALIKE * np.median(steps)) > _EVEN)

@@ -1,4 +1,4 @@
-"""Names of image files: the kind of each frame, and its place by numbers and angles."""
+"""Names of image files: the kind of each frame, and its place in the scan from numbers and angles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc|io|di)(?![a-z])")
 _PLAIN = re.compile(  # words of references, and those that go with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
-_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the views
+_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the projections
 _DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # of a folder
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
@@ -33,9 +33,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
     called.
 
-    Words for references (dark, flat, white, open beam; ob, df, dc as whole words) tell. If they leave no projection,
-    the sample is named by such a word: it is the one series with another word in its name, or the only series, or the
-    largest, where both kinds of references are there without it.
+    Words for darks and flats (dark, flat, white, open beam; ob, df, dc as whole words) decide. If they leave no
+    projection, the sample's name contains such a word: it is the one series with another word in its name, or the only
+    series, or the largest, if both kinds of references exist without it.
 
     Raises:
         DataError: no series can be recognised as the projections.
@@ -51,8 +51,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     if sample is None:
         numbers = ", ".join(f"{len(some)} of {key!r}" for key, some in [*series.items()][:6])
         raise DataError(
-            f"{path} holds no projections: all images are named as darks or flats ({numbers}). If a sample is called "
-            "so, give the folder of its projections, and the others with --darks and --flats."
+            f"{path} contains no projections, because all images are named as darks or flats ({numbers}). "
+            "If the sample has such a name, give the folder of its projections, and the others with "
+            "--darks and --flats."
         )
     return kinds | dict.fromkeys(series[sample], FrameKind.PROJECTION)
 
@@ -72,7 +73,7 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
 
 
 def _kind_of(name: str) -> FrameKind:
-    """The kind of image by a file's name relative to the scan's folder, which takes precedence over its folders."""
+    """The kind of image from a file's name relative to the scan's folder; the name has precedence over folders."""
     for words in (_REFERENCE, _SHORT):
         for part in reversed(name.lower().split("/")):
             match = words.search(part)
@@ -82,7 +83,7 @@ def _kind_of(name: str) -> FrameKind:
 
 
 def _without_common_folder(names: Sequence[str]) -> list[str]:
-    """Names relative to the deepest folder that holds them all: what it is called says nothing of one of them."""
+    """Names relative to the deepest folder that contains them all, because its name does not distinguish them."""
     parts = [name.split("/") for name in names]
     n = 0
     while parts and all(len(each) > n + 1 and each[n] == parts[0][n] for each in parts):
@@ -98,12 +99,12 @@ class NamedImages:
     Attributes:
         names: of the files.
         kinds: int32 [file], values of FrameKind.
-        angles: float64 [file] radians, NaN where the name says none.
-        numbers: int64 [file], -1 of references that do not count with the series; None where files are not numbered.
-        of_series: int64 [projection], the numbers of the series; None where they count no images.
+        angles: float64 [file] radians, NaN if the name says none.
+        numbers: int64 [file], -1 of references that do not count with the series; None if files are not numbered.
+        of_series: int64 [projection], the numbers of the series; None if they count no images.
         plain: the names of the projections without their angles.
         doubt: why the angles in the names are not used; empty if they are used or the names have none.
-        half_turn: images in a folder of their own that is named after half a turn, which are invalid frames.
+        half_turn: images in a folder of their own that is named after 180 degrees, which are invalid frames.
     """
 
     names: list[str]
@@ -164,16 +165,17 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
 
 
 def _half_a_turn_on(series: list[str]) -> list[str]:
-    """Images in the one folder that is named after an angle of half a turn, or a whole one, beside all others."""
+    """Images in the one folder that is named after an angle of 180 or 360 degrees, next to all others."""
     stated = {name: _DEGREES.search(name.lower().rpartition("/")[0]) for name in series}
     named = [name for name, match in stated.items() if match and match[1] in ("180", "360")]
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
 
 
 def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_series: bool) -> NDArray[np.int64]:
-    """The number of each image of a series, by its name without an angle. DataError: there are several series.
+    """The number of each image of a series, from its name without an angle. Raises DataError if there are several
+    series.
 
-    Series of which each counts anew follow one another, as where their names say of which kind they are.
+    Series with their own counts follow one another, for example if their names state their kinds.
 
     Args:
         images: of the scan, also those of other kinds.
@@ -193,7 +195,7 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
 
 
 def _rank(name: str) -> int:
-    """Where the frames of a kind stand in a scan: darks, flats, views, and references that were taken afterwards."""
+    """Place of a kind of frames in a scan: darks, flats, projections, then darks and flats taken afterwards."""
     kind = _kind_of(name)
     return (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind) + 3 * (
         kind in _REFERENCES and _AFTER.search(name.lower()) is not None
@@ -201,14 +203,15 @@ def _rank(name: str) -> int:
 
 
 def _template(name: str, doubt: str = "") -> str:
-    """A name without its numbers; in doubt of their signs, without these."""
+    """A name without its numbers; if it is unclear whether a mark is a sign, without the mark."""
     return re.sub(r"[-+_\d]+" if doubt else r"\d+", "", name)
 
 
 def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """The number of each image, wherever it stands in the name; None if no number differs from name to name.
+    """The number of each image, at any place in the name; None if no number differs from name to name.
 
-    Of several that are, the one that counts most closely; others, such as a date, may only go along with it.
+    If several numbers differ, the one that counts most consecutively; others, such as a date, may only vary together
+    with it.
     """
     numbers = np.zeros(len(names), np.int64)
     of_template: dict[str, list[int]] = {}
@@ -266,8 +269,9 @@ def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -
         if images:
             places = f", counted from 0 in this order: {places_of(in_order(path, images, one_series=True).names)}"
     return (
-        f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, flat_0001.tif), or "
-        "give the folder of the projections, and the others apart, with --darks and --flats. Or say which images are "
-        f"which: --frames darks=0:5,flats=5:10, with none=10:12 for what is left out{places}. Angles in names are read "
-        "as in a_angle-12.5_01.tif."
+        f"{path} contains several series of images: {numbers}. Name darks and flats as such "
+        "(dark_0001.tif, flat_0001.tif). Or give the folder of the projections, and the others "
+        "separately with --darks and --flats. Or state which images are which: --frames "
+        f"darks=0:5,flats=5:10, with none=10:12 for images to leave out{places}. Angles are read from "
+        "names such as a_angle-12.5_01.tif."
     )

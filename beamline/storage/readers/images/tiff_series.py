@@ -1,8 +1,8 @@
-"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG; a scene of R²-Gaussian.
+"""Image series: a folder (or .zip) with one image per file, as TIFF, .npy or PNG; or a scene of R²-Gaussian.
 
-The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
-order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
-the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
+The name of a file tells its kind, see `image_names`; all files except darks and flats must be one series. They are
+sorted by the numbers in their names, never by a directory listing. Files are read one at a time, so that the memory
+needed does not grow with the scan. Hidden files (`._0001.tif` of a Mac) are ignored.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class TiffSeriesSource(ScanSource):
 
         Args:
             one_series: all images are one numbered series, whatever the names say of kinds.
-            listed: names of the images, all of them views; None: those that lie in the folder.
+            listed: names of the images, all of them projections; None: those that lie in the folder.
         """
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
@@ -130,8 +130,9 @@ class TiffSeriesSource(ScanSource):
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
             if not np.can_cast(image.dtype, self.dtype):
                 raise DataError(
-                    f"{name} in {self.path} holds {image.dtype} pixels, the frames before it {self.dtype}, which "
-                    "cannot hold them all. Write all images of a scan in one type."
+                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have "
+                    f"{self.dtype}, which cannot represent them all. Write all images of a scan in one "
+                    "pixel type."
                 )
             out[i] = image[rows]
         return out
@@ -165,9 +166,9 @@ class TiffSeriesSource(ScanSource):
     def _opened(self, name: str, most: int) -> IO[bytes]:
         """A file of the series, of at most `most` bytes."""
         if (n := self._size(name)) > most:
-            raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
+            raise OSError(errno.EFBIG, f"it has {size(n)}; at most {size(most)} are allowed")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
-            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of nearly equal values, which no image has")
+            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of nearly equal values, which is not an image")
         return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
 
     @contextmanager
@@ -180,7 +181,7 @@ class TiffSeriesSource(ScanSource):
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
-        """Shape and type of the images of these files that can be read, by their heads; DataError where they are fewer
+        """Shape and type of the images of these files that can be read, by their heads; DataError if they are fewer
         than `at_least`.
 
         Of many bytes the first ones: to tell their type takes no more.
@@ -221,12 +222,12 @@ class TiffSeriesSource(ScanSource):
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
+            raise UnreadableError(f"{name} in {self.path} cannot be read as an image (the file contains none).")
         if len(shape) != 2:
             raise _StacksError(
-                f"{name} in {self.path} is {shape}; expected one grey image a file, or, in a folder of at most "
-                f"{_FEW_STACKS} files, a stack of grey images in each. Give a stack as FILE, with --darks FILE and "
-                "--flats FILE."
+                f"{name} in {self.path} is {shape}; expected one grey image per file. A folder of at most "
+                f"{_FEW_STACKS} files may have a stack of grey images in each. Give a single stack as "
+                "FILE, with --darks FILE and --flats FILE."
             )
         require_real(dtype, f"{name} in {self.path}")
         return shape
@@ -248,7 +249,10 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
 
 def _refuse_more(path: Path, n: int) -> None:
     if n > MOST_FILES:
-        raise DataError(f"{path} holds more than {MOST_FILES} files: it is no scan. Give the folder of its images.")
+        raise DataError(
+            f"{path} contains more than {MOST_FILES} files, which is too many for a scan. Give the folder of "
+            "its images."
+        )
 
 
 def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
@@ -262,7 +266,7 @@ def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
 
 
 _META = "meta_data.json"
-_TEST = "views that its authors keep to judge by; they are left out"
+_TEST = "projections that the authors of the scene keep as test data; they are left out"
 _AXES = "volume[z, y, x] is vol_gt.transpose(2, 0, 1)[::-1, ::-1]; lengths in mm are units of the scene"
 
 
@@ -276,12 +280,12 @@ def _scene_of(path: Path) -> Path | None:
 def _open_scene(folder: Path) -> ScanSource:
     """The scan in the folder of a scene of R²-Gaussian (Zha et al. 2024, NeurIPS, github.com/Ruyi-Zha/r2_gaussian).
 
-    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume. Views
-    and angles are taken as they stand. There the first row of a view is the highest z, and the source stands at
-    (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
+    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume.
+    Projections and angles are taken as they stand. There the first row of a projection is the highest z, and the source
+    stands at (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
 
     Raises:
-        DataError: views are not there, or it is no cone or parallel beam.
+        DataError: projections are not there, or it is no cone or parallel beam.
     """
     meta: dict[str, Any] = json.loads(text_in(folder / _META))
     scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
@@ -290,8 +294,8 @@ def _open_scene(folder: Path) -> ScanSource:
         raise DataError(f"{folder / _META} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
     if lost := [name for name in angles if not is_below(folder, name)]:
         raise DataError(
-            f"{folder / _META} names {len(angles)} views, of which {len(lost)} are not there, such as {lost[0]}. Fetch "
-            "them, or take them out of its list. Nothing was read."
+            f"{folder / _META} lists {len(angles)} projections, but {len(lost)} of the files do not "
+            f"exist, such as {lost[0]}. Download them, or remove them from the list. Nothing was read."
         )
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
@@ -309,8 +313,11 @@ def _open_scene(folder: Path) -> ScanSource:
     return source
 
 
-_MOVED = "the axis is searched, and the central ray meets the middle row; --axis states the axis"
-_BESIDE = "a view half a turn from the first, taken beside the series: the axis is found by the series itself"
+_MOVED = "the axis is searched for, and the central ray is assumed at the middle row; --axis sets the axis"
+_BESIDE = (
+    "a projection 180 degrees from the first, taken after the series. It is not used: the axis is found from "
+    "the series itself"
+)
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
@@ -354,7 +361,7 @@ def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
 
 
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
-    """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
+    """The scan of the folder above, where its projections are those of this one, and others are darks or flats."""
     with suppress(DataError, OSError):  # what lies there is only looked at, and may be no scan
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]

@@ -1,4 +1,6 @@
-"""TIFF stacks: one file with a page for each frame, read page by page, so that memory does not grow with the scan."""
+"""TIFF stacks: one file with a page for each frame, read page by page, so that the memory needed does not grow with
+the scan.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ class TiffStackSource(ScanSource):
                 raise
         if complaints.messages:
             self._tif.close()
-            raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.messages[0]}).")
+            raise DataError(f"{path} cannot be read completely: it is cut off or damaged ({complaints.messages[0]}).")
         self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
         self.not_used += offered(self)
@@ -68,7 +70,7 @@ class TiffStackSource(ScanSource):
         if len(series.shape) not in (2, 3) or others or "S" in series.axes:  # samples of a colour
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
             shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
-            raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
+            raise DataError(f"{self.path} contains {shapes}; expected one stack of grey images [page, row, col].")
         self.not_used, self.untyped = stated(self.path, self._tif), is_untyped(self._tif)
         self._stored, self.dtype, self._orientation = series.shape[-2:], np.dtype(series.dtype), orientation(self._tif)
         # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
@@ -96,7 +98,9 @@ class TiffStackSource(ScanSource):
         if self._offset is None:
             image = self._tif.pages.get(self._pages[page].index, aspage=True, cache=False).asarray()
             if (image.shape, image.dtype) != (self._stored, self.dtype):
-                raise ValueError(f"it is {image.dtype} {image.shape}, the first {self.dtype} {self._stored}")
+                raise ValueError(
+                    f"it is {image.dtype} {image.shape}, but the first page is {self.dtype} {self._stored}"
+                )
             return np.asarray(image)
         whole = np.empty(self._stored, self.dtype)
         self._fill(whole, page, 0)
@@ -107,7 +111,7 @@ class TiffStackSource(ScanSource):
         self._tif.filehandle.seek(self._offset + (page * self._stored[0] + first) * self._stored[1] * out.itemsize)
         n = self._tif.filehandle.readinto(out)
         if n != out.nbytes:
-            raise EOFError(f"{n} of {out.nbytes} bytes are there")
+            raise EOFError(f"only {n} of {out.nbytes} bytes exist")
         if not self.dtype.newbyteorder(self._tif.byteorder).isnative:
             out.byteswap(inplace=True)
 

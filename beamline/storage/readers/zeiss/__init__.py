@@ -1,8 +1,8 @@
 """Scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
 
 Stream names, types and units after two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
-with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide views by the one reference without a
-dark, which the instrument has subtracted. Images are as they are stored.
+with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide projections by the one reference
+without a dark, which the instrument has subtracted. Images are as they are stored.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ class TxrmFile:
             import olefile
         except ImportError as error:
             raise DataError(
-                f"{path} is a .txrm file, which needs olefile, and that cannot be loaded here ({error}): pip install "
-                '"splatline[txrm]".'
+                f"{path} is a .txrm file. Reading it needs the package olefile, which cannot be loaded "
+                f'({error}): pip install "splatline[txrm]".'
             ) from error
         self._ole = olefile.OleFileIO(path)
 
     def bytes_of(self, name: str) -> bytes:
         """The content of a stream; EOFError if there is none."""
         if not self._ole.exists(name):
-            raise EOFError(f"there is no stream {name}")
+            raise EOFError(f"the stream {name} is missing")
         return bytes(self._ole.openstream(name).read())
 
     def numbers(self, name: str, dtype: str, n: int = 1) -> NDArray[Any] | None:
@@ -96,7 +96,7 @@ class _Views:
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open a .txrm file. `own_angles` False: the caller supplies the angles, so the file may lack them.
 
-    DataError where olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
+    DataError if olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
     """
     with hdf5.readable(path):
         file = TxrmFile(path)
@@ -105,19 +105,21 @@ def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[Any], int]:
-    """Images, rows and columns, the type of a pixel, and how many images were planned. DataError: they cannot be."""
+    """Images, rows and columns, the type of a pixel, and how many images were planned. Raises DataError if they are
+    impossible.
+    """
     info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
     lost = [name for name, value in info.items() if value is None]
     if lost:
-        raise DataError(f"{path} is no .txrm scan: there is no stream ImageInfo/{lost[0]}.")
+        raise DataError(f"{path} is not a .txrm scan: the stream ImageInfo/{lost[0]} is missing.")
     rows, cols, planned, kind = (int(value) for value in info.values() if value is not None)
     n = min(planned, taken if (taken := file.number("ImageInfo/ImagesTaken")) is not None else planned)
     if min(rows, cols) < 1 or rows * cols > 2**31:
-        raise DataError(f"{path} says that its images have {rows} x {cols} pixels: it is damaged.")
+        raise DataError(f"{path} is damaged: it states images of {rows} x {cols} pixels.")
     if kind not in _TYPES:
-        raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
+        raise DataError(f"{path} has {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
     if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
-        raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
+        raise DataError(f"{path} states {n} images of {rows} x {cols} pixels, but the file is too small for them.")
     return (max(n, 0), rows, cols), _TYPES[kind], planned
 
 
@@ -142,11 +144,13 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         before = len(source.table) - n
         source.table = replace(source.table, shifts=np.pad(shifts, ((before, 0), (0, 0)), constant_values=np.nan))
     if n < planned:
-        source.stated_ending = ScanEnding("stopped", reason=f"{n} of {count(planned, 'planned view')} were taken.")
+        source.stated_ending = ScanEnding(
+            "stopped", reason=f"{n} of {count(planned, 'planned projection')} were taken."
+        )
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:
-            raise DataError(f"{path} does not say the angles of its {n} views: give --angles FILE (degrees).")
+            raise DataError(f"Give --angles FILE (degrees): {path} does not state the angles of its {n} projections.")
         source.table.angles[-n:] = np.radians(angles.astype(np.float64))
     _set_exposures(source, file, n)
     _set_scale(source, file)
@@ -155,10 +159,11 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
 
 def _refuse(path: Path, file: TxrmFile) -> None:
     if file.number("ImageInfo/AcquisitionMode") not in (None, _ACQUIRED):
-        raise DataError(f"{path} is a volume (.txm) or a single image, not a scan: give the .txrm file.")
+        raise DataError(f"Give the .txrm file: {path} is a volume (.txm) or a single image, not a scan.")
     if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):  # as the streams are spelt
         raise DataError(
-            f"{path} is a mosaic; expected views of one field each. Stitch it with the microscope's program."
+            f"{path} is a mosaic; expected projections of one field of view each. Stitch it with the "
+            "microscope's program."
         )
 
 
@@ -166,17 +171,17 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
     """Displacement of each image, [view, 2] pixels (col, row).
 
     The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
-    it). In a real file the displacement of each view against the one before has the opposite sign, too.
+    it). In a real file the displacement of each projection against the one before has the opposite sign, too.
     """
     shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
     shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
     if not np.isfinite(shifts).all():
-        raise DataError(f"{path}: {(~np.isfinite(shifts)).sum()} of its views' shifts are no numbers: it is damaged.")
+        raise DataError(f"{path} is damaged: {(~np.isfinite(shifts)).sum()} shifts of projections are not numbers.")
     return shifts
 
 
 def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
-    """Seconds of the views and of the reference, which may have its own."""
+    """Seconds of the projections and of the reference, which may have its own."""
     views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
     source.table.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
     for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):

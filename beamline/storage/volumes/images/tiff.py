@@ -1,4 +1,4 @@
-"""TIFF: all slices in one file, or a folder with a file for each."""
+"""TIFF volumes: all slices in one file, or a folder with one file per slice."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class TiffVolume:
             if complaints.messages or pages != shape[0]:
                 raise ValueError(f"{pages} of {shape[0]} slices, {'; '.join(complaints.messages)}")
         except UNREADABLE as error:
-            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
+            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off or was changed.") from error
         yield record_of(path, facts, values)
 
 
@@ -97,7 +97,9 @@ class TiffFolderVolume:
         first = next((z for z in range(shape[0]) if _slice(path, z).name not in there), None)
         if first is not None:
             missing = shape[0] - sum(_slice(path, z).name in there for z in range(min(shape[0], first + len(there))))
-            raise DataError(f"{path} lacks {missing} of {shape[0]} slices (first: {_slice(path, first).name}).")
+            raise DataError(
+                f"{missing} of {shape[0]} slices are missing in {path} (first: {_slice(path, first).name})."
+            )
         yield record_of(path, facts, _Stack(path, shape))
 
 
@@ -122,7 +124,7 @@ class _Stack:
         except UNREADABLE as error:
             raise DataError(f"{path} cannot be read ({error}).") from error
         if values.shape != self.shape[1:]:
-            raise DataError(f"{path} has shape {values.shape}, slice 0 has {self.shape[1:]}.")
+            raise DataError(f"{path} has shape {values.shape}, but slice 0 has {self.shape[1:]}.")
         return values
 
 

@@ -1,6 +1,8 @@
-"""OME-Zarr 0.5: a folder with the volume in several scales, each in raw chunks, for viewers that load what they show.
+"""OME-Zarr 0.5: a folder with the volume at several scales, each in uncompressed chunks, for viewers that load only
+what they show.
 
-The axes and scales are those of ngff.openmicroscopy.org/0.5; zarr, the format's library, writes and reads the arrays.
+The axes and scales are those of ngff.openmicroscopy.org/0.5; zarr, the format's library, writes and reads the
+arrays.
 """
 
 from __future__ import annotations
@@ -75,8 +77,8 @@ class OmeZarr:
         for scale in (finest, *finest.coarser):
             if lost := scale.array.nchunks - scale.array.nchunks_initialized:
                 raise DataError(
-                    f"{path} lacks {lost} of {scale.array.nchunks} chunks of the scale {scale.array.basename}: the "
-                    "volume is cut off, or was changed."
+                    f"{path} is cut off or was changed: {lost} of {scale.array.nchunks} chunks of the "
+                    f"scale {scale.array.basename} are missing."
                 )
         yield record_of(path, facts, finest)
 

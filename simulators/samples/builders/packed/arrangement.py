@@ -92,16 +92,16 @@ def arrange(
     room, tall = radius - bodies.across, height / 2 - bodies.up
     if min(room.min(), tall.min()) < 0:
         raise ValueError(
-            f"a particle of {2e3 * bodies.reach.max():.3g} um does not fit into {2 * radius:.3g} x {height:.3g} mm "
-            "(diameter x height); make the cell larger or the particles smaller"
+            f"make the cell larger or the particles smaller: a particle of {2e3 * bodies.reach.max():.3g} "
+            f"um does not fit into {2 * radius:.3g} x {height:.3g} mm (diameter x height)"
         )
     n = room.size
     # Balls of the gap's width around the centres must not overlap, either. This is checked first: if all bodies
     # were neighbours, the search would take hours.
     if n * gap**3 / 6 > (radius + gap / 2) ** 2 * (height + gap):
         raise ValueError(
-            f"a gap of {1e3 * gap:.3g} um between {n} particles is more than {2 * radius:.3g} x {height:.3g} mm "
-            "(diameter x height) have room for; make the gap or the fill smaller"
+            f"make the gap or the fill smaller: with a gap of {1e3 * gap:.3g} um, {n} particles do not "
+            f"fit into {2 * radius:.3g} x {height:.3g} mm (diameter x height)"
         )
     turn, out = rng.uniform(0, 2 * math.pi, n), room * np.sqrt(rng.uniform(0, 1, n))
     centres = np.stack([out * np.cos(turn), out * np.sin(turn), tall * rng.uniform(-1, 1, n)], axis=1)
@@ -116,8 +116,8 @@ def arrange(
     left = _part(centres, bodies, room, tall, gap, gap + SPARE * middling, SKIN * middling, sweeps)
     if left:
         raise ValueError(
-            f"{left} of {n} particles still overlap after {sweeps} moves of all of them in {2 * radius:.3g} x "
-            f"{height:.3g} mm (diameter x height); lower the fill, or take rounder particles"
+            f"lower the fill, or use rounder particles: {left} of {n} particles still overlap in "
+            f"{2 * radius:.3g} x {height:.3g} mm (diameter x height) after {sweeps} moves of all of them"
         )
     return centres
 
@@ -168,7 +168,7 @@ def _part(
 
 @njit(cache=True, nogil=True)
 def _all_apart(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: float, work: Reals) -> bool:
-    """Whether all pairs are known to be apart at their present places."""
+    """True if all pairs are known to be apart at their present places."""
     for p in range(pairs.shape[0]):
         if _apart(centres, bodies, pairs[p, 0], pairs[p, 1], gap, ways[p], work) < gap:
             return False

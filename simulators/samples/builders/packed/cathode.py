@@ -1,4 +1,6 @@
-"""Cathode: grains packed in electrolyte in a can, with a current collector below and a separator above if asked for."""
+"""Cathode: grains packed in electrolyte in a can, with a current collector below and, if asked for, a separator
+above.
+"""
 
 from __future__ import annotations
 
@@ -210,7 +212,9 @@ class Cathode(PieceBuilder):
 
     def __post_init__(self) -> None:
         if self.hollow + self.cracked > 1:
-            raise ValueError(f"hollow and cracked are shares, 1 at most in sum, got {self.hollow} and {self.cracked}")
+            raise ValueError(
+                f"hollow and cracked are shares whose sum must be at most 1, got {self.hollow} and {self.cracked}"
+            )
         if not sum(self.habits.values()) > 0:
             raise ValueError(f"habits are shares, not all 0, got {dict(self.habits)}")
         if not (self.inner_radius > 0 and self.bed_height > 0):

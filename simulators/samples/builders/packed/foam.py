@@ -1,4 +1,4 @@
-"""Foam: a cylinder or box of matter with many round holes that do not touch, from large to small ones.
+"""Foam: a cylinder or box of material with many round holes that do not touch, placed from large to small.
 
 Of many random points, each hole takes the one with most room. The idea is by Pelt, Hendriksen and Batenburg
 ("Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).
@@ -57,7 +57,7 @@ class Foam(PieceBuilder):
 
     def __post_init__(self) -> None:
         if not self.largest_um >= self.smallest_um:
-            raise ValueError(f"holes go from largest_um down to smallest_um, got {self.largest_um}, {self.smallest_um}")
+            raise ValueError(f"largest_um must be at least smallest_um, got {self.largest_um}, {self.smallest_um}")
         check_roles(self)
 
     @property

@@ -1,4 +1,4 @@
-"""Pieces: solids with their roles in a phantom, which a change in time may move or charge."""
+"""Pieces: solids with their roles in a phantom; a change in time may move them or change their charge."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class PieceBuilder(Protocol):
         """1/mm of each role, in a beam without energies."""
 
     def pieces(self) -> tuple[Piece, ...]:
-        """All pieces. Raises ValueError where they cannot be placed."""
+        """All pieces. Raises ValueError if they cannot be placed."""
 
 
 def check_roles(settings: PieceBuilder) -> None:
@@ -142,7 +142,7 @@ class Charge:
 
     def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
         if self.role not in {piece.role for piece in pieces}:
-            raise ValueError(f"role: {self.role!r} is no part of this phantom")
+            raise ValueError(f"role: {self.role!r} is not a part of this phantom")
         moments = self.from_s + self.over_s * np.random.default_rng(self.seed).uniform(size=len(pieces))
         done = 0.5 * (1 + np.tanh((seconds - moments) / self.each_s / 2))
         return tuple(

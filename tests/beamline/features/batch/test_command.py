@@ -1,4 +1,4 @@
-"""Batches: each scan gets its volume, a failure is named, and a second call does only what is left."""
+"""Batches: each scan gets its volume, a failure is named, and a second call does only what is missing."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     refused = beamline(*given)
     other.release()
     assert refused.exit_code == 5
-    assert "Another batch works in out" in refused.output
+    assert "until the other batch in out has ended" in refused.output
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
     ("program", "reason"),
     [
         ("import os, sys; print('out of memory', file=sys.stderr, flush=True); os.abort()", "out of memory"),
-        ("import time; time.sleep(600)", "no output from its process for 1.5 s; it was ended"),
+        ("import time; time.sleep(600)", "its process was ended, because it gave no output for 1.5 s"),
         ("", "its process ended with code 0"),
     ],
 )
@@ -240,7 +240,7 @@ def test_a_resumed_run_is_one_row_of_all_its_parts(folder: Path, tmp_path: Path)
     given = [run / name for name in ("scan.h5", "part-2/scan.h5", "joined.h5", ".")]
     result = beamline("batch", run.parent / "*/scan.h5", *given, "--config", "recipe.yaml", "-o", "out")
     assert result.exit_code == 0, result.output
-    assert f"{run / 'scan.h5'} is a part of a run that was resumed: {run / 'joined.h5'}" in result.stderr
+    assert f"{run / 'scan.h5'} is only a part of a resumed run. {run / 'joined.h5'}" in result.stderr
     assert {name: row["scan"] for name, row in _table(folder / "out").items()} == {"scan": str(run / "joined.h5")}
     assert read_reconstruction(Path("out/scan/recon.h5")).parameters["n_views"] == VIEWS
     assert [row.scan for row in batch._rows([run], before)] == [str(run / "joined.h5")]
@@ -265,7 +265,7 @@ def test_a_table_of_names_that_are_not_of_this_program_is_refused_and_nothing_is
     Path("out/batch.csv").write_text(rows.replace("'-o", "-o"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     result = beamline(*given)
-    assert result.exit_code == 5 and f"{name!r} is no name that this program gives" in result.stderr
+    assert result.exit_code == 5 and f"{name!r} is not a name that this program gives" in result.stderr
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 

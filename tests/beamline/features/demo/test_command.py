@@ -1,4 +1,4 @@
-"""The demonstration on a small scene: scan, live volume in its own process, truth, report."""
+"""The demo on a small scene: scan, live volume in its own process, ground truth, report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client of EPICS sees a run go on, and a next one, and ends it where it may."""
+"""An EPICS client follows a run and the next one, and can end a run if this is allowed."""
 
 from __future__ import annotations
 
@@ -160,9 +160,9 @@ def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path) ->
                 client.put("T:Decide", "offset", timeout=WITHIN)
             _put(server, client, "T:Decide", "enough")
             assert answers == ["enough"] and client.get("T:Decide") == ""
-            with pytest.raises(thread.RemoteError, match="does not ask"):
+            with pytest.raises(thread.RemoteError, match="is not waiting for a decision"):
                 client.put("T:Decide", "next", timeout=WITHIN)
-        assert "does not ask" in client.get("T:Decide").raw.alarm.message
+        assert "is not waiting for a decision" in client.get("T:Decide").raw.alarm.message
 
 
 def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:

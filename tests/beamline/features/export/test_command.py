@@ -1,4 +1,4 @@
-"""`beamline export`: formats, grey values, what is refused and what is left."""
+"""`beamline export`: formats, grey values, errors, and files."""
 
 from __future__ import annotations
 
@@ -69,7 +69,10 @@ def test_probabilities_of_a_material(folder: Path) -> None:
     with opened_volume(folder / "p.h5") as read:
         inside = read.volume.data[:][:, :, 6]
         assert read.unit == "" and inside.min() > 0.5 and read.volume.data[:][:, :, 1].max() < 0.1
-    for name, number, said in (("v.h5", "3", "materials 1 to 2"), ("p.h5", "1", "not pulled to few materials")):
+    for name, number, said in (
+        ("v.h5", "3", "materials of this volume are 1 to 2"),
+        ("p.h5", "1", "no discrete levels"),
+    ):
         refused = beamline("export", name, "-o", "q.h5", "--material", number)
         assert refused.exit_code == 5 and said in refused.stderr
 
@@ -77,11 +80,11 @@ def test_probabilities_of_a_material(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ([], "Every value of the slices looked at is 0: there is no window"),
-        ([((3, 4, 5), 2.5)], "lie in 0:2.5. "),
-        ([(0, 1.5)], "lie in 0:1.5. "),
-        ([(..., 1.0), ((..., slice(0, 3)), 1e-6)], "lie in 1:1.000001. "),
-        ([(..., np.nan)], "No value of the slices looked at is finite"),
+        ([], "Every voxel in the slices that were read is 0, so no window"),
+        ([((3, 4, 5), 2.5)], "--window 0:2.5 "),
+        ([(0, 1.5)], "--window 0:1.5 "),
+        ([(..., 1.0), ((..., slice(0, 3)), 1e-6)], "--window 1:1.000001 "),
+        ([(..., np.nan)], "The slices that were read have no finite value"),
     ],
 )
 def test_a_window_is_proposed_that_can_be_given(folder: Path, values: list[Any], said: str) -> None:
@@ -91,7 +94,7 @@ def test_a_window_is_proposed_that_can_be_given(folder: Path, values: list[Any],
     np.save(folder / "v.npy", data)
     result = beamline("export", "v.npy", "-o", "g.tif", "--bits", "16")
     assert result.exit_code == 2 and said in result.stderr
-    if (window := re.search(r"lie in (\S+)\. ", result.stderr)) is not None:
+    if (window := re.search(r"--window (\d\S*:\S+) ", result.stderr)) is not None:
         assert beamline("export", "v.npy", "-o", "g.tif", "--bits", "16", "--window", window[1]).exit_code == 0
         assert np.ptp(tifffile.imread(folder / "g.tif")) > 30_000
 

@@ -1,4 +1,4 @@
-"""`beamline info`, `validate` and `ingest`: what they print, their codes, and what they leave."""
+"""`beamline info`, `validate` and `ingest`: output, exit codes and files."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_validate_names_each_fault(folder: Path) -> None:
     result = beamline("validate", "scan.h5")
     assert result.exit_code == 5
     assert "error    angles" in result.stdout
-    assert "beamline: scan.h5: 1 error against" in result.stderr
+    assert "beamline: scan.h5 has 1 error" in result.stderr
     events = [json.loads(line) for line in beamline("validate", "scan.h5", "--json").stdout.splitlines()]
     assert [event["event"] for event in events][-1] == "done"
     assert events[-1]["error"] == 1
@@ -113,7 +113,7 @@ def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
     result = beamline("ingest", "in.tif", "out.h5", *options, "--sample", "cylinders", "--energy-kev", "25")
     assert result.exit_code == 0, result.output
     assert "out.h5" in result.stdout
-    assert "18, 0 without a valid pixel" in result.stdout
+    assert "18 (0 of them without a valid pixel)" in result.stdout
     with open_scan("out.h5") as source:
         assert source.quantity == "line_integrals"
         assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
@@ -151,7 +151,7 @@ def test_validate_deep_names_damaged_frames(folder: Path) -> None:
         file["entry/instrument/detector/data"][9, 1, 1] ^= 1
     result = beamline("validate", "scan.h5", "--deep")
     assert result.exit_code == 5
-    assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
+    assert "error    checksums       1 of 22 frames are damaged" in result.stdout and ": 9. Use" in result.stdout
     events = [json.loads(line) for line in beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
 

@@ -1,4 +1,4 @@
-"""ingest: whole or not at all, in the memory of a few frames."""
+"""ingest: the file is complete or absent, and only a few frames are in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is refused, as refusals.txt says."""
+"""Command lines that end with an error, as in refusals.txt."""
 
 from tests.beamline.transcript import refusals
 

@@ -33,7 +33,7 @@ class Browser:
         self.driver = selenium.Chrome(options=options, service=service)
 
     def open(self, address: str) -> None:
-        """A page; complaints of earlier ones, whose servers have ended, are forgotten."""
+        """Open a page; errors of earlier pages, whose servers have ended, are discarded."""
         self.driver.get("about:blank")
         self.driver.get_log("browser")
         self.driver.get(address)
@@ -53,14 +53,14 @@ class Browser:
         self.driver.find_element("css selector", f"[data-verb={verb}]").click()
 
     def complaints(self) -> list[str]:
-        """What the browser itself found wrong, but for pictures that are not there yet and the tests' own readbacks."""
+        """Errors that the browser found, except pictures that do not exist yet and the tests' own readbacks."""
         said = [each["message"] for each in self.driver.get_log("browser")]
         return [each for each in said if not any(word in each for word in ("model.png", "willReadFrequently"))]
 
 
 @contextmanager
 def page_of(command: list[str], address: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A command that serves a page, and the address that it prints after these words."""
+    """Start a command that serves a page; returns it and the address that it prints after `address`."""
     with subprocess.Popen(command, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         try:
@@ -77,7 +77,7 @@ def browser() -> Iterator[Browser]:
 
 
 def canvas_has_picture(browser: Browser, name: str) -> object:
-    """The canvas holds more than one grey value."""
+    """Whether the canvas contains more than one grey value."""
     return browser.script(
         f"const c = document.getElementById('{name}'); if (!c || !c.width) return false;"
         "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"

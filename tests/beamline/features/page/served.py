@@ -1,4 +1,4 @@
-"""A page that is served, and requests to it as a browser, or an attacker, would send them."""
+"""A served page, with requests as a browser or an attacker would send them."""
 
 from __future__ import annotations
 

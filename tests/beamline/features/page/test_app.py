@@ -1,4 +1,4 @@
-"""Who may see a page, and act from it; what its answers hold."""
+"""Who may see a page and send commands from it; content of its answers."""
 
 import http.client
 import json

@@ -1,4 +1,4 @@
-"""Entrance: the connection with the token is handed on, however many others were made before and after it."""
+"""Entrance: a connection with the token is accepted, however many others came before and after it."""
 
 import asyncio
 import socket

@@ -1,4 +1,4 @@
-"""Volumes in napari: every layer in its place and unit. napari itself is a stand-in that records the calls."""
+"""Volumes in napari: every layer has the right position and unit. A stand-in for napari records the calls."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The page's JavaScript: a finding of several frames is one line; a scan that died says what can be done."""
+"""The page's JavaScript: a finding about several frames is one line; for a scan that died it says what can be done."""
 
 from __future__ import annotations
 

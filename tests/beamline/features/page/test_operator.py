@@ -62,7 +62,7 @@ def test_a_first_scan(browser: Browser, tmp_path: Path) -> None:
         browser.click("pause")
         browser.until(lambda: browser.text("state") == "paused", "the scan pauses")
         browser.click("resume")
-        browser.until(lambda: browser.text("state") == "acquiring", "the scan goes on")
+        browser.until(lambda: browser.text("state") == "acquiring", "the scan continues")
         browser.until(lambda: stored() > 20 + 60 + 5, "half a turn is full, and the second pass has begun")
         browser.click("stop")
         browser.until(lambda: "This page has ended" in browser.text("said"), "the page says that it ends")

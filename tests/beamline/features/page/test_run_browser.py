@@ -200,7 +200,7 @@ def test_a_line_a_run_newest_first(tmp_path: Path) -> None:
 def test_no_run_is_no_error_and_no_folder_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = beamline("runs")
-    assert result.exit_code == 2 and "no folder runs" in result.stderr
+    assert result.exit_code == 2 and "the folder runs does not exist" in result.stderr
     (tmp_path / "runs").mkdir()
     result = beamline("runs")
-    assert (result.exit_code, result.stdout) == (0, "") and "no run in runs" in result.stderr
+    assert (result.exit_code, result.stdout) == (0, "") and "no runs in runs" in result.stderr

@@ -1,4 +1,4 @@
-"""A scan of any format in a real browser, and its axis by picture."""
+"""A scan of any format in a real browser, and finding its axis by eye."""
 
 from __future__ import annotations
 

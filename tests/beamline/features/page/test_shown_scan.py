@@ -1,4 +1,4 @@
-"""A scan of any format on the page: what its stack, means and slices by FBP hold."""
+"""A scan of any format on the page: content of its stack, means and FBP slices."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -126,7 +126,7 @@ def test_a_slice_with_a_tilt_is_that_of_views_turned_by_it(tmp_path: Path) -> No
 
 
 def test_what_cannot_be_shown_is_a_sentence(shown: ShownScan, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="Row 4 is not on a detector of 4 rows"):
+    with pytest.raises(DataError, match="Row 4 is outside the detector, which has 4 rows"):
         shown.fbp(4, 20.0, 0.0, ALL, fast=True)
     with pytest.raises(DataError, match="no lights to average"):
         shown.mean("lights")

@@ -1,4 +1,4 @@
-"""Volumes in the browser: what slices, histograms and profiles hold."""
+"""Volumes in the browser: content of slices, histograms and profiles."""
 
 import json
 from collections.abc import Iterator
@@ -67,8 +67,8 @@ def test_a_histogram_counts_each_voxel_once(pair: Served) -> None:
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("slice/0/0/6", "not in a volume of (6, 8, 10)"),
-        ("slice/0/3/0", "not in a volume"),
+        ("slice/0/0/6", "outside the volume of (6, 8, 10)"),
+        ("slice/0/3/0", "outside the volume"),
         ("slice/2/0/0", "not shown here"),
         ("profile/0/0/0?line=1,2,nan,3", "first row, first column"),
         ("profile/0/0/0", "first row, first column"),

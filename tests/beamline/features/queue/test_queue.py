@@ -1,4 +1,4 @@
-"""A queue of scans: what is read of a table, which scans begin, and what is told at the end."""
+"""A queue of scans: what is read from a table, which scans start, and the summary at the end."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (("sample.name", "a"), "is no table of scans"),
-        (("config,x",), "is no table of scans"),
-        (("config,config", "a.yaml,b.yaml"), "is no table of scans"),
+        (("sample.name", "a"), "is not a table of scans"),
+        (("config,x",), "is not a table of scans"),
+        (("config,config", "a.yaml,b.yaml"), "is not a table of scans"),
         (("config,sample.name", ",a"), "line 2: ',a' has 2 cells; expected 2, with a file"),
         (("config,sample.name", "a.yaml,b,c"), "line 2: 'a.yaml,b,c' has 3 cells"),
         (("config", "none.yaml", "gone.yaml"), r"line 2: .*none.yaml(.|\n)*line 3: .*gone.yaml"),

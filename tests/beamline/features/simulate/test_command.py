@@ -1,4 +1,4 @@
-"""`beamline simulate`: files, labels, truth, costs."""
+"""`beamline simulate`: files, labels, ground truth, and the resources it needs."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
 def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
     result = beamline("simulate", "scene.yaml", "--explain")
     assert result.exit_code == 0, result.output
-    head, tail = result.stdout.split("Not named by the scene")
+    head, tail = result.stdout.split("Effects that the scene does not use")
     lines = [line.split()[0] for line in head.splitlines() if line]
     steps = ["line_integrals", "beer_lambert", "photon_noise", "read_noise", "offset", "digitise"]
     assert [line for line in lines if line in steps] == steps
@@ -121,8 +121,8 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
     monkeypatch.setattr(write, "expose", stopping)
     result = beamline("simulate", "scene.yaml", "--out", "scan.h5")
     assert result.exit_code == 4
-    assert "Stopping after this frame. Ctrl-C again stops at once." in result.stderr
-    assert "Stopped after 7 of 16 frames; scan.h5 holds them and is readable." in result.stderr
+    assert "Stopping after this frame. Press Ctrl-C again to stop at once." in result.stderr
+    assert "Stopped after 7 of 16 frames. scan.h5 has these frames and is readable." in result.stderr
     with open_scan("scan.h5") as source:
         assert len(source.table) == 7
         assert source.attributes["status"] == "stopped"
@@ -157,8 +157,12 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = left(folder)
     for arguments, code, words in (
-        (("--out", "scan.h5", *HUGE), 5, r"scan.h5 would take 23\.4 TB with 1000004 frames, its disk has .* free"),
-        (("--truth", "t.h5", "--truth-bin", "1"), 2, r"--truth-bin 1: the truth takes 819 kB of memory, 300 kB are"),
+        (("--out", "scan.h5", *HUGE), 5, r"scan.h5 needs 23\.4 TB for 1000004 frames, but its disk has .* free"),
+        (
+            ("--truth", "t.h5", "--truth-bin", "1"),
+            2,
+            r"larger --truth-bin: with 1, the ground truth needs 819 kB of memory, and 300 kB is",
+        ),
     ):
         monkeypatch.setattr(module, "free_memory", lambda: 300_000)
         result = beamline("simulate", "scene.yaml", *arguments)
@@ -178,7 +182,7 @@ def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
 def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
     made = beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
     assert "voxels of 0.048 mm, for `beamline recon --bin 4`" in made.stdout
-    shape = "--truth has shape (8, 10, 10), the volume (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
+    shape = "--truth has the shape (8, 10, 10), but the volume has (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
     refused = beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
     assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
 

@@ -1,4 +1,4 @@
-"""Truth: it lies where a reconstruction of the scan puts the sample, also where rows are left over from the bins."""
+"""Ground truth: it is at the position of the reconstructed sample, also if rows do not fill the last bin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A comparison as a whole: what is written, what remains when it is ended, and what becomes of its processes."""
+"""A complete comparison: its files, what remains if it is interrupted, and the end of its processes."""
 
 from __future__ import annotations
 

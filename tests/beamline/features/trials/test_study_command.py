@@ -1,4 +1,4 @@
-"""`beamline study`: the table and its figures, rows that are left out, what an interruption leaves."""
+"""`beamline study`: the table with its figures, rows that are left out, and what an interruption leaves."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_rows_are_compared_with_the_volume_of_all_views_and_with_the_truth(folde
     assert [(row["views"], row["status"]) for row in rows] == [
         ("0", "not run"), ("0", "not run"), ("90", "done"), ("45", "done"),
     ]  # fmt: skip
-    assert "asks for 360 views" in rows[0]["message"] and "fixed, 360 views is left out" in result.stderr
+    assert "asks for 360 projections" in rows[0]["message"] and "fixed, 360 views is left out" in result.stderr
     peak = 20 * np.log10(truth.max() / ERROR)
     grid = Grid((4, 40, 40))
     contrasts = contrast(Volume(truth, grid), {"row": Volume(truth + np.float32(ERROR), grid)}, 0)["row"]
@@ -75,7 +75,7 @@ def test_rows_are_compared_with_the_volume_of_all_views_and_with_the_truth(folde
     assert left == {"study.csv", "report.html", "quality.png", "slices.png", "slices_fbp.png"}
     assert [row["frames"] for row in rows[2:]] == ["90", "45"]
     page = parsed_page((folder / "many_fixed-views" / "report.html").read_text(encoding="utf-8"))
-    assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
+    assert f"{peak:.2f}" in page.text and any("asks for 360 projections" in text for text in page.text)
 
 
 def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[Any]) -> None:

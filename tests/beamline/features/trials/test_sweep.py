@@ -94,7 +94,7 @@ def test_an_interrupt_keeps_the_slices_that_are_done(
 
 def test_values_that_change_pixels_have_no_score(folder: Path) -> None:
     result = beamline("sweep", "scan.h5", "bin=1,2", "--axis", "20.7")
-    assert result.exit_code == 0 and "No score: the values change pixels" in result.stdout
+    assert result.exit_code == 0 and "No scores: these values change the pixels" in result.stdout
     assert [(row["status"], row["residual_held_out"], row["verdict"]) for row in _table()] == [("done", "", "")] * 2
     assert Path("scan_sweep/slices.png").read_bytes().startswith(PNG)
 
@@ -167,9 +167,9 @@ def test_ranges_and_lists(text: str, expected: tuple[str, tuple[str, ...]]) -> N
         ("tv_weigt=1,2", "did you mean tv-weight?"),
         ("rings", "expected NAME=A:B:STEP"),
         ("rings=vo", "at least two"),
-        ("axis=5:1:1", "does not lead"),
-        ("axis=1:5:0", "does not lead"),
-        ("axis=1:5000:1", "give a larger STEP"),
+        ("axis=5:1:1", "do not lead"),
+        ("axis=1:5:0", "do not lead"),
+        ("axis=1:5000:1", "use a larger STEP"),
     ],
 )
 def test_nonsense_is_refused(text: str, why: str) -> None:

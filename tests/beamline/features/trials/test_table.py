@@ -1,4 +1,4 @@
-"""Tables of trials: values of trials, which of them are on the front, and their files."""
+"""Tables of trials: their values, which trials are on the Pareto front, and their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which views the rows of a study reconstruct, and what the mean of views is."""
+"""Which projections the rows of a study use, and how projections are averaged."""
 
 from __future__ import annotations
 

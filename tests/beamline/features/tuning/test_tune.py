@@ -85,7 +85,7 @@ def test_a_saturated_exposure_gives_way_to_a_shorter_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dark", "flat", "said"), [(1.0, 1.0, "no beam"), (0.8, 1.0, "there is light"), (0, 0, "no beam")]
+    ("dark", "flat", "said"), [(1.0, 1.0, "no beam"), (0.8, 1.0, "exposed to the beam"), (0, 0, "no beam")]
 )
 def test_no_exposure_is_advised_where_the_shutter_is_at_fault(dark: float, flat: float, said: str) -> None:
     rng = np.random.default_rng(5)
@@ -186,7 +186,7 @@ def test_the_axis_of_the_scene_is_found_with_its_correction(offset: float) -> No
     assert ("right of the middle" in axis) is (offset > 0)
     assert f"move the axis {abs(found.offset_mm):.4g} mm towards {'lower' if offset > 0 else 'higher'} columns" in axis
     assert f"optics.axis_col={found.axis_col:.2f}" in axis
-    assert "no correction" in tilt and "px over which the view" in detail
+    assert "no correction" in tilt and "px is the width of the finest detail in the projection" in detail
 
 
 def test_an_axis_that_leans_is_turned_back_by_what_is_said() -> None:

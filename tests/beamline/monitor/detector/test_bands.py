@@ -1,4 +1,4 @@
-"""Rows that lose their light alone are a band; a beam that dims all rows, or a sample that turns, is not."""
+"""A band: only some rows lose intensity. A beam that dims all rows, or a rotating sample, is not a band."""
 
 from collections.abc import Callable
 from typing import Any

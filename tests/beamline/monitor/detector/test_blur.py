@@ -1,4 +1,4 @@
-"""The figure of sharpness is that of an edge in closed form; views that lose detail are flagged, others are not."""
+"""The sharpness is that of an analytic edge; projections that lose detail are flagged, others are not."""
 
 from collections.abc import Callable
 from math import erf, pi

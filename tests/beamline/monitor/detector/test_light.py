@@ -1,4 +1,4 @@
-"""A step of the light is flagged in its view, with its size; spots of single frames are counted. Nothing else is."""
+"""An intensity step is flagged in its projection with its size; zingers are counted; nothing else is reported."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -85,4 +85,4 @@ def test_a_few_are_a_fact(fake: Any, rng: np.random.Generator) -> None:
     struck(frames[19], 3, 20_000, rng)
     flags = fake.flags(frames, checks=[ZingersCheck(warn=1.0)])
     assert [(flag.level, flag.frame) for flag in flags] == [(Level.INFO, 9 + VIEWS)]
-    assert flags[0].score == pytest.approx(5 / VIEWS / (64 * 96)) and "have 5 bright spots" in flags[0].advice
+    assert flags[0].score == pytest.approx(5 / VIEWS / (64 * 96)) and "5 zingers" in flags[0].advice

@@ -1,4 +1,4 @@
-"""The filters see what is faster than the sample, and neither what turns with it, nor rings, nor the beam."""
+"""The filters respond to what moves faster than the sample, but not to the sample, rings or the beam."""
 
 import numpy as np
 import pytest

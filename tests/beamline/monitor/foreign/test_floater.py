@@ -1,4 +1,4 @@
-"""What crosses the field faster than the sample turns is a floater; what turns with the sample never is."""
+"""Floaters: an object that crosses the field faster than the sample rotates is found; the sample itself never is."""
 
 import math
 import re
@@ -57,7 +57,7 @@ def test_a_faint_crumb_that_crosses_is_found_in_a_few_steps_and_where_it_is(spee
             assert top <= 12.5 * BLOCK < below
             col = speed * (frame - 10 - BEGINS) + 0.5
             assert left <= max(0.0, col + 1) * BLOCK and (col - 1) * BLOCK <= right
-    assert "A crumb crosses" in flags[0][1].advice
+    assert "Find the particle and blow it off" in flags[0][1].advice
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -67,7 +67,7 @@ def test_its_speed_direction_and_rows_are_said(sign: int) -> None:
         return image + blob(20, col, 0.75, 0.05)
 
     flag = only(Blobs(110, depth=change))[-1]
-    speed = float(re.search(r"([0-9.]+) px a view to the", flag.advice).group(1))  # type: ignore[union-attr]
+    speed = float(re.search(r"([0-9.]+) px per projection to the", flag.advice).group(1))  # type: ignore[union-attr]
     assert speed == pytest.approx(2.0 * BLOCK, rel=0.05)
     assert ("right" if sign > 0 else "left") in flag.advice
     rows = re.search(r"rows (\d+) \.\.\. (\d+),", flag.advice)

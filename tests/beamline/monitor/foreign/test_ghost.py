@@ -1,4 +1,4 @@
-"""Fog crosses all rows of the field; neither the sample, nor a crumb, nor the beam looks like it."""
+"""Ghosts (moving shadows) cross all rows; the sample, a particle or the beam is not mistaken for one."""
 
 from typing import Any
 

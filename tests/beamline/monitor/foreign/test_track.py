@@ -1,4 +1,4 @@
-"""The statistic of a track: its false alarms follow from noise, and it finds a line that no single view shows."""
+"""Track statistic: its false alarms follow from noise, and it finds a line that no single projection shows."""
 
 from collections.abc import Callable, Iterator
 

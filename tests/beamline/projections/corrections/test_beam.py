@@ -1,4 +1,4 @@
-"""The beam of an option: a tube behind filters, or a table."""
+"""The option for the beam spectrum: a tube with filters, or a table."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ def test_a_tube_and_a_table_are_read(tmp_path: Path) -> None:
 def test_a_wrong_table_is_refused(tmp_path: Path, wrong: str) -> None:
     table = tmp_path / "beam.txt"
     table.write_text(wrong)
-    with pytest.raises(ValueError, match=r"must hold two columns|neither a tube such as"):
+    with pytest.raises(ValueError, match=r"must have two columns|neither a tube such as"):
         in_beam("Al", str(table))

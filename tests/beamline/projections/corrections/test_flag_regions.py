@@ -1,4 +1,4 @@
-"""Rays in the region of a flag weigh less, and the rest of the view is used as it is."""
+"""Rays in the region of a flag get less weight; the rest of the projection is used unchanged."""
 
 from __future__ import annotations
 
@@ -90,6 +90,6 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     assert rays is not None and rays.shape == (32, 4, 40)
     assert (rays[4, :, 10:12] == 0).all() and (rays[5, :, 10:12] == WARNED_SHARE).all()
     assert (rays != 1).any(axis=(1, 2)).sum() == 2
-    assert "2 are flagged in a part" in told[0]
+    assert "2 are flagged in a region" in told[0]
     kept = hold_out(prepared, 10, advice="")
     assert kept.shares is not None and len(kept.shares) == kept.geometry.n_views

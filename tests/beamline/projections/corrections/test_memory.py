@@ -1,4 +1,4 @@
-"""What steps take of the memory is at most what they state, and the budget counts it."""
+"""Correction steps use at most the memory that they state, and the memory budget counts it."""
 
 from __future__ import annotations
 

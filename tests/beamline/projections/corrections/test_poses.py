@@ -1,4 +1,4 @@
-"""Poses of views from a file become geometry: read, assigned to the views of a scan, and kept with the volume."""
+"""Poses from a file become geometry: they are read, assigned to projections, and stored with the volume."""
 
 from __future__ import annotations
 
@@ -122,13 +122,13 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
     left = found.projections.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
-    assert found.done["poses"].sentence == f"Vectors of 40 views from {text} state the geometry."
+    assert found.done["poses"].sentence == f"The geometry comes from {text}: vectors of 40 projections."
 
 
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
     columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(ConfigError, match=r"of a cone, and .* give --cone 10(\.\d+)?:15\."):
+    with pytest.raises(ConfigError, match=r"of a cone, but .* give --cone 10(\.\d+)?:15\."):
         prepared(path, file, axis_col=None)
     with pytest.raises(ConfigError, match=r"pixels of 60 um, .*of 40 um.*--pixel-size-um"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
@@ -136,7 +136,7 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path
         prepared(path, file, cone=(10.0, 15.0))
     cone[5, 6:9] *= 1.1
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(DataError, match=r"view 5: its detector pixels .* Nothing was read"):
+    with pytest.raises(DataError, match=r"projection 5: the detector pixels .* Nothing was read"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
     with pytest.raises(ValueError, match=r"expected a header .*src_x, src_y"):
         read_poses(str(table(tmp_path, columns.replace(",u_z", ""), np.arange(N), *np.delete(cone, 8, axis=1).T)))
@@ -206,7 +206,7 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
 
 def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
     head, columns = f"view,{COLUMNS}", (np.arange(N), *SHIFTS.T, *TURNS.T)
-    with pytest.raises(DataError, match=r"of 20 of.*frame 5, at 31.5 degrees.*--views"):
+    with pytest.raises(DataError, match=r"for 20 of.*frame 5, at 31.5 degrees.*--views"):
         prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
     found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
     assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out.geometry.n_views <= 10
@@ -219,14 +219,14 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
         ("view,x\n0,1\n", "first line is 'view,x'"),
         ("view,shift_col_px\n", "header and no rows"),
         ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
-        ("view,shift_col_px,shift_col_px\n0,1,2\n", "there twice"),
+        ("view,shift_col_px,shift_col_px\n0,1,2\n", "occurs twice"),
         ("view,shift_col_px\n0,a\n", "'0,a' are not 2 numbers"),
         ("view,shift_col_px\n0\n", "'0' are not 2 numbers"),
         ("view,shift_col_px\n0,\n", "'0,' are not 2 numbers"),
         ("view,shift_col_px\n0,nan\n", "view 0 has no finite shift"),
         ("view,shift_col_px\n0,1\n0,2\n", "view 0 has 2 rows"),
-        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
-        ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected whole numbers"),
+        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected integers"),
+        ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected integers"),
         ("angle_deg,roll_deg\ninf,1\n", r"angle_deg holds \[inf\]; expected finite angles"),
         ("view,tilt_deg\n3,86\n", "view 3 has a roll of 0 and a tilt of 86 degrees"),
     ],
@@ -242,11 +242,11 @@ def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, 
 def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
     views = np.arange(N)
     for head, columns, match in (
-        ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
+        ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}, but .* has {N} views"),
         ("view,shift_col_px", (views, np.full(N, 321.0)), "view 0 is displaced by 321 columns and 0 rows"),
         ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
-        ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),
+        ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose for 40 of the 40 projections"),
     ):
         with pytest.raises(DataError, match=match):
             prepared(path, table(tmp_path, head, *columns))
@@ -284,7 +284,7 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         read_poses(f"{motors}:y,x")
     with pytest.raises(DataError, match="cone's"):
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
-    with pytest.raises(ValueError, match=r"^(?!.*damaged).*no sample/x_translation"):
+    with pytest.raises(ValueError, match=r"^(?!.*damaged).*none of sample/x_translation"):
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
 
 
@@ -306,5 +306,5 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
 @pytest.mark.parametrize("mark", [" ", ","])
 def test_vectors_of_astra_without_names_get_the_way_to_name_them(tmp_path: Path, mark: str) -> None:
     np.savetxt(tmp_path / "s.geom", np.eye(12)[:3], delimiter=mark)
-    with pytest.raises(ValueError, match=r"12 numbers a line.*cone_vec=np.loadtxt\('s\.geom'\)"):
+    with pytest.raises(ValueError, match=r"12 numbers per line.*cone_vec=np.loadtxt\('s\.geom'\)"):
         read_poses(str(tmp_path / "s.geom"))

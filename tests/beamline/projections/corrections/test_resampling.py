@@ -1,4 +1,4 @@
-"""Views of a tilted stage: as good a volume as of a straight one, slab by slab, and a warning where nobody asked."""
+"""Tilt: the volume is as good as without tilt, in slabs too; a warning appears if no correction was asked for."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
 
 def test_a_tilt_is_warned_of() -> None:
     as_it_is, warned = prepare(_source(1.5), SELECTION)
-    assert [text for text in warned if "seems to lean by 1." in text and "--tilt auto" in text]
+    assert [
+        text for text in warned if "seems to be tilted in the detector's plane by 1." in text and "--tilt auto" in text
+    ]
     assert _tilt(as_it_is) == ("", 0)
 
 
@@ -66,7 +68,10 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
     as_it_is, _ = prepare(_source(1.5), SELECTION)
     levelled, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens("auto")))
     assert not said
-    assert _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
+    assert (
+        _tilt(levelled)[0].startswith("The axis is tilted by 1.")
+        and "the projections are rotated" in _tilt(levelled)[0]
+    )
     given, _ = prepare(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
     for found in (levelled, given):
         assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)

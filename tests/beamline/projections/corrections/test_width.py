@@ -1,4 +1,4 @@
-"""The width of rays: asked for, or the motion that the file of a fly scan states."""
+"""The ray width: from an option, or from the motion that the file of a fly scan states."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
     assert after.skew == pytest.approx(sense * SKEW)
     np.testing.assert_allclose(after.angles, before.angles + sense * ARC / 2)
     assert done.sentence == (
-        "In the model of the views a view is the mean over 1.6 degrees (2.8 px at the edge of the field), the last row "
-        f"sees {sense * 0.25:.2g} degrees more than the first."
+        "Ray width in the reconstruction: a projection is the mean over 1.6 degrees (2.8 px at the edge of the field "
+        f"of view), the last row is seen {sense * 0.25:.2g} degrees later than the first."
     )
     assert done.parameters == {
         "ray_width": "none",
@@ -94,7 +94,7 @@ def test_a_pixel_has_its_area_and_blur() -> None:
     before, after, done = _rays(Width("0.6", "none"), _source(), Selection(binning=2))
     assert (after.width.pixel, after.width.blur, after.skew) == (1, 0.3, 0)
     np.testing.assert_array_equal(after.angles, before.angles)
-    assert done.sentence == "In the model of the views a pixel has its own area and a blur of 0.6 px."
+    assert done.sentence == "Ray width in the reconstruction: a pixel has its own area and a blur of 0.6 px."
 
 
 def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:

@@ -1,4 +1,4 @@
-"""Foreign scans, an NXtomo and one of Data Exchange, with other values of their fields or more of them."""
+"""Scans of other programs (NXtomo, Data Exchange) with changed or additional field values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def put(parent: h5py.Group, where: str, value: Any, units: str | None = None, **
 
 
 def nxtomo(path: Path, *changes: tuple[str, Any, str | None], also: Callable[[h5py.Group], None] | None = None) -> Path:
-    """A foreign NXtomo with other values or more of them, below its entry."""
+    """An NXtomo file of another program, with changed or additional values below its entry."""
     with h5py.File(path, "w") as file:
         entry = file.create_group("entry0000")
         put(entry, "definition", "NXtomo")

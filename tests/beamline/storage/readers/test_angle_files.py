@@ -55,9 +55,9 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("theta_set,theta_read", "{i},{deg}"), "", "columns are theta_set, theta_read; .* FILE::COLUMN"),
         (table("frame,pos", "{i},{deg}"), "", "columns are frame, pos; .* FILE::COLUMN"),
         (table("frame,theta", "{i},{deg}"), "::omega", "columns are frame, theta"),
-        (table("", "{i},{deg}"), "::2", "columns are 2 without names"),
+        (table("", "{i},{deg}"), "::2", "its 2 columns have no names"),
         (table("", "{i},{deg}"), "", "number of a view and its angle.* FILE::COLUMN"),
-        (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; say --angles-unit"),
+        (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; give --angles-unit"),
         ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 holds '\(empty\)'"),
         ("0 deg\n2 deg", "", "line 1 holds '0 deg'"),
         ("0.5°\n2.5°", "", "line 1 holds '0.5°'"),
@@ -79,7 +79,7 @@ def test_arrays_are_degrees_or_what_they_or_the_caller_say(tmp_path: Path) -> No
     for name, unit in (("deg.npy", None), ("rad.npy", "rad"), ("z.zarr::a/b", None), ("one.h5", None)):
         np.testing.assert_allclose(load_angles(tmp_path / name, unit), RADIANS)
     np.testing.assert_allclose(load_angles(f"{tmp_path / 'one.h5'}::/count", "rad"), np.arange(4.0))
-    with pytest.raises(DataError, match=r"/count in .* has no units attribute"):
+    with pytest.raises(DataError, match=r"/count in .* has no attribute units"):
         load_angles(f"{tmp_path / 'one.h5'}::/count")
     with h5py.File(tmp_path / "one.h5", "r+") as file:
         file["count"].attrs["units"] = "deg"

@@ -1,4 +1,4 @@
-"""Several frames a view: means of those that are good, and which frames belong together."""
+"""Several frames per projection: the mean of the good ones, and which frames belong together."""
 
 from __future__ import annotations
 
@@ -128,5 +128,5 @@ def test_views_that_have_one_frame_each_are_refused(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.degrees(source.table.angles[source.table.kinds == VIEW]), [1, 2, 3])
     with open_scan(SourceOptions(path, frames_per_view=None)) as source:  # it states none
         assert source.frames_per_view == 1 and source.dtype == np.uint16
-    with pytest.raises(ConfigError, match="Leave it out"):
+    with pytest.raises(ConfigError, match="Omit --frames-per-view"):
         AveragedSource(scan([FLAT, VIEW], [0, 0]), 2)

@@ -1,4 +1,4 @@
-"""What CIL writes beside projections is the geometry that CIL itself hands on: each point falls on the same pixel."""
+"""The geometry that CIL writes next to projections is that of CIL itself: each point falls on the same pixel."""
 
 from __future__ import annotations
 

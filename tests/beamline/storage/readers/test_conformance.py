@@ -1,4 +1,4 @@
-"""Readers of ours pass the suite that is shipped."""
+"""Our readers pass the conformance suite that is shipped."""
 
 from __future__ import annotations
 

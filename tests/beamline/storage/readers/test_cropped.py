@@ -1,4 +1,4 @@
-"""Columns of a scan: the scan that a narrower detector would have taken."""
+"""Cropped columns: the scan is that of a narrower detector."""
 
 from __future__ import annotations
 

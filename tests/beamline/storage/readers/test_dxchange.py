@@ -1,4 +1,4 @@
-"""Data Exchange: three separate stacks seen as one scan; nothing about it is guessed."""
+"""Data Exchange: three separate stacks read as one scan, without guessing."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def test_start_and_step_of_the_rotation_stand_for_theta(tmp_path: Path, parts: P
         elif where == "wide":
             group["step"][()] = 1500.0
     if where not in ("attributes", "process", "radians"):
-        with pytest.raises(DataError, match=r"no /exchange/theta.*--angles FILE"):
+        with pytest.raises(DataError, match=r"--angles FILE.*no /exchange/theta"):
             open_scan(path)
     else:
         with open_scan(path) as source:

@@ -273,7 +273,7 @@ def test_the_page_lists_every_field() -> None:
     rows = re.findall(r"(?m)^\| (`.*`) \| (.*) \|$", page)
     uses = {(name, use) for names, use in rows for name in re.findall("`([^`]+)`", names)}
     for field in (*NXTOMO, *EXCHANGE):
-        use = field.use if field.used else f"not used{', warned of' if field.matters else ''}: {field.use}"
+        use = field.use if field.used else f"not used{' (warning)' if field.matters else ''}: {field.use}"
         assert (field.where, use) in uses, field.where
 
 
@@ -307,7 +307,7 @@ def test_pixel_sizes_that_differ_from_view_to_view(tmp_path: Path, side: str, n:
         sizes = np.r_[[9.0] * (n - VIEWS), 6.5 * (1 + spread * np.linspace(-1, 1, VIEWS))]
         path = nxtomo(tmp_path / "s.nx", (f"detector/{side}_pixel_size", sizes, "um"))
         hits = [hit for hit in validate(path) if f"detector/{side}_pixel_size" in hit.message]
-        assert all(hit.severity == "error" and "differs from view to view" in hit.message for hit in hits)
+        assert all(hit.severity == "error" and "differs between projections" in hit.message for hit in hits)
         return [hit.message for hit in hits]
 
     assert not said(0.1)  # 0.3 of a pixel at the edge of six columns
@@ -319,14 +319,14 @@ def test_pixel_sizes_that_differ_from_view_to_view(tmp_path: Path, side: str, n:
 def test_a_volume_of_sizes_that_differ_is_refused_unless_one_is_said(tmp_path: Path, option: dict[str, float]) -> None:
     sizes = 6.5 * (1 + 0.2 * np.linspace(-1, 1, VIEWS))
     refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/x_pixel_size", sizes, "um")), Selection(**option))  # type: ignore[arg-type]
-    assert ("differs from view to view" in refused) == (not option)
+    assert ("differs between projections" in refused) == (not option)
 
 
 @pytest.mark.parametrize("cone", [None, (10.0, 20.0)])
 def test_a_scan_is_judged_as_the_beam_that_is_said(tmp_path: Path, cone: tuple[float, float] | None) -> None:
     """High pixels are slices apart in a parallel beam, and refused in a cone."""
     refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/y_pixel_size", 2e-6, "m")), Selection(cone=cone))
-    assert ("in a cone beam" in refused) == (cone is not None)
+    assert ("a cone beam needs square pixels" in refused) == (cone is not None)
 
 
 def _refused(path: Path, selection: Selection) -> str:

@@ -1,4 +1,4 @@
-"""Frames: columns, rows and pixels of several sources as those of one scan."""
+"""Frames: columns, rows and pixels of several files read as one scan."""
 
 from __future__ import annotations
 

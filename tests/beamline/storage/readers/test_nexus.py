@@ -1,4 +1,4 @@
-"""What a NeXus file states of cone, pixels, mirrored frames and other scans is used or named."""
+"""Cone geometry, pixel size, mirrored frames and other scans in a NeXus file are used or named."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_the_rotation_that_a_sample_depends_on(tmp_path: Path, chain: str) -> No
     path = nxtomo(tmp_path / "s.nx", also=add)
     np.testing.assert_allclose(np.degrees(opened(path).table.angles), sense * TURN, atol=1e-12)
     warned = [hit.message for hit in validate(path) if hit.rule == "angles"]
-    assert [f"--angles-path /entry0000/{T}/omega takes them" in message for message in warned] == [True] * (sense < 0)
+    assert [f"--angles-path /entry0000/{T}/omega uses them" in message for message in warned] == [True] * (sense < 0)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_the_rotation_that_a_sample_depends_on(tmp_path: Path, chain: str) -> No
 )
 def test_lists_that_may_be_angles_are_named(tmp_path: Path, add: Callable[[h5py.Group], None]) -> None:
     path = nxtomo(tmp_path / "s.nx", also=add)
-    (error,) = [hit.message for hit in validate(path) if hit.severity == "error" and "No angle for" in hit.message]
+    (error,) = [hit.message for hit in validate(path) if hit.severity == "error" and "have no angle" in hit.message]
     assert f"/entry0000/{T}/omega" in error and "may be the angles: --angles-path " in error
     with open_scan(SourceOptions(path, angles_path=f"/entry0000/{T}/omega")) as source:
         np.testing.assert_allclose(np.degrees(source.table.angles), TURN)

@@ -1,4 +1,4 @@
-"""Gaps between modules and photon counters: marks are no counts, and a dark of 0 is taken where the noise shows it."""
+"""Module gaps and photon counters: marker values are not counts; a dark of 0 is used if the noise shows it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_cameras_need_darks(
     tmp_path: Path, rng: np.random.Generator, gain: float, offset: int, dtype: str, mark: int | None
 ) -> None:
     with open_scan(_scan(tmp_path / "s.nx", rng, dtype, mark, None, gain, offset)) as source:
-        assert [f.message for f in findings_of(ScanEvidence(source)) if "Counts without darks" in f.message]
+        assert [f.message for f in findings_of(ScanEvidence(source)) if "darks are missing" in f.message]
 
 
 @pytest.mark.parametrize("where", [np.s_[:, :, 5:20], np.s_[:, 4:9, 5:20], np.s_[:5]])

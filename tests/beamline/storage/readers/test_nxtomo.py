@@ -1,4 +1,4 @@
-"""Reading NXtomo: replay gives back the frames; foreign files are read by their structure, and never guessed at."""
+"""Reading NXtomo: replay gives the same frames; files of other programs are read by structure, without guessing."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
         np.testing.assert_array_equal(over.table.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 
-@pytest.mark.parametrize(("units", "said"), [(None, "no units attribute"), ("mm", "units 'mm'")])
+@pytest.mark.parametrize(("units", "said"), [(None, "no attribute units"), ("mm", "units 'mm'")])
 def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
     tmp_path: Path, units: str | None, said: str
 ) -> None:
@@ -212,7 +212,7 @@ def test_virtual_frames_that_cannot_be_read_are_no_zeros(tmp_path: Path, lose: C
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
     lose(tmp_path / "pixels.h5")
-    with pytest.raises(DataError, match=r"frames from.*pixels\.h5"):
+    with pytest.raises(DataError, match=r"refers to frames in.*pixels\.h5"):
         open_scan(path)
 
 
@@ -244,7 +244,7 @@ def test_virtual_frames_join_the_tiles_of_a_detector(tmp_path: Path, tiles: list
         shorter = part["data"][:-1]
         del part["data"]
         part["data"] = shorter
-    with pytest.raises(DataError, match=r"frames from.*tile1\.h5"):
+    with pytest.raises(DataError, match=r"refers to frames in.*tile1\.h5"):
         open_scan(path)
 
 
@@ -288,5 +288,7 @@ def test_what_is_no_real_number_is_refused(path: Path, where: str, dtype: str, s
         del file["entry"][where]
         file["entry"][where] = np.zeros(shape, dtype)
         file["entry"][where].attrs.update(attributes)
-    with pytest.raises(DataError, match=rf"^/entry/{where} in .* holds {said}; expected whole or real numbers\.$"):
+    with pytest.raises(
+        DataError, match=rf"^/entry/{where} in .* contains {said}; expected integers or real numbers\.$"
+    ):
         open_scan(path)

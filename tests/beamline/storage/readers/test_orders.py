@@ -1,4 +1,4 @@
-"""One scan, whatever the order of its dimensions, of which some may have length one, and whatever keeps it."""
+"""The same scan with its dimensions in any order, some of length one, in any container."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) 
         sentences = list[str]()
         checked_views(evidence_of(source, Selection()), Selection().of(source), sentences.append)
     (said,) = [each for each in sentences if "sinogram" in each]
-    assert isinstance(said, Note) and "20 views and 9 columns" in said and other in said
+    assert isinstance(said, Note) and "20 projections and 9 columns" in said and other in said
 
 
 def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
         file["exchange/data"], file["exchange/theta"] = VIEWS[:, 0].T.astype(np.uint16), np.arange(5) * 30
         file["exchange/data"].attrs["axes"] = "x:theta"
     (said,) = [each.message for each in validate(tmp_path / "s.h5") if each.rule == SINOGRAM]
-    assert "5 views and 4 columns" in said and "/exchange/data to theta:x" in said
+    assert "5 projections and 4 columns" in said and "/exchange/data to theta:x" in said
 
 
 @pytest.mark.parametrize("packed", [np.savez, np.savez_compressed])
@@ -117,13 +117,15 @@ def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]
 @pytest.mark.parametrize("name", ["s.npy", "s.npz"])
 def test_objects_of_python_are_refused_as_pickles(tmp_path: Path, name: str) -> None:
     (np.save if name == "s.npy" else np.savez)(tmp_path / name, np.array([{}], object))
-    with pytest.raises(DataError, match=r"objects of Python among its arrays, which are pickles.*numpy.save"):
+    with pytest.raises(DataError, match=r"numpy.save.*Python objects among its arrays.*pickles"):
         open_scan(SourceOptions(tmp_path / name, angles=ANGLES))
 
 
 def test_what_is_no_sinogram_of_so_many_angles_is_said(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", VIEWS[:, 1])
-    with pytest.raises(DataError, match=r"has 9 angles, and .* holds one image of 5 x 4 pixels. As a sinogram"):
+    with pytest.raises(
+        DataError, match=r"has 9 angles, but .* is one image of 5 x 4 pixels. If the image is a sinogram"
+    ):
         open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(9.0)))
 
 
@@ -134,7 +136,7 @@ def test_lists_of_a_file_that_may_be_its_angles_are_named(tmp_path: Path) -> Non
         for hit in validate(SourceOptions(tmp_path / "s.npz", data_path="projections"))
         if hit.rule == "angles"
     ]
-    assert "--angles-path /theta takes those of /theta" in said
+    assert "--angles-path /theta uses those of /theta" in said
 
 
 def test_angles_of_an_array_file_are_taken_in_the_unit_in_which_they_go_round(tmp_path: Path) -> None:
@@ -168,10 +170,10 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
             (4, 4),
             None,
             4,
-            "4 angles: whether its rows or its columns are the views is not known. Give --order view,col",
+            "Give --order view,col or .*there are 4 angles it is a sinogram, but either its rows or its columns",
         ),
-        ((3, 5, 4), None, 5, "If each image is a sinogram of 5 views, say --order row,view,col"),
-        ((3, 4, 5), None, 5, "If each image is a sinogram of 5 views, say --order row,col,view"),
+        ((3, 5, 4), None, 5, "If each image is a sinogram of 5 projections, give --order row,view,col"),
+        ((3, 4, 5), None, 5, "If each image is a sinogram of 5 projections, give --order row,col,view"),
         ((3, 5, 4), "view,col", 5, "--order view,col does not fit .* 3 images of 5 x 4 pixels"),
         ((3, 5, 4), "row,row,col", 5, "dimensions are given as row,row,col; expected"),
     ],

@@ -1,4 +1,4 @@
-"""in_parts: the parts of a scan that grows, as the file that joins them has them once it has ended."""
+"""in_parts: the parts of a growing scan equal the file that joins them at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Darks and flats are the same in any file."""
+"""Darks and flats can be read from any kind of file, with the same result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several detectors in a file, links that lead nowhere, and locked files: read by a name, or told by their cause."""
+"""Several detectors in a file, broken links and locked files: read by name, or an error with the cause."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of scanners' makers beside images: offered where they fit, taken where they are named, never guessed."""
+"""Files of scanner makers next to images: offered if they fit, used if named, never guessed."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_any_text_beside_images_stops_no_scan(images: Path, name: str, above: bo
 @pytest.mark.parametrize("name", TEXTS)
 def test_any_text_that_is_named_is_refused_in_a_sentence(images: Path, name: str) -> None:
     (images / name).write_bytes(TEXTS[name])
-    with pytest.raises(DataError, match=r"cannot be read as|is not a supported file|states no"):
+    with pytest.raises(DataError, match=r"cannot be read as|is not a supported settings file|states no"):
         read_side_file(images / name)
 
 
@@ -184,11 +184,11 @@ def test_nikons_list_of_angles_goes_before_its_step(images: Path) -> None:
     [
         ("s.xtekct", NIKON.replace("SrcToDetector", "Other"), "states no xtekct/srctodetector"),
         ("s.xtekct", NIKON.replace("=60\nSrc", "=-60\nSrc"), "states no xtekct/srctoobject"),
-        ("s.xtekct", "no section\n", "cannot be read as a file of a CT scanner"),
-        ("s.xtekct", NIKON.replace(f"Projections={N}", "Projections=7"), "7 projections; .* has 6"),
+        ("s.xtekct", "no section\n", "cannot be read as a settings file of a CT scanner"),
+        ("s.xtekct", NIKON.replace(f"Projections={N}", "Projections=7"), "7 projections, but .* has 6"),
         ("diondo.xml", DIONDO.replace("HelixMode>false", "HelixMode>true"), "helixmode"),
-        ("s.xml", "<a><b></a>", "cannot be read as a file of a CT scanner"),
-        ("s.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines entities"),
+        ("s.xml", "<a><b></a>", "cannot be read as a settings file of a CT scanner"),
+        ("s.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines XML entities"),
         ("s.log", "[System]\nuser=root\n", "file of a CT scanner"),
     ],
 )

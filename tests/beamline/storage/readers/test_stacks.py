@@ -1,4 +1,4 @@
-"""HDF5 files of any layout: their datasets are named, and nothing about them is guessed."""
+"""HDF5 files of any layout: their datasets are named, nothing is guessed."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
         ({"angles_path": "/raw/before/one"}, r"has the shape \(4, 6\); expected a list of angles"),
         ({"angles_path": "/note"}, "expected a list of angles"),
-        ({"angles_path": "/motors/plain"}, "has no units attribute; .* --angles-unit deg or rad"),
-        ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),
-        ({"angles": [0.0] * 5}, "--angles and --angles-path name the same thing twice"),
-        ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path name the same thing twice"),
-        ({"data_path": None}, "--darks-path goes with --data-path: give both, or neither"),
-        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit goes with --angles-path: give both, or neither"),
+        ({"angles_path": "/motors/plain"}, "has no attribute units; .* --angles-unit deg or rad"),
+        ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but 5"),
+        ({"angles": [0.0] * 5}, "--angles and --angles-path state the same thing"),
+        ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path state the same thing"),
+        ({"data_path": None}, "--darks-path requires --data-path: give both, or neither"),
+        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit requires --angles-path: give both, or neither"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, Any], message: str) -> None:
@@ -100,7 +100,7 @@ def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, Any], messa
 
 
 def test_a_layout_that_is_not_known_says_what_the_file_has(path: Path) -> None:
-    with pytest.raises(DataError, match=r"that is read.* /raw/images \(5 x 4 x 6\).*--data-path"):
+    with pytest.raises(DataError, match=r"in a known format.* /raw/images \(5 x 4 x 6\).*--data-path"):
         open_scan(path)
     with pytest.raises(DataError, match=r"--data-path, --angles-path:.*fit all frames"):
         open_scan(SourceOptions(path, **PATHS), follow=True)

@@ -1,4 +1,4 @@
-"""Kinds of frames that a caller says, and scans in several files."""
+"""Frame kinds stated by the caller, and scans in several files."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def test_ranges_of_a_numbered_series_are_the_kinds_of_its_frames(series: Path) -
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
-        ("darks=0:11", "'darks=0:11' is none of"),
-        ("bright=0:1", "'bright=0:1' is none of darks, flats, views, none with frames of 0:10"),
+        ("darks=0:11", "'darks=0:11' is not one of"),
+        ("bright=0:1", "'bright=0:1' is not one of darks, flats, views, none with frames of 0:10"),
         ("darks=3:3", "'darks=3:3'"),
         ("darks=0:2,flats=1:3", "names frame 1 twice"),
         ("darks", "'darks'"),
@@ -85,7 +85,7 @@ def test_angles_are_those_of_all_views_or_of_the_selected_ones(series: Path) -> 
             views = source.table.kinds == VIEW
             assert source.read(np.flatnonzero(views))[:, 0, 0].tolist() == [3, 5, 7, 9]
             np.testing.assert_allclose(source.table.angles[views], [1, 3, 5, 7])
-    with pytest.raises(DataError, match=r"selects no view: .* has 8"):
+    with pytest.raises(DataError, match=r"selects no projection: .* has 8"):
         open_scan(SourceOptions(series, frames="darks=0:1,flats=1:2,8:", angles=np.arange(8.0)))
 
 
@@ -119,7 +119,7 @@ def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path)
     assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
     with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
         open_scan(SourceOptions(path, frames="energy=25"))
-    with pytest.raises(DataError, match="states no energy of each frame"):
+    with pytest.raises(DataError, match="does not state the energy of each frame"):
         open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))
 
 
@@ -129,7 +129,9 @@ def test_frames_that_are_left_out_alone_keep_the_kinds_of_the_others(tmp_path: P
     with open_scan(SourceOptions(path, frames="none=3:5+7:8")) as source:
         assert source.table.kinds.tolist() == [DARK, FLAT, VIEW, NONE, NONE, VIEW, VIEW, NONE]
     angles = np.array([0, np.nan, 20, 30, np.nan, 50])
-    (finding,) = [each.message for each in validate(SourceOptions(path, angles=angles)) if "No angle" in each.message]
+    (finding,) = [
+        each.message for each in validate(SourceOptions(path, angles=angles)) if "have no angle" in each.message
+    ]
     assert "--frames none=3:4+6:7." in finding  # as it is given below
     for given in (angles, angles[np.isfinite(angles)]):  # of all views, or of those that are left
         with open_scan(SourceOptions(path, angles=given, frames="none=3:4+6:7")) as source:

@@ -1,4 +1,4 @@
-"""Counts beyond the end of a signed type are read without its sign; what is negative for another reason is not."""
+"""Counts beyond a signed type are read as unsigned; values that are negative for other reasons are not."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 0)), counts)
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 1)), flats)
         np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
-    assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
+    assert any("int16 that overflowed, read as uint16" in finding.message for finding in validate(options))
 
 
 @pytest.mark.parametrize("flats_as", [np.uint16, np.int16])
@@ -82,6 +82,6 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
     flats[:, 0, 0] += 5
     changes = {"data": counts.view(np.int16), "data_white": flats.view(flats_as)}
     with open_scan(write_exchange(tmp_path / "s.h5", SCAN, changes)) as source:
-        assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
+        assert source.dtype == np.uint16 and "overflowed" in str(source.attributes["pixels"])
         np.testing.assert_array_equal(source.read(source.table.views), counts)
         np.testing.assert_array_equal(source.read(source.table.flats), flats)

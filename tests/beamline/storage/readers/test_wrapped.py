@@ -1,4 +1,4 @@
-"""Counts of 16 bits that wrapped: beyond the largest number they begin again at 0."""
+"""16-bit counts that wrapped around: after the largest number they restart at 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angles that are not those of the views: positions in a list, twice or half of the truth.
+"""Angles that do not belong to the projections: list positions, twice or half of the true angles.
 
 Scans of balls by the formula of a sphere's chord; one sample is wider than the field, one is round.
 """
@@ -52,8 +52,8 @@ def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float
 @pytest.mark.parametrize(
     ("true", "stated", "unit"),
     [
-        (turn(180, 240), np.arange(240.0), "they are 0, 1, 2 and so on, and count the views"),
-        (turn(180, 90), np.arange(90.0), "they are 0, 1, 2 and so on, and count the views"),
+        (turn(180, 240), np.arange(240.0), "they are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 90), np.arange(90.0), "they are 0, 1, 2 and so on, so they are frame numbers"),
         (turn(180, 120), turn(360, 120), "times as large as stated"),
     ],
 )
@@ -105,12 +105,12 @@ GOLDEN = np.arange(64) * 111.246
 @pytest.mark.parametrize(
     ("true", "stated", "severity", "says"),
     [
-        (EVEN, np.roll(EVEN, 10), "error", "stated at 177.188 and 0 degrees, look alike"),
+        (EVEN, np.roll(EVEN, 10), "error", "stated at 177.188 and 0 degrees, look similar"),
         (EVEN, EVEN[PASSES], "error", "not in the order of the frames"),
         (EVEN, EVEN[MIXED], "error", "not in the order of the frames"),
         (EVEN, np.r_[EVEN[:54], np.zeros(10)], "error", "not in the order of the frames"),
         (EVEN, np.where(np.arange(64) == 40, 0, EVEN), "warning", "not between those of their neighbours: frames 48"),
-        (EVEN[PASSES], EVEN, "warning", "look more alike than neighbours"),
+        (EVEN[PASSES], EVEN, "warning", "look more similar than neighbours"),
     ],
     ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
 )
@@ -137,4 +137,4 @@ def test_views_that_count_up_are_asked_about_unless_a_plan_of_ours_states_them()
     (asked,) = angles_spread(ScanEvidence(source))
     source.plan = {"angles_deg": np.arange(180.0)}
     (known,) = angles_spread(ScanEvidence(source))
-    assert "do they count the frames?" in asked.message and "count" not in known.message
+    assert "are they frame numbers?" in asked.message and "count" not in known.message

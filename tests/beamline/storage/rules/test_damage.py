@@ -1,4 +1,4 @@
-"""Files that a disk, a memory or another program damaged: frames are named, and nothing is taken from them."""
+"""Files damaged by a disk, memory or another program: frames are named and not used."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_flipped_bit_of_any_pixel_is_found_in_its_frame(
         told: list[tuple[int, int]] = []
         (hit,) = [hit for hit in validate(path, deep=lambda n, of: told.append((n, of))) if hit.rule == "checksums"]  # noqa: B023
         assert hit.severity == "error"
-        assert f"1 of 14 frames differ from the checksums that were written with them: {row}." in hit.message
+        assert f"1 of 14 frames are damaged, because they differ from their stored checksums: {row}." in hit.message
         assert told == [(n, 14) for n in range(1, 15)]
         flip(path, at, bit)
     assert validate(path, deep=lambda n, of: None) == []
@@ -65,7 +65,7 @@ def test_frames_that_cannot_be_read_are_named(tmp_path: Path) -> None:
 def test_a_damaged_scan_is_not_ingested(path: Path, tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file[f"{DETECTOR}/data"][6, 0, 0] ^= 8
-    with pytest.raises(DataError, match=r"Frame 6 of .* checksum differs"):
+    with pytest.raises(DataError, match=r"Frame 6 of .* differ from the stored checksum"):
         ingest(path, tmp_path / "copy.h5")
     assert [left.name for left in tmp_path.iterdir()] == ["scan.h5"]
 

@@ -1,4 +1,4 @@
-"""Evidence of a scan: each frame is read once, a running scan adds its new ones, accepted references are all used."""
+"""Evidence of a scan: each frame is read once, a running scan adds new ones, all accepted flats and darks are used."""
 
 from itertools import chain
 

@@ -1,4 +1,4 @@
-"""Flags as a finding of `validate`: numbers by check and level, and how bad that is."""
+"""Flags in `validate`: their numbers by check and level, and how serious they are."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 
             (
                 range(6, 9),
                 "warning",
-                "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction (--flags "
-                "use): Of 18 views 3 have an alarm and are left out (beam 3 alarm)",
+                "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. In a reconstruction (--flags "
+                "use): Of 18 projections, 3 have an alarm and are left out (beam 3 alarm)",
             ),
-            (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views are left, 10 are needed"),
+            (
+                range(6, 20),
+                "error",
+                "Frames with an alarm: 6-19. Repeat the scan: only 4 of 18 projections have no alarm, and 10 are",
+            ),
             (range(0), "info", "flagged 1 of 22 frames: beam 1 warn."),
             (range(2), "warning", "Frames with an alarm: 0-1."),
         ],
@@ -45,14 +49,17 @@ def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, sev
     assert describe(path)["reconstructable"] is (severity != "error")
 
 
-IN_A_PART = "Of 18 views 4 are flagged in a part, where rays weigh half, with an alarm nothing (bands 4 alarm)."
+IN_A_PART = (
+    "Of 18 projections, 4 are flagged in a region, in which rays have half weight (with an alarm: none) "
+    "(bands 4 alarm)."
+)
 
 
 @pytest.mark.parametrize(
     ("region", "said"),
     [
         ((0, 1, 4, 8), IN_A_PART),
-        (None, "Of 18 views 4 have an alarm and are left out (bands 4 alarm)."),
+        (None, "Of 18 projections, 4 have an alarm and are left out (bands 4 alarm)."),
     ],
 )
 def test_what_a_reconstruction_does_is_said_in_its_own_words(
@@ -64,6 +71,6 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
     with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
         (finding,) = frames_flagged(ScanEvidence(source, EvidenceRequest(judged=judged)))
         taken = usable_views(ScanEvidence(source, EvidenceRequest(judged=judged)), True)
-    assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
+    assert finding.message.endswith(f"In a reconstruction (--flags use): {said}")
     assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)

@@ -1,4 +1,4 @@
-"""Sinograms where views are expected, a horizontal axis, and bytes of numbers in the other order, are told."""
+"""Sinograms instead of projections, a horizontal axis, and numbers in the other byte order are reported."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantit
             file["exchange/data_dark"] = np.full((2, 40, 20), 100, np.uint16)
             file["exchange/data_white"] = np.full((2, 40, 20), 20100, np.uint16)
     stated = SourceOptions(path, quantity=quantity)  # type: ignore[arg-type]
-    assert [f.rule for f in validate(stated) if "say --horizontal-axis" in f.message] == ["axis"]
+    assert [f.rule for f in validate(stated) if "give --horizontal-axis" in f.message] == ["axis"]
     upright = replace(stated, horizontal_axis=True)
     assert not [f for f in validate(upright) if f.rule == "axis"]
     with open_scan(upright) as source:

@@ -1,4 +1,4 @@
-"""Volume files: every format gives back what was written, to other programs and to us; whole or absent."""
+"""Volume files: every format gives back what was written, to other programs and to us; complete or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The writer: what it writes, and what it refuses."""
+"""The writer: the content of its files, and its errors."""
 
 from __future__ import annotations
 
@@ -251,11 +251,11 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
     append(writer, frames[0])
     good = frames[1]
     for bad, said in (
-        (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\), expected uint16 \(12, 16\)"),
+        (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\); expected uint16 \(12, 16\)"),
         (replace(good, counts=good.counts.astype(np.float32)), "float32"),
         (replace(good, counts=good.counts.astype(np.int16)), "int16"),
-        (replace(good, index=2), "index is 2, expected 1"),
-        (replace(good, index=0), "index is 0, expected 1"),
+        (replace(good, index=2), "index is 2; expected 1"),
+        (replace(good, index=0), "index is 0; expected 1"),
     ):
         with pytest.raises(DataError, match=said):
             writer.append(bad, digest(good.counts))

@@ -1,4 +1,4 @@
-"""The writer on a disk that is full, fails or hangs: what is named, what is safe, and what stays readable."""
+"""The writer on a full, failing or hanging disk: what is reported, what is safe, what stays readable."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
     append(writer, *frames[:3])
     with monkeypatch.context() as patch:
         patch.setattr(h5py.Dataset, "resize", Mock(side_effect=OSError(28, "No space left on device")))
-        with pytest.raises(DataError, match=r"s\.h5 could not take the end of a pass.*No space left.*first 3 frames"):
+        with pytest.raises(DataError, match=r"s\.h5 could not store the end of a pass.*No space left.*first 3 frames"):
             writer.end_pass()
     writer.add_decision({"choice": "next"})  # nothing more is written
     writer.close()
@@ -114,7 +114,9 @@ def test_no_view_is_begun_where_there_is_no_room_for_it(
     writer.close()
     assert len(writer.remarks) == 1
     assert "no /exchange view: " in writer.remarks[0]
-    assert re.search(r"has 500 B free, of \S+ MB for the view.*1 frames are safe", writer.remarks[0])
+    assert re.search(
+        r"has 500 B free, and \S+ MB are needed for the /exchange view.*1 frames are safe", writer.remarks[0]
+    )
     with h5py.File(tmp_path / "s.h5") as file:
         assert list(file["exchange"]) == []
         assert file[layout.STATUS][()] == b"complete"
@@ -189,7 +191,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    with pytest.raises(DataError, match=r"take the frame .*Input/output error.*first 3 frames"):
+    with pytest.raises(DataError, match=r"store the frame .*Input/output error.*first 3 frames"):
         for frame in frames:
             append(writer, frame)
             if (thread := writer._to_disk._thread) is not None:
@@ -251,7 +253,7 @@ def test_a_file_that_another_program_touches_ends_the_scan(
     writer: NXtomoWriter, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
 ) -> None:
     """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
-    with pytest.raises(DataError, match=f"was written:.*{said}"):
+    with pytest.raises(DataError, match=f"was writing it .*{said}"):
         for frame in frames:
             if frame.index == at:
                 touch(writer.path)

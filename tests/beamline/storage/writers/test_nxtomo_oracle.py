@@ -1,4 +1,4 @@
-"""nabu (ESRF, extra "oracle") runs on our scans: its validator, its corrected views and its axis are as ours.
+"""nabu (ESRF, extra "oracle") reads our scans: its validation, corrected projections and axis agree with ours.
 
 A slice needs its kernels: CUDA, or OpenCL with pyvkfft. It has none for a processor alone.
 """

@@ -1,4 +1,4 @@
-"""Reconstruction files and checkpoints: whole or absent, never overwritten unless asked, and everything comes back."""
+"""Volume files and checkpoints: complete or absent, overwritten only on request, and everything is read back."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_other_files_and_missing_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("no HDF5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["entry/data/data"] = np.zeros((2, 2, 2))
-    refused = {"text.h5": "as a reconstruction", "other.h5": "as a reconstruction", "missing.h5": "is not there"}
+    refused = {"text.h5": "as a reconstruction", "other.h5": "as a reconstruction", "missing.h5": "does not exist"}
     for name, said in refused.items():
         with pytest.raises(DataError, match=said):
             read_reconstruction(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Every stage of ours, in each of its ways, passes the suite that is shipped."""
+"""All our stages, in all variants, pass the conformance suite that is shipped."""
 
 from __future__ import annotations
 

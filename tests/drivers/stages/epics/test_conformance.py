@@ -1,4 +1,4 @@
-"""A motor record passes the suite of stages without a trigger output, in this process and behind a soft IOC."""
+"""A motor record passes the suite for stages without a trigger output, in this process and behind a soft IOC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A motor record that does not fit, is stopped by a person, meets a switch, loses its controller or its IOC."""
+"""A motor record that does not fit, is stopped by hand, hits a switch, or loses its controller or IOC."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _stage(url: str, clock: TickingClock, **settings: Any) -> EpicsStage:
     [
         ({"unit": "mm"}, r"its unit \(EGU\) is 'mm', expected 'deg'"),
         ({"counts_per_turn": 36_000}, r"its step \(MRES\) is 0.01 deg, expected 0.001"),
-        ({"fastest": 20.0}, r"its greatest speed \(VMAX\) is 20, below 30 deg/s"),
+        ({"fastest": 20.0}, r"its maximum speed \(VMAX\) is 20, below 30 deg/s"),
         ({"low": -5.0, "high": 99.0}, r"limited to -5.0000 deg to 99.0000 deg.*widen LLM and HLM"),
     ],
 )
@@ -82,7 +82,9 @@ def test_a_limit_switch_ends_the_move_with_its_name() -> None:
     _, url, clock = _record(switch_at=10_000)
     stage = _stage(url, clock)
     stage.start_move(math.radians(20), SPEED)
-    with pytest.raises(DeviceError, match=r"stopped short of 20.*Move away.*stands at 10.0000 deg.*upper limit switch"):
+    with pytest.raises(
+        DeviceError, match=r"stopped short of 20.*Move it away.*stands at 10.0000 deg.*upper limit switch"
+    ):
         stage.wait(60)
 
 
@@ -146,7 +148,7 @@ def test_a_done_that_falls_late_or_comes_early_ends_no_move(build: dict[str, flo
     [
         (lambda record: record.write(".SPMG", "Pause"), r"SPMG is Pause: somebody paused"),
         (lambda record: record.write(".STOP", 1), r"no reason given"),
-        (lambda record: record.write(".VAL", 3.0), r"VAL is 3\.0: another client has sent it elsewhere"),
+        (lambda record: record.write(".VAL", 3.0), r"VAL is 3\.0: another client sent it somewhere else"),
     ],
     ids=["paused", "stopped", "sent elsewhere"],
 )

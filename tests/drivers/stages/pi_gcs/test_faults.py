@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver on a disturbed line: what got lost is noticed, and what (has not) moved is said."""
+"""PI GCS 2.0 driver on a disturbed line: lost bytes are noticed, and the message says what moved."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_step_that_the_controller_rounds_is_taken_only_if_the_train_is_not_pul
     if taken:
         stage.arm(train)
     else:
-        with pytest.raises(DeviceError, match="setting was not taken"):
+        with pytest.raises(DeviceError, match="did not accept a setting"):
             stage.arm(train)
     stage.close()
 
@@ -68,7 +68,7 @@ def test_a_stop_that_is_not_understood_is_named(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(60), SPEED)
     rig.replace("HLT 1", "HXT 1")
-    with pytest.raises(DeviceRefused, match=r"HLT.*command did nothing"):
+    with pytest.raises(DeviceRefused, match=r"HLT.*command had no effect"):
         stage.stop()
     stage.abort()
     assert not stage.moving()

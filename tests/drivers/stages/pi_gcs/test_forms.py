@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver: its bytes against a captured dialogue, numbers that keep their count, windows of trains."""
+"""PI GCS 2.0 driver: bytes as in a captured dialogue, number formats, windows of trains."""
 
 from __future__ import annotations
 

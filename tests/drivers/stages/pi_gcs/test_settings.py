@@ -1,4 +1,4 @@
-"""PI GCS 2.0 trains: where firmware puts the first pulse, and trains refused."""
+"""PI GCS 2.0 trigger trains: where the firmware puts the first pulse, and trains that end with an error."""
 
 from __future__ import annotations
 

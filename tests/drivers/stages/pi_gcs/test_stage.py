@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver: what is this controller's own; what every stage does stands in conformance."""
+"""PI GCS 2.0 driver: specific behaviour of this controller; common behaviour is tested in conformance."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) ->
         ({"axis": "2"}, r"no axis '2', but 1"),
         ({"trigger_line": 7}, r"error 36.*trigger_line"),
         ({"acceleration": 1e4}, r"error 17.*acceleration"),
-        ({"counts_per_turn": 100_000}, r"has 90000 counts a turn, which is no multiple of the configured 100000"),
+        ({"counts_per_turn": 100_000}, r"has 90000 counts per turn, which is not a multiple of the configured 100000"),
         ({"counts_per_turn": 0}, "counts_per_turn is 0"),
         ({"max_speed": 0.0}, "max_speed is 0.0"),
         ({"max_speed": 1e-9}, "must be 1e-06 deg/s"),
@@ -117,7 +117,7 @@ def test_a_search_that_fails_says_so_and_leaves_the_axis_unreferenced() -> None:
     rig = Rig(reference_fails=True, found_at=3.0)
     stage = rig.open()
     stage.start_home()
-    with pytest.raises(DeviceError, match=r"error 45.*of the reference"):
+    with pytest.raises(DeviceError, match=r"error 45.*from the reference"):
         stage.wait(LONG)
 
 
@@ -156,7 +156,7 @@ def test_a_motion_error_is_named_with_where_it_stands_and_no_move_follows_before
     stage.start_move(math.radians(30), SPEED)
     with pytest.raises(DeviceError, match=r"30\.0000 deg.*servo is off") as e:
         stage.wait(LONG)
-    assert "stands at 10.0000 deg, 2500 counts" in str(e.value)
+    assert "It is at 10.0000 deg, 2500 counts" in str(e.value)
     assert not isinstance(e.value, DeviceTimeout | DeviceRefused)
     with pytest.raises(DeviceRefused, match=r"servo is off.*Nothing has moved"):
         stage.start_move(math.radians(5), SPEED)

@@ -1,4 +1,4 @@
-"""PM16C-04XD driver: the search for the home switch, where it ends, and what disturbs it."""
+"""PM16C-04XD driver: the search for the home switch, its end position, and disturbances."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_stage_whose_switch_is_not_found_says_so() -> None:
     stage = rig.open()
     stage.start_home()
     for _ in range(2):
-        with pytest.raises(DeviceError, match=r"short \(emergency stop\).*stands at 1000 counts"):
+        with pytest.raises(DeviceError, match=r"short \(emergency stop\).*is at 1000 counts"):
             stage.wait(LONG)
 
 

@@ -1,4 +1,4 @@
-"""PM16C driver on older firmware, wherever the first pulse comes, and widths in microseconds."""
+"""PM16C driver with older firmware, for any position of the first pulse, and pulse widths in microseconds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_train_is_right_whether_the_start_point_fires_or_not_as_long_as_that_i
 def test_the_room_before_the_first_pulse_is_in_the_limits_and_asked_for() -> None:
     bench = Rig(fires_at_start=False).bench(first_pulse="interval_after")
     assert bench.stage.limits.run_up == 1
-    with pytest.raises(DeviceRefused, match="pulses are let through"):
+    with pytest.raises(DeviceRefused, match="the pulse output opens"):
         bench.stage.arm(bench.train(1.0, 1.0, 5))
     bench.stage.close()
     bench = Rig().bench()

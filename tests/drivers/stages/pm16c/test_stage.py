@@ -1,4 +1,4 @@
-"""PM16C-04XD driver: what is this controller's own; what every stage does stands in conformance."""
+"""PM16C-04XD driver: specific behaviour of this controller; common behaviour is tested in conformance."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig
 
 @pytest.mark.parametrize(
     ("flag", "words"),
-    [(2, "its pulse chip was busy"), (4, "a wrong place was refused"), (6, "busy and a move to a wrong")],
+    [(2, "its pulse chip was busy"), (4, "a wrong position was rejected"), (6, "busy and a move to a wrong")],
 )
 def test_error_flags_of_the_past_are_in_the_description(flag: int, words: str) -> None:
     rig = Rig()

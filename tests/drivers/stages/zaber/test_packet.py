@@ -1,4 +1,4 @@
-"""Zaber packets on the host's side: published checksum vectors, and what damage and junk do to a reply."""
+"""Zaber packets on the host: published checksums, and the effect of damaged replies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zaber driver: what is this controller's own, from identity to faults, and a disturbed line."""
+"""Zaber driver: specific behaviour of this controller, from identity to faults, and a disturbed line."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_move_of_somebody_else_is_waited_for_or_named(rig: Rig) -> None:
 
 SLIPS = [
     ("WS", "stalled and recovered"),
-    ("WM", "displaced while it stood"),
+    ("WM", "displaced while at rest"),
     ("NC", "moved by its knob"),
     ("WL", "a limit switch came where none was expected"),
 ]
@@ -132,7 +132,7 @@ def test_a_slip_during_a_move_is_an_error_of_that_move_though_it_arrived(flag: s
     stage.start_move(math.radians(30), SPEED)
     rig.clock.sleep(1.0)
     rig.controller.device.axis.flags.add(flag)
-    with pytest.raises(DeviceError, match=rf"a fault at 30\.0000 deg.*stands at 30\.0000 deg.*{words} \({flag}\)"):
+    with pytest.raises(DeviceError, match=rf"a fault at 30\.0000 deg.*is at 30\.0000 deg.*{words} \({flag}\)"):
         stage.wait(LONG)
     stage.start_move(0.0, SPEED)  # it was told: the next move clears it
     assert stage.wait(LONG) == 0.0
@@ -171,7 +171,7 @@ def test_a_stop_before_opening_is_not_told_for_the_stage_is_where_it_counts(rig:
     assert "found_at_opening" not in again.describe()
     again.close()
     rig.controller.device.axis.flags.add("WM")
-    assert rig.open().describe()["found_at_opening"] == "displaced while it stood (WM)"  # not NI
+    assert rig.open().describe()["found_at_opening"] == "displaced while at rest (WM)"  # not NI
 
 
 class _Bus:
@@ -232,7 +232,7 @@ def test_an_alert_is_passed_over_and_a_request_to_repeat_is_followed(fault: Faul
 
 def test_a_device_that_asks_to_repeat_for_ever_is_named() -> None:
     stage = Rig(faults=dict.fromkeys(range(REPLIES_TO_OPEN, 1000), Fault.AGAIN)).open()
-    with pytest.raises(DeviceRefused, match="again and again"):
+    with pytest.raises(DeviceRefused, match="repeatedly asks"):
         stage.position()
 
 

@@ -1,4 +1,4 @@
-"""Zaber pulse trains: the triggers they become, and the pulses that come of them from any place on any firmware."""
+"""Zaber pulse trains: the triggers they use, and the pulses from any position with any firmware."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gains learnt with the volume: rings go, and bodies on the axis stay, beside the filters of sinograms."""
+"""Pixel sensitivities measured with the volume: rings disappear, bodies on the axis stay; compared with filters."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_stripe_of_all_rows_may_be_the_wall_of_a_can() -> None:
 
 
 def test_few_views_are_refused_and_the_memory_is_that_of_a_band() -> None:
-    with pytest.raises(ValueError, match="39 views"):
+    with pytest.raises(ValueError, match="39 projections"):
         learn_gains(np.ones((39, *SHAPE), np.float32), GEOMETRY.select(np.arange(39)))
     high = Geometry.parallel(GEOMETRY.angles, (2000, 72), pixel_pitch=1.0, axis_col=MIDDLE)
     low = Geometry.parallel(GEOMETRY.angles, (24, 72), pixel_pitch=1.0, axis_col=MIDDLE)

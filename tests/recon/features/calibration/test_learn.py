@@ -1,4 +1,4 @@
-"""Geometry learnt from views of analytic bodies: places, axis, roll; what nobody knows; no harm where all is right."""
+"""Geometry calibrated from projections of analytic bodies: shifts, axis, roll; no change if all is right."""
 
 from __future__ import annotations
 
@@ -73,13 +73,13 @@ def test_a_change_is_of_its_terms_and_scales_with_pixels() -> None:
 def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
     change = GeometryChange(1.0, 0.0, 0.0, np.zeros((2, 2)))
     assert LearntGeometry(change, ("axis",), ("roll",), 0.4, 0.3).in_words(2) == (
-        "Geometry learnt: the axis moves by +2.00 px. Views held out deviate by 0.3 in place of 0.4. Roll: left as it "
-        "was, views held out do not confirm a change."
+        "Geometry calibrated: the axis moves by +2.00 px. The deviation of held-out projections fell from 0.4 to 0.3. "
+        "Roll: unchanged, because held-out projections do not confirm a change."
     )
     assert (
         LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4)
         .in_words()
-        .startswith("Geometry: the views show no error")
+        .startswith("Geometry: unchanged, because the projections show no error")
     )
 
 
@@ -93,7 +93,7 @@ def test_better_means_better_in_most_views() -> None:
 
 def test_few_views_and_views_without_matter_are_refused() -> None:
     few = _start().select(slice(11))
-    with pytest.raises(ValueError, match="11 views"):
+    with pytest.raises(ValueError, match="geometry: 11"):
         learn_geometry(np.ones((11, *SHAPE), np.float32), few, PLACES)
     with pytest.raises(ValueError, match="no absorbing sample"):
         learn_geometry(np.zeros((VIEWS, *SHAPE), np.float32), _start(), PLACES)

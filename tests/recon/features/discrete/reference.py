@@ -1,4 +1,4 @@
-"""Reference implementation of the posterior mean of few materials in float64: integrals over the true density."""
+"""Reference implementation of the posterior mean with discrete levels, in float64: integrals over the true density."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ F64 = NDArray[np.float64]
 
 
 def shares_of_neighbours(shares: F64, blur: tuple[float, float, float]) -> F64:
-    """[material, ...] shares, blurred along each axis of a volume that is continued by its outer voxels."""
+    """[material, ...] shares, blurred along each axis; the outer voxels are repeated beyond the volume."""
     taps = [blur[2], blur[1], blur[0], blur[1], blur[2]]
     for axis in range(1, shares.ndim):
         shares = correlate1d(shares, taps, axis, mode="nearest")
@@ -20,7 +20,7 @@ def shares_of_neighbours(shares: F64, blur: tuple[float, float, float]) -> F64:
 def posterior_by_integrals(
     y: float, f: F64, levels: F64, noise: float, spread: float, partial: tuple[float, float]
 ) -> tuple[float, F64]:
-    """E[t | y] and the probability of each material, by sums over a fine grid of true densities t."""
+    """E[t | y] and the probability of each material, from sums over a fine grid of true densities t."""
     t = np.linspace(y - 12 * noise - 12 * spread, y + 12 * noise + 12 * spread, 40001)
     step = t[1] - t[0]
 

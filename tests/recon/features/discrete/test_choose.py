@@ -1,4 +1,4 @@
-"""How much total variation remains beside few materials: by residuals that a trial is told, in place of volumes."""
+"""The share of total variation with discrete levels, chosen from given residuals instead of volumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Discrete tomography: what it gains on grains of two materials, and where few materials are refused."""
+"""Discrete tomography: its gain on grains of two materials, and samples for which discrete levels are rejected."""
 
 from __future__ import annotations
 
@@ -113,5 +113,5 @@ def test_levels_that_are_given_are_those_of_the_volume() -> None:
 
 @pytest.mark.parametrize("levels", [(0.1,), (0.2, 0.1), (0.1, 0.1)])
 def test_levels_that_do_not_ascend_are_refused(levels: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="each above the one before"):
+    with pytest.raises(ValueError, match="in ascending order"):
         replace(recon.Discrete(), levels=levels)

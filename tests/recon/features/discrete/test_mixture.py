@@ -1,4 +1,4 @@
-"""A mixture of few materials: its posterior mean against integrals in float64, its gradient, its levels, its place."""
+"""Mixture of discrete levels: posterior mean compared with float64 integrals, gradient, levels, region."""
 
 from __future__ import annotations
 

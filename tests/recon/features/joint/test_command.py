@@ -1,8 +1,9 @@
-"""`beamline recon --volumes N`: a cylinder that fades, from the scan to volumes in time, and what reads these."""
+"""`beamline recon --volumes N`: a fading cylinder, from the scan to volumes in time and the commands that read them."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -75,7 +76,7 @@ def test_each_time_has_the_attenuation_of_its_time(series: Path) -> None:
 def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: Path) -> None:
     refused = beamline("export", str(series), "-o", str(tmp_path / "all.npy"))
     assert refused.exit_code == 5
-    assert "holds 2 volumes in time: name one by --at 0 to 1" in refused.output
+    assert "contains 2 volumes of a time series: choose one with --at 0 to 1" in refused.output
     for at, name in ((1, "last.npy"), (1, "last.h5")):
         done = beamline("export", str(series), "--at", str(at), "-o", str(tmp_path / name))
         assert done.exit_code == 0, done.output
@@ -93,7 +94,7 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
 def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path: Path) -> None:
     page = series.with_suffix(".html").read_text(encoding="utf-8")
     assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
-    assert "Data residual, views used" in page and "data:image/png" in page
+    assert "Residual of the projections used" in page and "data:image/png" in page
     done = beamline("recon", str(scan), *ASKED, "--no-report", "-o", str(tmp_path / "s.h5"))
     assert done.exit_code == 0, done.output
     assert left(tmp_path) == {"s.h5"}
@@ -148,21 +149,21 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
     ("words", "code", "said"),
     [
         (("--volumes", "3", "--follow"), 2, "--volumes does not go with --follow"),
-        (("--volumes", "3", "-m", "fbp"), 2, "--volumes is of series; it does not go with --method fbp"),
+        (("--volumes", "3", "-m", "fbp"), 2, "--volumes belongs to series; it does not go with --method fbp"),
         (("--volumes", "3", "--uncertainty"), 2, "error bars belong to one volume"),
         (("--volumes", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
         (("--volumes", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--volumes", "1"), 2, "--volumes"),
-        (("--moves",), 2, "give --volumes N"),
+        (("--moves",), 2, "add --volumes N"),
         (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
+        (("--volumes", "2", "--memory", "100K"), 2, "because volumes in time cannot be made in slabs: give --bin"),
         (
             ("--volumes", "2", "--memory", "300K"),
             2,
             "made in slabs: give --rows with 1 row or fewer at a time, or --bin",
         ),
         (("--volumes", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
+        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "because volumes in time cannot be made in slabs"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
@@ -215,5 +216,5 @@ def test_a_stop_during_the_fit_writes_the_volumes_so_far(
 
 def test_the_help_names_methods_for_comparison_and_not_those_of_several_volumes() -> None:
     said = " ".join(beamline("recon", "--help").output.split())
-    compared = said.partition("the others iterate on voxels; ")[2].partition(" are there for comparison")[0]
+    compared = re.findall(r"\(([^()]*) are meant for comparison", said)[0]
     assert "sirt" in compared and not {"series"} & set(compared.split(", "))

@@ -1,4 +1,4 @@
-"""Motion of a sample: the transpose, gradients by finite differences, and a motion that is known."""
+"""Motion of a sample: the transpose, gradients by finite differences, and a known motion."""
 
 from __future__ import annotations
 

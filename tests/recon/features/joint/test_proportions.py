@@ -1,4 +1,4 @@
-"""Factors that are smooth within matter: the transpose, the gradient, and known factors from views of several kinds."""
+"""Smooth factors within the sample: transpose, gradient, and known factors from several kinds of projections."""
 
 from __future__ import annotations
 

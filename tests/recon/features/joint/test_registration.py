@@ -1,4 +1,4 @@
-"""Registration of energies: known shifts of a sample between energies, seen by the simulator's projector."""
+"""Registration of energies: known shifts of a sample between energies, projected by the simulator."""
 
 from __future__ import annotations
 

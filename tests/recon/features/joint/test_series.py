@@ -1,4 +1,4 @@
-"""Volumes in time from one scan: known answers, against sub-scans and one volume of all views; what is refused."""
+"""Volumes in time from one scan: known answers, comparison with sub-scans and a single volume, and errors."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
 def test_a_gap_with_too_few_views_for_a_volume_is_refused() -> None:
     views = views_of(60)
     gap = replace(views, times=np.where(views.times < 3, views.times, views.times + 20))
-    with pytest.raises(ValueError, match=r"volume 2 of 4.*, has 0 views within 4.9.*, expected 6 or more"):
+    with pytest.raises(ValueError, match=r"volume 2 of 4.*: 0 within 4.9.*, and at least 6 are needed"):
         fit_series(gap, 4)
 
 

@@ -1,4 +1,4 @@
-"""The share of one of two states, smooth within matter: transposes, a known answer, and against the fit without it."""
+"""The smooth share of one of two states: transposes, a known answer, and the fit without it."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ def test_an_end_keeps_the_densities_found_before() -> None:
 def test_states_that_are_no_two_materials_are_refused(states: tuple[int, int]) -> None:
     truth = two_grains(16)
     views = views_of(truth, 3, EDGE)
-    with pytest.raises(ValueError, match=r"two of the materials 0 \.\.\. 1"):
+    with pytest.raises(ValueError, match=r"two different materials from 0 to 1"):
         fit_share(views, Materials(truth, Grid.matching(views.geometry), np.zeros(2), 0.0), states)

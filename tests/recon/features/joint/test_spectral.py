@@ -1,4 +1,4 @@
-"""Materials from views of several energies: known answers, gradients, and against one volume an energy."""
+"""Materials from projections at several energies: known answers, gradients, and one volume per energy."""
 
 from __future__ import annotations
 
@@ -175,11 +175,11 @@ def test_the_share_of_nothing_is_not_a_number() -> None:
 @pytest.mark.parametrize(
     ("sections", "energy", "said"),
     [
-        ([[1.0, 2.0], [0.5, 1.0]], [0, 1, 0, 1], "cannot distinguish 2 materials"),
-        ([[1.0, 2.0], [2.0, 1.0]], [0, 0, 0, 0], "1 energies cannot distinguish"),
-        ([[1.0, 2.0], [2.0, 1.0]], [0, 2, 0, 1], "an index 0 ... 1"),
-        ([[1.0, 2.0], [2.0, 1.0]], [0, 1, 0], "for each of 4 views"),
-        ([[0.0, 0.0], [0.0, 0.0]], [0, 1, 0, 1], "cannot distinguish 2 materials"),
+        ([[1.0, 2.0], [0.5, 1.0]], [0, 1, 0, 1], "separate 2 materials with 2 energies"),
+        ([[1.0, 2.0], [2.0, 1.0]], [0, 0, 0, 0], "separate 2 materials with 1 energy:"),
+        ([[1.0, 2.0], [2.0, 1.0]], [0, 2, 0, 1], "an index from 0 to 1"),
+        ([[1.0, 2.0], [2.0, 1.0]], [0, 1, 0], "for each of the 4 projections"),
+        ([[0.0, 0.0], [0.0, 0.0]], [0, 1, 0, 1], "separate 2 materials with 2 energies"),
         ([[1.0, np.nan], [0.5, 1.0]], [0, 1, 0, 1], "cross_sections must be finite"),
     ],
 )

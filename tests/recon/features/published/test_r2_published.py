@@ -1,4 +1,4 @@
-"""The published R²-Gaussian: its settings, its start, and how it splits and clones."""
+"""The published R²-Gaussian: its settings, its start, and how it splits and clones Gaussians."""
 
 from __future__ import annotations
 

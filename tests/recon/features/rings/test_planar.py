@@ -1,4 +1,4 @@
-"""A planar sample: removing rings leaves no mirror image of it beyond the axis, as in half acquisition."""
+"""A flat sample: removing rings leaves no mirror image of it on the other side of the axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stripes: known ones are taken out, what has none is left alone, and a crack stays a crack."""
+"""Stripes: known ones are removed, data without stripes are unchanged, and a crack stays."""
 
 from __future__ import annotations
 
@@ -91,15 +91,15 @@ def test_a_wide_stripe_is_shifted_and_the_rest_untouched(clean: F32) -> None:
 
 def test_auto_removes_detected_stripes_and_reports_it(clean: F32, gains: F32) -> None:
     shuffled = np.random.default_rng(7).permutation(len(ANGLES))  # views in any order
-    for views, said in ((clean, "no stripes seen"), (clean + gains, "removed by")):
+    for views, said in ((clean, "no visible stripes"), (clean + gains, "removed by")):
         stack = np.repeat(views[shuffled, None], 2, axis=1)
         before = stack.copy()
         taken, text = remove_rings_in_place(stack, ANGLES[shuffled], "auto")
         assert said in text
-        assert (stack == before).all() == (said == "no stripes seen")
+        assert (stack == before).all() == (said == "no visible stripes")
         np.testing.assert_allclose(taken, (before - stack).mean(axis=0), atol=1e-6)
     few = clean[:7, None].copy()
-    assert "7 views of 240 columns are too few" in remove_rings_in_place(few, ANGLES[:7], "vo")[1]
+    assert "7 projections of 240 columns are too few" in remove_rings_in_place(few, ANGLES[:7], "vo")[1]
     np.testing.assert_array_equal(few, clean[:7, None])
     assert remove_rings_in_place(clean[:, None].copy(), ANGLES, "none")[1] == ""
 

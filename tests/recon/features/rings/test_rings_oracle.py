@@ -1,4 +1,4 @@
-"""Stripe removal beside algotom's, by the author of the methods `sort` and `vo` (Vo et al. 2018; extra "oracle")."""
+"""Stripe removal compared with algotom by the author of `sort` and `vo` (Vo et al. 2018; extra "oracle")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Activations and their backward pass against torch."""
+"""Activations and their backward pass compared with torch."""
 
 from __future__ import annotations
 

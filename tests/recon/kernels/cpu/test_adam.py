@@ -1,4 +1,4 @@
-"""Adam against its published steps, its bounds, and the record of pulls."""
+"""Adam compared with its published steps; bounds; and the sum of gradient lengths."""
 
 from __future__ import annotations
 

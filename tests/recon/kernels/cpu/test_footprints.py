@@ -1,4 +1,4 @@
-"""Footprint tables and their backward pass against the reference, with plain sums over pixels in between."""
+"""Footprint tables and their backward pass compared with the reference, with plain sums over pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sixteen-lane arithmetic against numpy."""
+"""Sixteen-lane arithmetic compared with numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fused losses against their reference implementations in torch, and the reference's SSIM against scikit-image."""
+"""Fused losses compared with torch references; the SSIM of the reference compared with scikit-image."""
 
 from __future__ import annotations
 

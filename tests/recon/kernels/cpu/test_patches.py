@@ -1,4 +1,4 @@
-"""Sparse patches: against the reference implementation, and the laws of the mean over all blocks."""
+"""Patch denoiser: compared with the reference, and properties of the mean over all blocks."""
 
 from __future__ import annotations
 

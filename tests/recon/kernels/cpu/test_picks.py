@@ -1,4 +1,4 @@
-"""Picks from a line of an array against numpy's, by the instructions of each level of processors."""
+"""Picking elements from a line of an array, compared with numpy, for each processor level."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rendering and moments of footprint tables against dense float64 sums, where the recurrence holds and where not."""
+"""Rendering and moments of footprint tables compared with dense float64 sums, with and without the recurrence."""
 
 from __future__ import annotations
 

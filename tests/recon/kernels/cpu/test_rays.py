@@ -1,4 +1,4 @@
-"""Exact rays of a cone: the kernel against the reference, its cut-off, and Gaussians that break naive code."""
+"""Exact rays of a cone: the kernel compared with the reference, its cut-off, and difficult Gaussians."""
 
 from __future__ import annotations
 

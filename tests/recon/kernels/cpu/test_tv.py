@@ -1,4 +1,4 @@
-"""TV's kernels against numpy in float64, and its gradient against finite differences."""
+"""TV kernels compared with numpy in float64; the gradient compared with finite differences."""
 
 from __future__ import annotations
 

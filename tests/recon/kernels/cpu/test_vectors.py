@@ -1,4 +1,4 @@
-"""Small kernels on voxels and lines: sums and products, mixtures, slopes, transposes and rows between slices."""
+"""Small kernels on voxels and lines: sums and products, mixtures, slopes, transposes, rows between slices."""
 
 from __future__ import annotations
 

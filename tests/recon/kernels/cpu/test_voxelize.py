@@ -1,4 +1,4 @@
-"""Voxelisation and its backward pass against the float64 reference: anisotropic voxels, needles, dots, small boxes."""
+"""Voxelisation and its backward pass compared with the float64 reference: anisotropic voxels, needles, small boxes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Displaced volumes: against SciPy's interpolation, the transpose, and the slope of a trilinear function."""
+"""Displaced volumes: compared with SciPy's interpolation; the transpose; the slope of a trilinear function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the Triton kernels are tested: on CUDA where there is one, else interpreted; geometries and comparisons."""
+"""Where the Triton kernels are tested: on CUDA if there is one, otherwise interpreted; geometries, comparisons."""
 
 from __future__ import annotations
 
@@ -18,13 +18,17 @@ from tests.recon.helpers import as_leaves, gradients
 from tests.recon.kernels import reference
 
 if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here
+    # it is read when triton and the kernels are first imported, which happens here
+    os.environ["TRITON_INTERPRET"] = "1"
 pytest.importorskip("triton", reason="the GPU kernels need triton (extra gpu, Linux)")
 
 
 def _prepare_the_language_once() -> None:
-    """Triton's interpreter replaces all functions of its language when a kernel is launched, and again at each call of
-    a function within it, where they are replaced already: a quarter of these tests' time."""
+    """Let Triton's interpreter replace the functions of its language only once.
+
+    It replaces them when a kernel is launched, and again at each call of a function within it, which takes a quarter of
+    the time of these tests.
+    """
     interpreter, language = (importlib.import_module(f"triton.{name}") for name in ("runtime.interpreter", "language"))
     prepare, modules = interpreter._patch_lang, (language, language.core)
 
@@ -39,10 +43,10 @@ def _prepare_the_language_once() -> None:
 
 _prepare_the_language_once()
 DEVICE: torch.device = importlib.import_module("recon.kernels.gpu").require("cuda")
-WHOLE = (1e-12, 9.0)  # faint, cut: no cut-off worth the name
+WHOLE = (1e-12, 9.0)  # faint, cut: practically no cut-off
 AFFINE, EXACT = RayModel(), RayModel(exact_above=0.0)
 UNIT = 0.7
-SHAPE = (19, 26)  # no multiple of a tile
+SHAPE = (19, 26)  # not a multiple of a tile
 
 
 def parallel(shape: tuple[int, int] = SHAPE) -> Geometry:
@@ -60,7 +64,7 @@ def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
 
 
 def project_raw(*arguments: Any) -> Tensor:
-    """The views of raw parameters and their unit: what `recon.project` calls on a GPU."""
+    """The projections of raw parameters and their unit, which `recon.project` calls on a GPU."""
     *raw, unit, geometry, faint, cut, model = arguments
     return Project.apply(*raw, Renderer(unit, Kernel.GAUSSIAN, _gpu()), geometry, (faint, cut, model))
 

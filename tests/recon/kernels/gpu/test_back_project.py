@@ -1,4 +1,4 @@
-"""Back-projection of FDK: the Triton kernel against that of the CPU."""
+"""FDK back-projection: the Triton kernel compared with the CPU kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fit is the same on both backends, calls go to the device of their tensors, and errors say what is missing."""
+"""A fit is the same on both backends, calls run on the device of their tensors, and errors name what is missing."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="devices, got cpu"):
         gpu.require("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RuntimeError, match="sees no CUDA device"):
+    with pytest.raises(RuntimeError, match="finds no CUDA device"):
         gpu.require("cuda:1")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(ValueError, match=r"cuda:1.*current one, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
+    with pytest.raises(ValueError, match=r"cuda:1.*current device, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
         gpu.require("cuda:1")
     for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a device of negative number
-        with pytest.raises(ValueError, match=r"sees 2 CUDA.*ask for cuda"):
+        with pytest.raises(ValueError, match=r"finds 2 CUDA.*Use cuda"):
             gpu.require(absent)
     assert gpu.require("cuda:0") == torch.device("cuda:0")

@@ -1,4 +1,4 @@
-"""Images and volumes, what flows back from them, and where they end: the Triton kernels against the reference."""
+"""Images, volumes, gradients and cut-offs: the Triton kernels compared with the reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole steps on the device: lists that are too short are repeated, and a graph gives the bits of its launches."""
+"""Complete steps on the device: too short lists are repeated; a graph is bit-identical to its launches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Triton is loaded only where a GPU is asked for, and compiles every kernel for CUDA, on a machine that has none.
+"""Triton is loaded only if a GPU is requested, and compiles every kernel for CUDA on a machine without one.
 
 The interpreter takes code that the compiler refuses. Triton brings its own assembler, so no driver is needed. Both
 are checked in one process of their own, since here the kernels may be interpreted.

@@ -1,4 +1,4 @@
-"""The voxel projector and its transpose: the Triton kernels against those of the CPU."""
+"""The voxel projector and its transpose: the Triton kernels compared with the CPU kernels."""
 
 from __future__ import annotations
 
@@ -112,5 +112,5 @@ def test_no_views_leave_an_empty_volume(rng: np.random.Generator) -> None:
 def test_leaning_views_and_a_box_at_the_source_are_refused() -> None:
     with pytest.raises(ValueError, match="straight"):
         joseph.JosephRays.of(_parallel(roll=0.1), Grid((7, 9, 11), 0.7), DEVICE)
-    with pytest.raises(ValueError, match="reaches the source"):
+    with pytest.raises(ValueError, match="reaches the X-ray source"):
         joseph.JosephRays.of(_cone(), Grid((7, 60, 60), 0.7), DEVICE)

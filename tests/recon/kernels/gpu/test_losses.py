@@ -1,4 +1,4 @@
-"""Losses, and Adam: the Triton kernels against the reference and the CPU's."""
+"""Losses and Adam: the Triton kernels compared with the reference and the CPU kernels."""
 
 from __future__ import annotations
 

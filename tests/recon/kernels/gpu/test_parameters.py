@@ -1,4 +1,4 @@
-"""Activations and Adam: the Triton kernels against torch and the CPU's."""
+"""Activations and Adam: the Triton kernels compared with torch and the CPU kernels."""
 
 from __future__ import annotations
 

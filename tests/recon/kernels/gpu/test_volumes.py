@@ -1,4 +1,4 @@
-"""Operations on volumes and views: torch's on a device against the CPU kernels."""
+"""Operations on volumes and projections: torch on a device compared with the CPU kernels."""
 
 from __future__ import annotations
 

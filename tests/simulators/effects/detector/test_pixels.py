@@ -160,7 +160,7 @@ def test_each_keeps_its_own_charge_when_it_spreads() -> None:
 
 def test_more_zingers_than_a_frame_can_hold_are_refused() -> None:
     """They would fill the memory."""
-    with pytest.raises(CannotExposeError, match=r"1e\+12 a"):
+    with pytest.raises(CannotExposeError, match=r"1e\+12 per"):
         _frame(Zingers(1e12), 0)
 
 

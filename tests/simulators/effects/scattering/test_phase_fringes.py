@@ -136,7 +136,7 @@ def test_oversampling_alone_averages_over_a_pixel() -> None:
 
 
 def test_transport_far_from_the_sample_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"is 0.5 and.* at most 16.1 mm"):
+    with pytest.raises(ValueError, match=r"is 0.5, but.* at most 16.1 mm"):
         PhaseFringes(40.0, _distance(0.5), 20.0, method="transport").apply(np.zeros((8, 8)), _shot((8, 8)))
 
 
@@ -147,7 +147,7 @@ def test_a_wave_that_would_alias_is_refused_and_the_depth_left() -> None:
     kept = depth.copy()
     with pytest.raises(
         ValueError,
-        match=r"by 10 rad.*follows 1.57.* or method transport",
+        match=r"by 10 rad.*allows 1.57.* or method transport",
     ):
         effect.apply(depth, _shot((64, 64)))
     np.testing.assert_array_equal(depth, kept)

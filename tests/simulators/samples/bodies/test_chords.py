@@ -139,12 +139,12 @@ def test_many_solids_in_the_same_shadow_cost_as_much_as_few() -> None:
 @pytest.mark.parametrize(
     ("solid", "words"),
     [
-        (Box((0.2, 0.2, 0.2), 1.0, (0.0, -1.2, 0.0)), r"solid 0 \(box\) reaches 0.3 mm behind the source"),
-        (Box((0.2, 0.2, 0.2), 1.0, (0.0, -3.0, 0.0)), "reaches 2.1 mm behind the source, which is 1 mm before"),
-        (Ellipsoid((0.1, 0.5, 0.1), 1.0, (0.3, -0.5, 0.0)), "solid 0 .ellipsoid. reaches"),
-        (Cylinder(1.0, 0.2, 1.0), "raise sod. No frame was computed"),
-        (Cylinder(1.2, 0.2, 1.0), r"solid 0 \(cylinder\) reaches 0.2 mm behind"),
-        (Polyhedron(octahedron((0.1, 0.4, 0.1)), 1.0, (0.0, -0.7, 0.0)), r"solid 0 \(polyhedron\) reaches 0.1 mm"),
+        (Box((0.2, 0.2, 0.2), 1.0, (0.0, -1.2, 0.0)), r"solid 0 \(box\) extends 0.3 mm behind the source"),
+        (Box((0.2, 0.2, 0.2), 1.0, (0.0, -3.0, 0.0)), "extends 2.1 mm behind the source, which is 1 mm in front of"),
+        (Ellipsoid((0.1, 0.5, 0.1), 1.0, (0.3, -0.5, 0.0)), "solid 0 .ellipsoid. extends"),
+        (Cylinder(1.0, 0.2, 1.0), "increase sod. No frame was computed"),
+        (Cylinder(1.2, 0.2, 1.0), r"solid 0 \(cylinder\) extends 0.2 mm behind"),
+        (Polyhedron(octahedron((0.1, 0.4, 0.1)), 1.0, (0.0, -0.7, 0.0)), r"solid 0 \(polyhedron\) extends 0.1 mm"),
     ],
 )
 def test_bodies_at_or_behind_the_source_are_refused(solid: Solid, words: str) -> None:

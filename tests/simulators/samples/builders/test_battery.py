@@ -46,7 +46,7 @@ def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
     assert battery(np.random.default_rng(4)) == battery(np.random.default_rng(4))
     assert battery(np.random.default_rng(4)) != battery(np.random.default_rng(5))
     assert len(battery(np.random.default_rng(4), n_particles=0)) == 3
-    with pytest.raises(ValueError, match=r"50 particles.* lower fill"):
+    with pytest.raises(ValueError, match=r"lower fill.* 50 particles"):
         battery(np.random.default_rng(4), n_particles=50, fill=0.9)
 
 

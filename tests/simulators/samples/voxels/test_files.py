@@ -87,7 +87,7 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
         ({"file": "flat"}, "three axes"),
         ({"file": "complex"}, "real values"),
         ({"file": "thin", "voxel_mm": None, "largest_line_integral": 2.0}, "too anisotropic for largest_line_integral"),
-        ({"file": "none", "largest_line_integral": 2.0}, "needs matter"),
+        ({"file": "none", "largest_line_integral": 2.0}, "needs a sample that absorbs"),
         ({"file": "none", "attenuation_max": 2.0}, "needs a value above 0"),
     ],
 )

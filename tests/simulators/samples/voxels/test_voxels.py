@@ -167,7 +167,7 @@ def test_a_source_in_the_volume_is_refused(random: Voxels) -> None:
     random.line_integrals(0.7, detector)
     for moved in (Pose.turned(0.7, 3).shifted_by([0.0, -0.03, 0.0]), Pose.turned(math.atan2(0.2, 0.18), 3)):
         close = Detector.centred((3, 4), 0.05, sod=0.265 if moved.shift is None else 0.28)
-        with pytest.raises(ValueError, match=r"source\. Raise sod"):
+        with pytest.raises(ValueError, match=r"detector: increase sod"):
             random.line_integrals(moved, close)
     with pytest.raises(ValueError, match="2 angles"):
         random.line_integrals(Pose.turned(0.0, 2), detector)

@@ -1,4 +1,4 @@
-"""--calibrate: places of views and the axis are learnt from a scan's own views, and enter the geometry alone."""
+"""--calibrate: shifts and the axis are measured from the projections, and change only the geometry."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
     done = found.done["calibrate"]
-    assert done.sentence.startswith("Geometry learnt: the axis moves by +")
-    assert "Views held out deviate by" in done.sentence
+    assert done.sentence.startswith("Geometry calibrated: the axis moves by +")
+    assert "The deviation of held-out projections fell from" in done.sentence
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
     assert plain.done["calibrate"].sentence == ""
 
@@ -79,15 +79,15 @@ def test_poses_of_a_volume_with_another_axis_are_told(
         return prepare(scan, Selection(axis_col=given, steps=steps))
 
     _, warnings = taken(taken(None)[0].axis_col + off)
-    assert any("go with the rotation axis of that volume" in each for each in warnings) is told
+    assert any("were found with the rotation axis" in each for each in warnings) is told
 
 
 def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Path) -> None:
-    assert "it needs all views" in LEARN.needs_finished and Calibrate().needs_finished == ""
+    assert "it uses all projections" in LEARN.needs_finished and Calibrate().needs_finished == ""
     table = tmp_path / "poses.csv"
     rows = "\n".join(f"{view},1,0" for view in range(N))
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
-    with pytest.raises(ConfigError, match=r"--calibrate learns what .*give one of"):
+    with pytest.raises(ConfigError, match=r"--calibrate calibrates what .*Give either"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
     with pytest.raises(ValueError, match="'lean'"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")

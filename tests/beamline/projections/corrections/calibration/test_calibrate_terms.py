@@ -1,4 +1,4 @@
-"""--calibrate gains: refused where the views cannot show them."""
+"""--calibrate gains: error if the projections cannot show them."""
 
 from __future__ import annotations
 
@@ -37,4 +37,8 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def test_gains_of_few_columns_are_refused(scans: dict[str, Path]) -> None:
     done = CliRunner().invoke(main, ["recon", str(scans["bent"]), "--bin", "2", "--calibrate", "gains"])
-    assert done.exit_code == 5 and "56 columns are too few" in done.output and "No view was read" in done.output
+    assert (
+        done.exit_code == 5
+        and "projections of 56 columns, and gains needs" in done.output
+        and "Nothing was read" in done.output
+    )

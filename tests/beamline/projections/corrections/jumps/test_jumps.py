@@ -1,4 +1,4 @@
-"""Views after a jump of the sample are left out, and the reason is told in a line."""
+"""Projections after a jump of the sample are left out, and one line says why."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def moved(x: float, z: float) -> NDArray[np.float32]:
 def test_views_after_a_jump_are_left_out(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), replace(SELECTION, views="first:30"))
     assert found.geometry.n_views == 30 and found.left_out == 19 and found.view_weights is None
-    assert "The sample jumped at frame 45. 19 views are left out" in told
-    assert "`--calibrate shifts` takes all" in told and found.done["jumps"].sentence in told
+    assert "The sample jumped at frame 45. 19 projections are left out" in told
+    assert "`--calibrate shifts` uses all" in told and found.done["jumps"].sentence in told
 
 
 def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
@@ -57,29 +57,29 @@ def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
     views[LATER] = ball_views(ANGLES[LATER], SHAPE, seed=1)
     found, told = prepared(scan(tmp_path, views, JUMP))
     assert found.geometry.n_views == JUMP and found.left_out == 19 and not found.geometry.shifts.any()
-    assert "19 views are left out: the sample stood elsewhere" in told
+    assert "19 projections are left out, because the sample had another position" in told
 
 
 def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> None:
     views = moved(2.0, 2.0)
     views[15:20] += np.random.default_rng(1).normal(0, 0.5, (5, *SHAPE)).astype(np.float32)
     found, told = prepared(scan(tmp_path, views, 15, 20, JUMP), replace(SELECTION, binning=2))
-    assert told.startswith("The sample jumped at frame 45. 19 views are left out")
-    assert "At the alarm of motion at frames 19, 24 the other views show no jump" in told
+    assert told.startswith("The sample jumped at frame 45. 19 projections are left out")
+    assert "The monitor reported motion at frames 19, 24, but the projections show no jump" in told
     assert found.geometry.n_views == JUMP
 
 
 def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(0.0, 0.0), 20, 22))
     assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
-    assert told.startswith("At the alarm of motion at frames 24, 26 the other views show no jump")
+    assert told.startswith("The monitor reported motion at frames 24, 26, but the projections show no jump")
 
 
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 view with an alarm"),
-        (replace(SELECTION, cone=(100.0, 200.0)), "Views of a cone beam are not compared"),
+        (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 projection with an alarm"),
+        (replace(SELECTION, cone=(100.0, 200.0)), "In a cone beam jumps cannot be checked"),
     ],
 )
 def test_who_wants_them_as_they_are_and_cones_get_them_so(tmp_path: Path, selection: Selection, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Phase of a scan: the same views in batches, bands of rows and slabs; what it must know is the file's or asked for."""
+"""Phase filter of a scan: same result in batches, bands of rows and slabs; its values come from file or options."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     found, said = Phase("20").filter_of(source, SELECTION.of(source))
     assert found == PHASE.filter_of(source, SELECTION.of(source))[0]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
-    with pytest.raises(ConfigError, match=r"has 48 x 40"):
+    with pytest.raises(ConfigError, match=r"has only 48 x 40"):
         replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION.of(source))
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
         _correction(SELECTION.with_steps(Preparation(noise="counts")))
@@ -100,9 +100,9 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
     found = _prepared(source)
     sentence = found.done["phase"].sentence
     assert (
-        "(by views held out)" in sentence
+        "(from held-out projections)" in sentence
         and "below the air" in sentence
-        and "--phase none leaves the filter out" in sentence
+        and "--phase none omits the filter" in sentence
     )
     length = float(sentence.split("over ")[1].split(" pixels")[0])
     by_hand = replace(Phase(), length=length)
@@ -134,7 +134,7 @@ def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: p
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: FilterLength(1.4, 1.1, 0.08))
     found = _prepared(_rimmed(0.8))
     sentence = found.done["phase"].sentence
-    assert "over 1.4 pixels lowers the residual of views held out by 8%" in sentence
+    assert "over 1.4 pixels would lower the residual in held-out projections by 8%" in sentence
     np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
 
 
@@ -151,4 +151,4 @@ def test_the_search_takes_no_more_memory_than_it_states() -> None:
 
 def test_an_unsharp_mask_that_no_filter_precedes_is_not_dropped_without_a_word() -> None:
     sentence = _prepared(_rimmed(0.0), Phase(unsharp=(1.5, 2.0))).done["phase"].sentence
-    assert "not retrieved" in sentence and "--unsharp is not used" in sentence
+    assert "No phase retrieval" in sentence and "--unsharp has no effect" in sentence

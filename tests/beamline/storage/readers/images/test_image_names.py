@@ -1,4 +1,4 @@
-"""What a sample is called does not make it a dark or a flat; angles in names are read; hidden files are no images."""
+"""The sample's name does not make an image a dark or flat; angles in names are read; hidden files are ignored."""
 
 from __future__ import annotations
 
@@ -154,10 +154,10 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     np.savez(tmp_path / "s.npz", a=picture, settings=np.array({"mode": "cone"}, object))
     (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")
     for name, message in {
-        "jpg": r"pictures such as p_1.jpg .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
+        "jpg": r"pictures such as p_1.jpg .* 8 bits.*PNG.*PIL.*\*\.jpg",
         "png": "its pixels are RGB, 6 x 4; expected grey ones",
-        "s.npz": "objects of Python among its arrays, which are pickles.*numpy.savez",
-        "s.pickle": "is a pickle, which is never opened here.*np.save",
+        "s.npz": "numpy.savez.*Python objects among its arrays.*pickles",
+        "s.pickle": "is a pickle, which this program never opens.*np.save",
     }.items():
         with pytest.raises(DataError, match=message):
             open_scan(tmp_path / name)
@@ -175,9 +175,9 @@ def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: P
         with open_scan(scan) as source:
             assert source.table.kinds.tolist() == kinds
     said = _of_references(SourceOptions(views, "counts", angles))
-    assert said == "Darks and flats are those beside the views: Dark_After, Flat_Before."
+    assert said == "The darks and flats next to the projections are used: Dark_After, Flat_Before."
     _written(tmp_path / "Tomo_2", [f"IMAT_other_{i}.tif" for i in range(4)])  # whose flats are they?
-    assert "Counts without flats: give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
+    assert "flats are missing. Give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
 
 
 def test_a_defect_while_looking_beside_the_views_is_no_scan_without_references(

@@ -1,4 +1,4 @@
-"""TIFFs of many pages and archives of many files open at once, or are refused."""
+"""TIFFs with many pages and archives with many files open at once, or end with an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene of R²-Gaussian, projected here by the geometry of its authors, gives their volume, not its mirror image."""
+"""A scene of R²-Gaussian, projected with its authors' geometry, gives their volume and not its mirror image."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_scene_gives_the_volume_of_its_authors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("changed", "message"),
-    [({"mode": "helical"}, "mode 'helical'; expected cone or parallel"), ({}, "1 are not there")],
+    [({"mode": "helical"}, "mode 'helical'; expected cone or parallel"), ({}, "1 of the files do not exist")],
 )
 def test_what_no_scene_has_is_refused(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
     scene = _scene(tmp_path / "scene", **changed)

@@ -137,7 +137,7 @@ def test_an_image_of_another_shape_or_a_broken_one_is_named(series: tuple[Path, 
 
 def test_empty_and_broken_places_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="holds no image"):
+    with pytest.raises(DataError, match="contains no image"):
         open_scan(tmp_path / "empty")
     for name in ("broken.zip", "broken.tif"):
         (tmp_path / name).write_bytes(b"nothing of the kind")
@@ -234,7 +234,7 @@ def test_packed_pixels_are_refused_in_words(tmp_path: Path) -> None:
     for i in range(3):
         _packed(tmp_path / f"s/a_{i}.tif")
     for path in (tmp_path / "s", tmp_path / "s/a_0.tif"):
-        with pytest.raises(DataError, match=r"packed, 12 bits each.*imagecodecs"):
+        with pytest.raises(DataError, match=r"packed with 12 bits each.*imagecodecs"):
             open_scan(path)
-    with pytest.raises(DataError, match=r"packed, 12 bits each"):
+    with pytest.raises(DataError, match=r"packed with 12 bits each"):
         load_images(tmp_path / "s", FrameKind.DARK)

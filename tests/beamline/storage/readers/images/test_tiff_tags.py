@@ -1,4 +1,4 @@
-"""What a TIFF says of its pages: orientation, copies of reduced resolution, sets of OME files and their axes."""
+"""TIFF tags: orientation, reduced-resolution copies, sets of OME files and their axes."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_file_of_an_ome_set_has_its_own_pages_alone(tmp_path: Path, stack: NDA
         np.testing.assert_array_equal(source.read(slice(None)), stack)
         assert source.not_used == () or pages > 1
     if pages > 1:
-        with pytest.raises(DataError, match=rf"others hold {N - pages} images: give them with --append FILE"):
+        with pytest.raises(DataError, match=rf"others contain {N - pages} images: add them with --append FILE"):
             open_scan(SourceOptions(tmp_path / names[0], angles=np.arange(N + 1.0)))
 
 

@@ -1,4 +1,4 @@
-"""TIFFs that do not say of what type their numbers are: reals are read by their bits, whole numbers stay whole."""
+"""TIFFs without a number type: floats are recognised by their bits, integers stay integers."""
 
 from __future__ import annotations
 

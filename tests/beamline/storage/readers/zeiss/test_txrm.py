@@ -1,4 +1,4 @@
-"""Zeiss's .txrm: files written here as two public readers document them, and a real one."""
+"""Zeiss .txrm: files written here as two public readers document them, and a real one."""
 
 from __future__ import annotations
 
@@ -110,11 +110,11 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
     with open_scan(path) as source:
         assert (source.quantity, source.pixel_size_mm) == ("unknown", None)
         assert source.table.kinds.tolist() == [FrameKind.PROJECTION] * 30
-        assert source.ending == ScanEnding("stopped", reason="30 of 120 planned views were taken.")
+        assert source.ending == ScanEnding("stopped", reason="30 of 120 planned projections were taken.")
         assert np.isnan(source.table.exposures).all()
     assert describe(path)["format"] == "txrm"
     lost = write_compound(tmp_path / "a.txrm", streams(ImageInfo__Angles=None))
-    with pytest.raises(DataError, match="120 views"):
+    with pytest.raises(DataError, match="120 projections"):
         open_scan(lost)
     with open_scan(SourceOptions(lost, angles=SCAN.angles)) as source:
         np.testing.assert_array_equal(source.table.angles[2:], SCAN.angles)
@@ -124,16 +124,16 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"ImageInfo__DataType": np.int32(7)}, "4 x 40 pixels of type 7; expected type 5"),
-        ({"ImageInfo__ImageHeight": np.int32(0)}, r"s\.txrm says that its images have 0 x 40 pixels: it is damaged\."),
-        ({"ImageInfo__ImageWidth": np.int32(2**30)}, "4 x 1073741824 pixels: it is damaged"),
-        ({"ImageInfo__ImageWidth": None}, "no stream ImageInfo/ImageWidth"),
-        ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged, or its structure"),
-        ({"ImageInfo__NoOfImages": np.int32(0)}, "holds no projections"),
+        ({"ImageInfo__ImageHeight": np.int32(0)}, r"s\.txrm is damaged: it states images of 0 x 40 pixels\."),
+        ({"ImageInfo__ImageWidth": np.int32(2**30)}, "damaged: it states images of 4 x 1073741824 pixels"),
+        ({"ImageInfo__ImageWidth": None}, "the stream ImageInfo/ImageWidth is missing"),
+        ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged or has an unexpected structure"),
+        ({"ImageInfo__NoOfImages": np.int32(0)}, "contains no projections"),
         ({"ImageInfo__NoOfImages": np.int32(2**31 - 1), "ImageInfo__ImagesTaken": None}, "2147483647 images of 4 x 40"),
         ({"ImageInfo__AcquisitionMode": np.int32(2)}, "a volume"),
         ({"ImageInfo__MosiacRows": np.int32(2)}, "is a mosaic"),
-        ({"Alignment__Y-Shifts": np.full(120, np.nan, "<f4")}, "120 of its views' shifts are no numbers"),
-        ({"ReferenceData__Image": b"1234"}, "damaged, or its structure"),
+        ({"Alignment__Y-Shifts": np.full(120, np.nan, "<f4")}, "120 shifts of projections are not numbers"),
+        ({"ReferenceData__Image": b"1234"}, "damaged or has an unexpected structure"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_a_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -155,7 +155,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
     assert not ignored.geometry.shifts.any() and said == []
     with pytest.raises(ConfigError, match="--tilt and --poses both"):
         prepare(path, selection.with_steps(TiltAndLens(1.0)))
-    with pytest.raises(DataError, match=r"copy would not.*Nothing was written"):
+    with pytest.raises(DataError, match=r"copy could not.*Nothing was written"):
         ingest(path, tmp_path / "copy.h5")
     with open_scan(write_compound(tmp_path / "z.txrm", streams(**{"Alignment__X-Shifts": 0 * back}))) as source:
         assert source.table.shifts is None

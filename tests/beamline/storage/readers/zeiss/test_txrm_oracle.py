@@ -1,4 +1,4 @@
-"""A .txrm beside txrm2tiff's reading of it (Diamond Light Source; extra "oracle")."""
+"""A .txrm compared with txrm2tiff's reading of it (Diamond Light Source; extra "oracle")."""
 
 from __future__ import annotations
 
