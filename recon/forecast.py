@@ -130,6 +130,8 @@ class Timing:
             part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
             first = method.first_sweeps if isinstance(method, VoxelMethod) else 0
             pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
+            if isinstance(method, VoxelMethod):
+                pace = pace._replace(planned=min(pace.planned, method.usual_sweeps))
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # Steps that are not over all views take as long whatever their number, by samples along rays.
             along = max(self._grid.shape) / max(part.grid.shape)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from typing import ClassVar, Self
 
@@ -79,6 +79,12 @@ class FistaTv(VoxelMethod):
     def usual_sweeps(self) -> int:
         """Passes until the volume stands still, as a rule."""
         return min(self.iterations, USUAL_SWEEPS)
+
+    def refit(self, share: float) -> VoxelMethod:
+        """Early iterations on subsets, with this share of their number."""
+        given = {each.name: getattr(self, each.name) for each in fields(FistaTv)}
+        subsets, iterations = EarlyTv.subsets, max(1, round(share * EarlyTv.iterations))
+        return EarlyTv(**given | {"subsets": subsets, "iterations": iterations})
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """A volume that is nearer its end, or further from it."""

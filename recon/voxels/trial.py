@@ -306,6 +306,23 @@ class Trial:
         return None if isinstance(weight, NoiseBalance) else weight
 
     @property
+    def smooth_residuals(self) -> F64:
+        """Residuals for total variation of the weight chosen.
+
+        Raises:
+            ValueError: none was chosen.
+        """
+        if self.weight is None:
+            raise ValueError("no weight of total variation could be chosen")
+        return self.residuals_of_weight(self.weight)
+
+    @cached_property
+    def early_weight(self) -> float | None:
+        """The weight of total variation for a finish, which ends early: a heavier one. None: as of `weight`."""
+        early = Trial.of(self.scan, replace(self.settings, early=True))
+        return None if early is None else early.weight
+
+    @property
     def wide(self) -> bool:
         """Whether the sample goes on beyond the field, or the box is wider than that by a tenth: patches are not tried.
 

@@ -20,7 +20,7 @@ from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabili
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv, FistaTv
 from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
@@ -33,6 +33,7 @@ MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
 of the middle between two levels).
 """
+REFIT_SWEEPS = 16  # of error bars, in all
 _TRIALS = 6  # usual number of test reconstructions with levels
 
 
@@ -70,15 +71,24 @@ class Discrete(VoxelMethod):
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
+    def refit(self, share: float) -> VoxelMethod:
+        """Early iterations of total variation, with this share of the number that a finish makes."""
+        return EarlyTv(iterations=max(1, round(share * REFIT_SWEEPS)), allow_negative=self.allow_negative)
+
+    @property
+    def usual_sweeps(self) -> int:
+        """Usual number of iterations until the volume stands still."""
+        return min(self.iterations, USUAL_SWEEPS)
+
     @property
     def trial_sweeps(self) -> int:
         """Iterations of the test reconstructions for the weight of total variation and for the levels."""
-        return CHOICE_SWEEPS + _TRIALS * min(self.iterations, USUAL_SWEEPS)
+        return CHOICE_SWEEPS + _TRIALS * self.usual_sweeps
 
     @property
     def refused_sweeps(self) -> int:
         """Usual number of test iterations after which discrete levels are rejected and PnP-DCT may be tried."""
-        return len(COUNTS) * min(self.iterations, USUAL_SWEEPS)
+        return len(COUNTS) * self.usual_sweeps
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
@@ -112,7 +122,7 @@ class Discrete(VoxelMethod):
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return FistaTv(iterations=self.iterations).iterate(problem, x)
+            return EarlyTv(iterations=self.iterations).iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         materials = self.materials(problem, weight, trial)
