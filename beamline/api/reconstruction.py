@@ -36,6 +36,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
+from recon.auto import method_named
 from recon.base.choices import AUTO
 from recon.base.method import Method
 from recon.base.volume import Volume
