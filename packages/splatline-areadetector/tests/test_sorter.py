@@ -8,7 +8,7 @@ from itertools import chain
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
@@ -458,7 +458,9 @@ def _is_said(sorter: Sorter, decided: list[tuple[Seen, Decision]]) -> bool:
 @settings(max_examples=500, deadline=None, derandomize=True)  # the same scans in each run
 def test_no_frame_has_a_wrong_angle_without_a_word(scan: Scan) -> None:
     """And a scan without a fault is stored whole, without one. Frames that are exchanged are none, but for those of a
-    plugin that averages, and around numbers that begin anew."""
+    plugin that averages, and around numbers that begin anew. Not looked at are frames that are exchanged just where
+    numbers begin anew within a scan: their numbers are those of another scan (docs/areadetector.md)."""
+    assume(scan.anew is None or scan.swapped is None or abs(scan.anew - scan.swapped) > 1)
     blocks = [PlannedBlock(DARK, 2), PlannedBlock(FLAT, 3), PlannedBlock(VIEW, 12)]
     sorter, frames = Sorter(blocks), scan.frames
     is_faulty = bool(scan.lost) or scan.anew is not None or (bool(scan.untold) and scan.phased)
