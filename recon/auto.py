@@ -142,3 +142,12 @@ def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:
         return problem, "all rows"
     views = Views(problem.views.masked().data, problem.geometry).binned(2)
     return replace(problem, views=views, grid=Grid.matching(views.geometry)), "all rows, binned 2 x 2"
+
+
+def method_named(name: str) -> Method:
+    """The method of this name with its default settings; "auto": `Auto`.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    return Auto() if name == AUTO else by_name(name)()

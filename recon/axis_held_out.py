@@ -17,7 +17,7 @@ from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import predicted_views
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 
 COLS = 128  # Columns that show the axis to 0.05 of their pixels; more cost time
 VIEWS = 90  # Views that are enough
@@ -139,7 +139,7 @@ class _Residuals:
     def __call__(self, axis_col: float) -> float:
         if axis_col not in self.found:
             views = self._moved(axis_col)
-            grid, method = self.grid or self.grid_about(axis_col), FistaTv(self.sweeps, _TV_WEIGHT)
+            grid, method = self.grid or self.grid_about(axis_col), EarlyTv(self.sweeps, _TV_WEIGHT)
             weights = None if self.lit is None else self.lit.astype(np.float32)
             unseen, images = predicted_views(method, Views(self.data, views, weights), grid, _ONE_IN)
             lit = 1 if self.lit is None else self.lit[unseen]

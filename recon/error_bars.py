@@ -15,12 +15,12 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.methods import names_where, with_settings
+from recon.methods import names_where
 from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pull_methods
+from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -155,7 +155,7 @@ def _refitted(
     control: RunControl,
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
-    refit: VoxelMethod = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
+    refit = method.refit(_SHARE)
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     given = problem.views.masked()

@@ -25,7 +25,8 @@ from recon.voxels.choice import TRIALS
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import STEPS, pull_methods
+from recon.voxels.ordered_fista import pull_methods
+from recon.voxels.priors import STEPS
 
 VOXELS = 2**20
 """Of the part that is timed: as many as caches of a processor do not hold several times."""
@@ -129,6 +130,8 @@ class Timing:
             part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
             first = method.first_sweeps if isinstance(method, VoxelMethod) else 0
             pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
+            if isinstance(method, VoxelMethod):
+                pace = pace._replace(planned=min(pace.planned, method.usual_sweeps))
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # Steps that are not over all views take as long whatever their number, by samples along rays.
             along = max(self._grid.shape) / max(part.grid.shape)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.auto import method_named
 from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
@@ -25,7 +26,7 @@ from recon.base.setting import Natural
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.methods import DEFAULT, accepting, by_name
+from recon.methods import DEFAULT, accepting
 from recon.prep.counts import Counts, line_integrals
 from recon.voxels.beyond_field import run_on_extended_grid
 
@@ -73,7 +74,7 @@ def reconstruct(
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())
-    chosen = by_name(method)() if isinstance(method, str) else method
+    chosen = method_named(method) if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
     _refuse_geometry(geometry)

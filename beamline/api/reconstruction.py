@@ -36,11 +36,10 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
-from recon.auto import Auto
+from recon.auto import method_named
 from recon.base.choices import AUTO
 from recon.base.method import Method
 from recon.base.volume import Volume
-from recon.methods import by_name
 
 ReconResult = ReconRecord  # what scripts get
 
@@ -102,7 +101,7 @@ def _method(method: str | Method) -> Method:
     if not isinstance(method, str):
         return method
     try:
-        return Auto() if method == AUTO else by_name(method)()
+        return method_named(method)
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
 

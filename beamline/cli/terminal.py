@@ -278,6 +278,7 @@ def results(record: ReconRecord) -> str:
             **numbers
         ),
         "chosen": record.chosen,
+        "ended": record.parameters.get("ended"),
     }
     lines = [f"{name:<10}{text}" for name, text in rows.items() if text]
     return "\n".join([*lines, "", *_metrics_of(record)])

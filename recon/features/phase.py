@@ -20,7 +20,7 @@ from recon.base.volume import Grid
 from recon.voxels.choice import exceeds_standard_error, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter
 from recon.voxels.held_out import LEAST_VIEWS, predicted_views
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 from recon.voxels.voxel_problem import NORM
 
 _REACH = 4.0  # in units of the length; beyond it, the influence of a pixel is below exp(-4)
@@ -34,7 +34,7 @@ A filter that lowers it by 8 % removes half the depth of the thin cracks of a to
 """
 _FIRST, _LONGEST = 1.0, 64.0  # squared lengths in pixels²: start of the search, and largest
 _ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
-_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a test reconstruction with `FistaTv`
+_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a test reconstruction with `EarlyTv`
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def length_by_held_out_views(
     geometry = geometry.select(some).rows(rows.start, rows.stop)
     if matter := columns_of_matter(geometry, Grid.matching(geometry), views):
         views, known, geometry = views[:, :, matter[0]], known[:, matter[0]], matter[1]
-    method, grid = FistaTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
+    method, grid = EarlyTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
     weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
     norms: list[float] = []

@@ -25,13 +25,17 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.iterative import TrialWatch, Watch, solve_views
 from recon.voxels.methods import PnpDct
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct, pull_methods
+from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods
+from recon.voxels.priors import NoiseBalance, pnp_dct
 from recon.voxels.projector import Projector
-from recon.voxels.trial import SUBSETS, TV_STEPS, Trial, choose_patches, choose_weight
+from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
 """Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
+
+PULLED_SWEEPS = 16
+"""Of a pull to few materials after these."""
 
 _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
@@ -67,7 +71,7 @@ def level_of(beyond: F32) -> F32:
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
-    first, parts = GoesOn(problem.go_on), Subsets.of(problem, SUBSETS)
+    first, parts = GoesOn(problem.go_on), Subsets.of(problem, MANY_SUBSETS, damped=False)
     x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
     if not (first.going and strength):
         return x
@@ -89,13 +93,13 @@ class _Finish:
     planned: int = 0
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        trial = cache(partial(Trial.of, problem))
+        trial = cache(partial(Trial.of, problem, TrialSettings(early=True)))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
-        for method in pull_methods() if self.patches else ():
+        for method in pull_methods(iterations=PULLED_SWEEPS) if self.patches else ():
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                return method.pulled(problem, x, weight, materials, self.iterations) if first.going else x
+                return method.pulled(problem, x, weight, materials, self.iterations, False) if first.going else x
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0

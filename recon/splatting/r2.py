@@ -95,7 +95,8 @@ class R2(Fit):
         other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if other or self.early_stop or trial.prior is None:
             return trial.predicted(self)
-        return predict(self, trial, so_far, trial.prior)
+        weight = trial.early_weight
+        return predict(self, trial, so_far, trial.prior if weight is None else trial.prior._replace(weight=weight))
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that takes projections during a scan and starts with this number of Gaussians.

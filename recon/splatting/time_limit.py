@@ -14,16 +14,17 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, finish
+from recon.splatting.finish import FINISH_SWEEPS, PULLED_SWEEPS, finish
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
-from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
+from recon.voxels.choice import TRIALS
+from recon.voxels.held_out import EARLY_CHOICE_SWEEPS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pull_methods, subsets_of
+from recon.voxels.ordered_fista import MANY_SUBSETS, pull_methods, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.trial import SUBSETS, TV_STEPS
+from recon.voxels.trial import TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
@@ -49,7 +50,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
     projected = now()
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
-    parts = subsets_of(geometry, SUBSETS)
+    parts = subsets_of(geometry, MANY_SUBSETS, damped=False)
     return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
 
 
@@ -87,13 +88,13 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     if seconds <= 0:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
-    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
-    choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
+    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, damped=False) + _FIRST_SWEEPS) * sweep
+    choice, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried
-        most += patches.iterations * sweep + choice * (
-            patches.trial_sweeps + sum(method.refused_sweeps for method in pull_methods())
-        ) / CHOICE_SWEEPS  # fmt: skip
+        trials_of_patches = EARLY_CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * patches.trial_steps
+        refused = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
+        most += patches.iterations * sweep + choice * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
         room = min(seconds, beside_steps)
     if most <= room:
         return FinishPlan(None, most)

@@ -40,7 +40,7 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     """
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
-    smooth, best = trial.residuals_of_weight(prior.weight), so_far.least
+    smooth, best = trial.smooth_residuals, so_far.least
     left, remark = tried.refined(prior), ""
     leads = best is None or significantly_better(trial.in_line_integrals(left), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, left, FAR_BEHIND):
@@ -100,7 +100,7 @@ class _Fit:
         and otherwise would not be better than PnP-DCT alone either.
         """
         residuals = self._by(prior, 0.0)
-        if prior.patches and residuals.mean() < self.trial.residuals_of_weight(prior.weight).mean():
+        if prior.patches and residuals.mean() < self.trial.smooth_residuals.mean():
             return self._by(prior, prior.strength)
         return residuals
 

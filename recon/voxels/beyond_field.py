@@ -33,7 +33,7 @@ from recon.voxels.field_edges import (
     wider_than_field,
 )
 from recon.voxels.held_out import LEAST_VIEWS
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 from recon.voxels.projector import Projector
 from recon.voxels.residuals import residuals_of
 
@@ -226,6 +226,6 @@ class _Trial:
     def of_radius(self, radius: float) -> tuple[F64, float]:
         """Residual [view held out] of a box that reaches so far, and the mean density in the middle of the field."""
         grid = self.box.reaching(radius, self.seen.geometry)
-        method = FistaTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
+        method = EarlyTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
         volume = method.run(ReconProblem(self.seen, grid), RunControl()).volume
         return residuals_of(volume, self.unseen), _middle_density(volume, self.seen.geometry.reach)

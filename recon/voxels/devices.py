@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from scipy.fft import irfft2, rfft2
 
 from recon.base.arrays import F32
 from recon.base.choices import refuse_unknown_device
 from recon.base.registry import loaded
-from recon.kernels.cpu import patches, tv, vectors
+from recon.kernels.cpu import patches, tents, tv, vectors
 from recon.kernels.cpu.tv import Weights
 from recon.voxels.projector import Projector, views_of_exposure
 
@@ -53,6 +54,15 @@ class VoxelDevice(Protocol[Array]):
     ) -> float: ...
     def turn_of_steps(self, before: Array, start: Array, end: Array) -> float: ...
     def extrapolate(self, x: Array, factor: float, last: Array, start: Array) -> None: ...
+    def dot(self, a: Array, b: Array) -> float: ...
+    def norm(self, x: Array) -> float: ...
+
+    def tent_sums(self, x: Array, width: int) -> Array: ...
+    def add_tents(self, x: Array, factor: float, cells: Array, width: int) -> None: ...
+
+    def filtered(self, cells: Array, transfer: F32) -> Array:
+        """Cells [a, b, z] after a filter [a, b of rfft2] along a and b."""
+
     def dual_field(self, shape: tuple[int, int, int]) -> Any: ...
     def dual_scratch(self, shape: tuple[int, int, int]) -> Any: ...
 
@@ -81,6 +91,8 @@ class CpuVolumes:
     replace_by_residual, add_product = staticmethod(vectors.replace_by_residual), staticmethod(vectors.add_product)
     maximum = np.maximum
     turn_of_steps = staticmethod(vectors.turn_of_steps)
+    dot, norm = staticmethod(vectors.dot), staticmethod(vectors.norm)
+    tent_sums, add_tents = staticmethod(tents.tent_sums), staticmethod(tents.add_tents)
     dual_field, dual_scratch = staticmethod(tv.dual_field), staticmethod(tv.dual_scratch)
     dual_step, primal = staticmethod(tv.dual_step), staticmethod(tv.primal)
     patch_scratch, denoise = staticmethod(patches.patch_scratch), staticmethod(patches.denoise)
@@ -97,6 +109,11 @@ class CpuVolumes:
 
     def copy(self, array: F32) -> F32:
         return array.copy()
+
+    def filtered(self, cells: F32, transfer: F32) -> F32:
+        waves = rfft2(cells, axes=(0, 1))
+        waves *= transfer[:, :, None]
+        return np.ascontiguousarray(irfft2(waves, cells.shape[:2], axes=(0, 1)), np.float32)
 
 
 CPU: VoxelDevice[Any] = CpuVolumes()

@@ -13,25 +13,31 @@ from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid
 from recon.voxels.choice import TRIALS
+from recon.voxels.ordered_fista import USUAL_SWEEPS
 from recon.voxels.projector import Projector
 
 TRIAL_SWEEPS = 20
-"""Sweeps of total variation in a trial, and by default of `FistaTv`: a trial that gets less far than its volume prefers
-a heavier weight, one that gets further a lighter one."""
+"""Sweeps of total variation in the trial of a finish, and of `EarlyTv`: a trial that gets less far than its volume
+prefers a heavier weight, one that gets further a lighter one."""
 
 LEAST_VIEWS = 2 * ONE_IN
 
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
-"""Sweeps of trials for a weight, as a rule."""
+CHOICE_SWEEPS, EARLY_CHOICE_SWEEPS = TRIALS * USUAL_SWEEPS, TRIALS * TRIAL_SWEEPS
+"""Sweeps of trials for a weight, as a rule: until volumes stand still, and of a finish."""
 
 
-def choice_sweeps(geometry: Geometry) -> float:
-    """Cost of `choose_weight` in sweeps over all rows: four trials as a rule; 0 if no view is held out."""
+def choice_sweeps(geometry: Geometry, early: bool = False) -> float:
+    """Cost of `choose_weight` in sweeps over all rows: four trials as a rule; 0 if no view is held out.
+
+    Args:
+        early: of a finish.
+    """
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
-    return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
+    sweeps = EARLY_CHOICE_SWEEPS if early else CHOICE_SWEEPS
+    return sweeps * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
 
 def predicted_views(

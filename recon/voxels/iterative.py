@@ -197,6 +197,15 @@ class VoxelMethod(Iterative):
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """See `Iterating`."""
 
+    @property
+    def usual_sweeps(self) -> int:
+        """Usual number of iterations; fewer than `iterations` if the volume stands still before."""
+        return self.iterations
+
+    def refit(self, share: float) -> VoxelMethod:
+        """The method with this share of its iterations, from a finished volume, as error bars need it."""
+        return replace(self, iterations=max(1, round(share * self.iterations)))
+
     def toy(self) -> Self:
         return replace(self, iterations=1)
 

@@ -31,7 +31,8 @@ from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.iterative import Iterating, solve
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
+from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
@@ -45,7 +46,7 @@ _GAPS_ERROR = 0.46  # likewise with gaps between views, where exponents from 0.4
 _SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
-_SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
+_SWEEPS, _TV_STEPS, _TRIAL_VIEWS = 8, 3, 64
 _LEAST_FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
 _CIRCLE = 0.95  # of the field's radius, where errors count
@@ -134,7 +135,7 @@ class _TotalVariation:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
-        subsets = Subsets.of(problem, _SUBSETS)
+        subsets = Subsets.of(problem, MANY_SUBSETS, damped=False)
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from recon.base.arrays import F32
+from recon.base.choices import Quality
 from recon.base.decisions import GoesOn, Prior
-from recon.base.empirical import FEWEST_SUBSETS
+from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
 from recon.base.setting import Count, Natural, NonNegative
@@ -19,7 +20,8 @@ from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
+from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance, pnp_dct
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     NORM,
@@ -40,12 +42,16 @@ class FistaTv(VoxelMethod):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.priors`. Memory: 7 volumes,
     2 x the projections.
 
+    The sweeps end where the volume stands still: about 20 of 180 views, 35 of 30.
+
     Attributes:
-        iterations: passes over all views.
+        iterations: passes over all views, at most.
         tv_weight: None chooses μ by views held out, or by the noise of the data, see `choose_weight`; a number is the
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
-        subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
+        subsets: of the views, a step each in the first sweeps, at most.
         tv_steps: dual steps of total variation in each step.
+        still: share of the norm of the volume by which four sweeps together change it where it stands still; 0: all
+            iterations are made.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -55,16 +61,36 @@ class FistaTv(VoxelMethod):
     error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
     buffers: ClassVar[Buffers] = Buffers(7.3, 3.0, 4.8, filtered=True)
 
-    iterations: Count = TRIAL_SWEEPS
+    iterations: Count = MOST_SWEEPS
     tv_weight: NonNegative | None = None
-    subsets: Count = 9
+    subsets: Count = SUBSETS
     tv_steps: Count = 3
+    still: NonNegative = STANDS_STILL
     allow_negative: bool = False
+
+    damped: ClassVar[bool] = True
 
     @property
     def trial_sweeps(self) -> int:
         """Sweeps of the trials that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
+
+    @property
+    def usual_sweeps(self) -> int:
+        """Passes until the volume stands still, as a rule."""
+        return min(self.iterations, USUAL_SWEEPS)
+
+    def refit(self, share: float) -> VoxelMethod:
+        """Early iterations on subsets, with this share of their number."""
+        given = {each.name: getattr(self, each.name) for each in fields(FistaTv)}
+        subsets, iterations = EarlyTv.subsets, max(1, round(share * EarlyTv.iterations))
+        return EarlyTv(**given | {"subsets": subsets, "iterations": iterations})
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """A volume that is nearer its end, or further from it."""
+        factor = {"preview": 4.0, "standard": 1.0, "best": 0.25}[quality]
+        most = MOST_SWEEPS * 4 if quality == "best" else self.iterations
+        return replace(self, still=factor * self.still, iterations=max(self.iterations, most))
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best weight; with one of its own that of the method's volume."""
@@ -85,17 +111,30 @@ class FistaTv(VoxelMethod):
         weight: NoiseBalance | float
         unit = density_unit(x)
         if self.tv_weight is None:
-            weight = choose_weight(problem, x, self.iterations, trial)
+            weight = choose_weight(problem, x, self.usual_sweeps, trial)
         else:
             share, rays = self.tv_weight, problem.weight
             norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
             weight = problem.decide("weight", lambda: share * unit * norm)
-        subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
-        x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
+        subsets = Subsets.of(problem, self.subsets, self.damped)
+        x = ordered_fista(
+            problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
+        )  # fmt: skip
         if self.tv_weight is None and unit > 0:
             used = weight.value if isinstance(weight, NoiseBalance) else weight
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
+
+
+@dataclass(frozen=True)
+class EarlyTv(FistaTv):
+    """`FistaTv` with so many sweeps on subsets, which end before the volume stands still: volumes that are compared
+    with each other, and need not be finished."""
+
+    iterations: Count = TRIAL_SWEEPS
+    subsets: Count = MANY_SUBSETS
+
+    damped: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -186,12 +225,12 @@ class PnpDct(VoxelMethod):
     patch_threshold: NonNegative | None = None
     allow_negative: bool = False
 
-    first_sweeps: ClassVar[int] = FistaTv.iterations
+    first_sweeps: ClassVar[int] = MOST_SWEEPS
 
     @property
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * self.trial_steps
+        return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
     def trial_steps(self) -> int:

@@ -1,21 +1,17 @@
-"""Steps with a prior: ordered-subset FISTA with total variation, its weight by the noise, and sparse patches."""
+"""Priors: the weight of total variation by the noise, and steps with sparse patches."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.base.arrays import F32, median_deviation
 from recon.base.empirical import (
     FALL,
     HALF_OF_MANY,
-    LEAST_OF_SUBSET,
     MANY_VIEWS,
     MOST_BY_RESIDUAL,
     PULL,
@@ -24,19 +20,13 @@ from recon.base.empirical import (
 )
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure
-from recon.base.registry import MethodEntry, in_folders, loaded
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
-from recon.voxels.projector import Projector
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import (
-    Momentum,
-    TotalVariationProx,
     VoxelProblem,
     density_unit,
     difference_weights,
-    interleaved,
-    largest_eigenvalue,
     whitened,
 )
 
@@ -115,133 +105,6 @@ def _by_views(geometry: Geometry) -> float:
     """Factor on the noise by the number of views, over those that determine a slice: π / 2 a column."""
     determined = min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
     return 1 + MANY_VIEWS * min(max(determined / HALF_OF_MANY - 1, 0.0), 1.0)
-
-
-_LOOKED_AT = 9  # views of a sweep whose residual is looked at
-
-
-@dataclass(frozen=True, eq=False)
-class Subsets:
-    """Subsets of the views of a problem, which all runs with these views and weights can share.
-
-    Attributes:
-        views: indices, of each subset.
-        projectors: of these views.
-        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
-        plain_norm: the same eigenvalue, of the projector that is not sharpened.
-    """
-
-    views: Sequence[NDArray[np.intp]]
-    projectors: Sequence[Projector]
-    step: float
-    plain_norm: float
-
-    @classmethod
-    def of(cls, problem: VoxelProblem, most: int, fewest: int = 1) -> Subsets:
-        """At most `most` subsets of the views; see `subsets_of`."""
-        projector, weight = problem.projector, problem.weight
-        count, heaviest = subsets_of(projector.geometry, most, fewest), 0
-        views = interleaved(projector, count)
-        projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
-        rays = [None if weight is None else weight[some] for some in views] if count > 1 else [weight]
-        if weight is not None:
-            heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
-        norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
-        gain = max(part.gain(some) for part, some in zip(projectors, rays, strict=True))
-        whole = problem.with_all_columns
-        step = Subsets.of(whole(), most, fewest).step if whole else 1 / (norm * gain)
-        return cls(views, projectors, step, norm)
-
-
-RENEWED = 2
-"""Sweeps after which the volume is made anew towards which steps are pulled."""
-
-
-# Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
-PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
-
-
-def pull_methods(**settings: Any) -> list[Any]:
-    """The methods of `PULLS`, with these settings."""
-    return [getattr(loaded(entry.module), entry.cls)(**settings) for entry in PULLS.values()]
-
-
-class Pull(Protocol):
-    """A volume z that follows x, towards which each step of `ordered_fista` moves a share of the way.
-
-    Attributes:
-        share: c of c (z - x).
-    """
-
-    @property
-    def share(self) -> float: ...
-
-    def target(self, x: F32) -> F32:
-        """z [y, x, z] for a volume x, which is not changed."""
-
-
-def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
-    pull: Pull | None = None,
-) -> F32:  # fmt: skip
-    """min ½||A x - p||² + μ TV(x), x >= 0, by steps from a subset of the views each, with momentum and restarts.
-
-        x <- prox_{μ/L TV}(y + (m / L) A_sᵀ W (p_s - A_s y)),    L >= the largest eigenvalue of AᵀWA, m subsets
-
-    (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183;
-    O'Donoghue & Candès 2015). With one subset this is FISTA and converges; with more it is faster by about their
-    number at first, and ends near the minimum. Memory: 7 volumes, 2 x the projections.
-
-    Args:
-        x: [y, x, z], not zero; overwritten.
-        weight: μ, or an object that chooses it after each sweep.
-        tv_steps: dual steps of each proximal step, which continue from the last ones.
-        pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is minimised, too.
-    """
-    device, step, count = voxel_device(problem.projector.device), subsets.step, len(subsets.views)
-    prox = TotalVariationProx(
-        x.shape, difference_weights(problem.projector.grid), problem.nonnegative, tv_steps, device
-    )
-    scale, projectors = problem.scale, [projector_on(device, part) for part in subsets.projectors]
-    views, weights = device.array(problem.data), None if problem.weight is None else device.array(problem.weight)
-    x = device.array(x)
-    gradient, ahead = device.copy(x), Momentum(x, problem.decide, device)
-    for k in range(sweeps):
-        error, seen = 0.0, []
-        if pull is not None and k % RENEWED == 0:
-            target = device.array(pull.target(device.numpy(x)))
-        for at, s in enumerate(problem.rng.permutation(count)):
-            part = slice(None) if count == 1 else subsets.views[s]
-            data, rays = views[part], None if weights is None else weights[part]
-            mu = weight.value if isinstance(weight, NoiseBalance) else weight
-            residual = projectors[s].forward_lines(x)
-            error += device.replace_by_residual(data, residual, rays)
-            if isinstance(weight, NoiseBalance):
-                some = slice(None, None, max(1, count * len(residual) // _LOOKED_AT))
-                unweighted = np.array(device.numpy(residual[some]))
-                seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[some])))
-            if rays is not None:
-                residual *= rays
-            projectors[s].adjoint_lines(residual, gradient)
-            device.combine(1.0 if pull is None else 1.0 - pull.share, x, step, gradient, x)
-            if pull is not None:
-                device.combine(1.0, x, pull.share, target, x)
-            prox(x, mu * step / count)
-            prox.turn()
-            if at + 1 < count:
-                ahead(x)
-        if isinstance(weight, NoiseBalance):
-            weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(seen)))
-        if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == sweeps:
-            break
-        ahead(x)
-    return device.numpy(x)
-
-
-def subsets_of(geometry: Geometry, most: int, fewest: int = 1) -> int:
-    """Number of subsets: of `LEAST_OF_SUBSET` views or more; from that many views on at least `fewest`."""
-    whole = geometry.n_views // LEAST_OF_SUBSET
-    return max(1, min(most, max(whole, fewest) if whole else 1))
 
 
 STEPS = 5

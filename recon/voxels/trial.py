@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions, Prior
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
+from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
 from recon.base.registry import LibraryError
@@ -27,13 +27,22 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoice, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
-from recon.voxels.priors import NoiseBalance, Pull, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.ordered_fista import (
+    MANY_SUBSETS,
+    MOST_SWEEPS,
+    SUBSETS,
+    Pull,
+    Subsets,
+    ordered_fista,
+    subsets_of,
+)
+from recon.voxels.priors import NoiseBalance, noise_of_volume, pnp_dct
 from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 _WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
-SUBSETS, TV_STEPS = 9, 3  # of a trial, and of the finish of a fit
+TV_STEPS = 3  # of a trial, and of the finish of a fit
 PATCH_STEPS = 35
 """Steps with sparse patches of a trial, and by default of `PnpDct`."""
 
@@ -133,10 +142,12 @@ class TrialSettings:
         all_rows: words for the rows of a trial of all of them, as of a cone whose middle shows little matter. Pixels
             may be joined for it, so that its priors are not those of the volume. Empty: a trial of some rows.
         now: the clock.
+        early: sweeps as of a finish, which begins with a fit and ends early; else until volumes stand still.
     """
 
     all_rows: str = ""
     now: Clock = time.perf_counter
+    early: bool = False
 
 
 _USUAL = TrialSettings()
@@ -183,8 +194,9 @@ class Trial:
     ) -> None:  # fmt: skip
         self.scan, self.problem, self.start = scan, replace(slab, go_on=self._go_on), start
         self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
-        subsets = subsets_of(scan.projector.geometry, SUBSETS, FEWEST_SUBSETS)
-        self._subsets = Subsets.of(slab, subsets, subsets)
+        early, geometry = settings.early, scan.projector.geometry
+        count = subsets_of(geometry, MANY_SUBSETS if early else SUBSETS, damped=not early)
+        self._subsets = Subsets.of(slab, count, damped=not early)
         self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None
@@ -294,6 +306,23 @@ class Trial:
         return None if isinstance(weight, NoiseBalance) else weight
 
     @property
+    def smooth_residuals(self) -> F64:
+        """Residuals for total variation of the weight chosen.
+
+        Raises:
+            ValueError: none was chosen.
+        """
+        if self.weight is None:
+            raise ValueError("no weight of total variation could be chosen")
+        return self.residuals_of_weight(self.weight)
+
+    @cached_property
+    def early_weight(self) -> float | None:
+        """The weight of total variation for a finish, which ends early: a heavier one. None: as of `weight`."""
+        early = Trial.of(self.scan, replace(self.settings, early=True))
+        return None if early is None else early.weight
+
+    @property
     def wide(self) -> bool:
         """Whether the sample goes on beyond the field, or the box is wider than that by a tenth: patches are not tried.
 
@@ -379,11 +408,16 @@ class Trial:
         return self._known.get(("patches", strength))
 
     def volume_of_weight(
-        self, weight: float, start: F32 | None = None, sweeps: int = TRIAL_SWEEPS, pull: Pull | None = None
+        self, weight: float, start: F32 | None = None, sweeps: int | None = None, pull: Pull | None = None
     ) -> F32:
-        """The volume of total variation with this weight, `start` and `pull` as of `volume_by` and `ordered_fista`."""
+        """The volume of total variation with this weight, `start` and `pull` as of `volume_by` and `ordered_fista`.
+
+        Args:
+            sweeps: at most; None: until the volume stands still, or as of a finish.
+        """
+        most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=sweeps, tv_steps=TV_STEPS, pull=pull
+            part, x, weight, self._subsets, sweeps=most, tv_steps=TV_STEPS, pull=pull, still=STILL_IN_TRIAL
         ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:

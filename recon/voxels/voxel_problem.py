@@ -268,10 +268,13 @@ class Momentum:
     """Nesterov's extrapolation between the steps of a descent; it starts anew when it points uphill.
 
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes. Arrays are those of a device.
+
+    Args:
+        most: share of the last step that is added, at most.
     """
 
-    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU) -> None:
-        self._decide, self._device = decide, device
+    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU, most: float = 1.0) -> None:
+        self._decide, self._device, self._most = decide, device, most
         self._last, self._from, self._t = device.copy(start), device.copy(start), 1.0
 
     def __call__(self, x: Any) -> None:
@@ -279,7 +282,7 @@ class Momentum:
         if self._decide("restart", lambda: self._device.turn_of_steps(self._last, self._from, x) > 0):
             self._t = 1.0
         after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
-        self._device.extrapolate(x, (self._t - 1) / after, self._last, self._from)
+        self._device.extrapolate(x, min((self._t - 1) / after, self._most), self._last, self._from)
         self._t = after
 
 
@@ -291,13 +294,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     matched projector has negative entries: the bound is that of the plain one, times `Projector.gain`.
     Where each row sees one slice, and all rows are alike, it is computed on one row: a half to a fifth of the time.
     """
-    geometry, slices = projector.geometry, projector.grid.shape[0]
-    alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
-    if alike and slices > 1:
-        some, grid = geometry.rows(0, 1), projector.grid
-        centre = (Grid.matching(some).centre[0], *grid.centre[1:])
-        box = replace(grid, shape=(1, *grid.shape[1:]), centre=centre)
-        projector = replace(projector, geometry=some, grid=box)
+    projector = one_of_like_rows(projector, weight)
     gain, projector, device = projector.gain(weight), projector.plain, voxel_device(projector.device)
     lines, (nz, ny, nx) = projector_on(device, projector), projector.grid.shape
     rays = None if weight is None else device.array(weight)
@@ -314,6 +311,17 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
             return math.inf  # no ray meets the box
         x = product / product.max()
     return gain * bound
+
+
+def one_of_like_rows(projector: Projector, weight: F32 | None) -> Projector:
+    """The projector of one row, where rays have no `weight` and all rows are alike; else the projector itself."""
+    geometry, slices = projector.geometry, projector.grid.shape[0]
+    alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
+    if not (alike and slices > 1):
+        return projector
+    some, grid = geometry.rows(0, 1), projector.grid
+    centre = (Grid.matching(some).centre[0], *grid.centre[1:])
+    return replace(projector, geometry=some, grid=replace(grid, shape=(1, *grid.shape[1:]), centre=centre))
 
 
 def slices_are_rows(projector: Projector) -> bool:

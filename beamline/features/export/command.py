@@ -189,7 +189,7 @@ def _of_material(record: ReconRecord, number: int) -> ReconRecord:
     """
     from recon.base.registry import loaded
     from recon.base.volume import Volume
-    from recon.voxels.priors import PULLS
+    from recon.voxels.ordered_fista import PULLS
 
     pulled: Any = next((getattr(loaded(entry.module), entry.cls) for entry in PULLS.values()), None)
     known = pulled is not None and record.kind is not VoxelKind.SHARE

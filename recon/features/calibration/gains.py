@@ -25,7 +25,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.field_edges import busiest_rows
 from recon.voxels.iterative import solve
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import Buffers, bytes_of
 
@@ -158,7 +158,7 @@ class _Band:
         decide, gains_so_far, volume = Decisions(), np.zeros(self.data.shape[1:], np.float32), None
         data = self.data[seen]
         for at in range(_ROUNDS):
-            method = FistaTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
+            method = EarlyTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
             if gains and at + 1 < _ROUNDS:
                 left = ring_offsets(data - projector.forward(volume.data), views) * self._told_apart()

@@ -22,7 +22,7 @@ from recon.base.volume import Grid
 from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
 from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.held_out import predicted_views
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 
 _ONE_IN = 4  # one in this many projections is held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
@@ -50,7 +50,7 @@ class Judge:
 
     def deviations(self, geometry: Geometry) -> F64:
         """[held-out projection] root mean square residual for a volume from the other projections in this geometry."""
-        method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
+        method, rows = EarlyTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
         weights = None if self.known is None else np.broadcast_to(self.known, self.views.shape)
         unseen, images = predicted_views(method, Views(self.views, geometry, weights), self.grid, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()

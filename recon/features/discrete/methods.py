@@ -12,7 +12,6 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn, MaterialPrior, Prior
-from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.method import Plain
 from recon.base.setting import Count
 from recon.base.volume import Volume
@@ -21,10 +20,11 @@ from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabili
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.methods import FistaTv
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
+from recon.voxels.methods import EarlyTv, FistaTv
+from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
-from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
+from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
@@ -33,6 +33,7 @@ MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
 of the middle between two levels).
 """
+REFIT_SWEEPS = 16  # of error bars, in all
 _TRIALS = 6  # usual number of test reconstructions with levels
 
 
@@ -48,7 +49,7 @@ class Discrete(VoxelMethod):
     projections to hold any out. If it starts from a first volume, it uses total variation alone.
 
     Attributes:
-        iterations: iterations over all projections after those of FISTA-TV.
+        iterations: largest number of iterations over all projections after those of FISTA-TV.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
             voxels are pulled weakly to given levels.
     """
@@ -59,9 +60,9 @@ class Discrete(VoxelMethod):
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 3.0, 0.2
     buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
-    first_sweeps: ClassVar[int] = FistaTv.iterations
+    first_sweeps: ClassVar[int] = MOST_SWEEPS
 
-    iterations: Count = 16
+    iterations: Count = MOST_SWEEPS
     levels: tuple[float, ...] | None = None
     allow_negative: bool = False
 
@@ -70,15 +71,24 @@ class Discrete(VoxelMethod):
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
+    def refit(self, share: float) -> VoxelMethod:
+        """Early iterations of total variation, with this share of the number that a finish makes."""
+        return EarlyTv(iterations=max(1, round(share * REFIT_SWEEPS)), allow_negative=self.allow_negative)
+
+    @property
+    def usual_sweeps(self) -> int:
+        """Usual number of iterations until the volume stands still."""
+        return min(self.iterations, USUAL_SWEEPS)
+
     @property
     def trial_sweeps(self) -> int:
         """Iterations of the test reconstructions for the weight of total variation and for the levels."""
-        return CHOICE_SWEEPS + _TRIALS * self.iterations
+        return CHOICE_SWEEPS + _TRIALS * self.usual_sweeps
 
     @property
     def refused_sweeps(self) -> int:
         """Usual number of test iterations after which discrete levels are rejected and PnP-DCT may be tried."""
-        return len(COUNTS) * self.iterations
+        return len(COUNTS) * self.usual_sweeps
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
@@ -112,7 +122,7 @@ class Discrete(VoxelMethod):
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return FistaTv(iterations=self.iterations).iterate(problem, x)
+            return EarlyTv(iterations=self.iterations).iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         materials = self.materials(problem, weight, trial)
@@ -137,13 +147,15 @@ class Discrete(VoxelMethod):
         return materials if materials.levels else None
 
     def pulled(
-        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int
-    ) -> F32:
-        """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before."""
+        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int,
+        damped: bool = True,
+    ) -> F32:  # fmt: skip
+        """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
+        `damped` as in `Subsets.of`."""
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
-        subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
+        subsets = Subsets.of(problem, SUBSETS if damped else MANY_SUBSETS, damped)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
             pull=MaterialPull(drawn_apart(materials), where, thin),

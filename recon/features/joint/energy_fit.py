@@ -19,7 +19,7 @@ from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.priors import subsets_of
+from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
@@ -162,7 +162,7 @@ class EnergyFit:
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
         self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # empty projections have the residual 0
-        subset = views.parted(subsets_of(views.geometry, _SUBSETS))
+        subset = views.parted(subsets_of(views.geometry, _SUBSETS, damped=False))
         self.subsets = []
         for number in range(subset.max() + 1):
             own = [np.flatnonzero((subset == number) & (views.energy == e)) for e in range(counts.size)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
@@ -32,6 +34,11 @@ def dot(a: F32, b: F32) -> float:
     sums = np.empty(get_num_threads())
     _dot(a.reshape(-1), b.reshape(-1), sums)
     return float(sums.sum())
+
+
+def norm(x: F32) -> float:
+    """The root of <x, x>."""
+    return math.sqrt(dot(x, x))
 
 
 @njit(**OPTIONS)

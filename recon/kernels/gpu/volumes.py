@@ -21,6 +21,7 @@ from torch.nn.functional import hardshrink
 from recon.base.arrays import F32
 from recon.kernels.cpu.patches import EDGE
 from recon.kernels.cpu.spread import passes_of
+from recon.kernels.cpu.tents import cells_of, tents
 from recon.kernels.cpu.tv import Weights, dual_pace
 from recon.kernels.gpu import require
 
@@ -73,6 +74,67 @@ def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
         turn = (start[some] - end[some]).mul_(end[some] - before[some])
         total += turn.sum(dtype=torch.float64)
     return float(total)
+
+
+def dot(a: Tensor, b: Tensor) -> float:
+    """<a, b> of two arrays of one shape, summed in float64."""
+    total = torch.zeros((), dtype=torch.float64, device=a.device)
+    for some in _parts(a, copies=1):
+        total += (a[some] * b[some]).sum(dtype=torch.float64)
+    return float(total)
+
+
+def norm(x: Tensor) -> float:
+    """The root of <x, x>."""
+    return math.sqrt(dot(x, x))
+
+
+def tent_sums(x: Tensor, width: int) -> Tensor:
+    """A volume [y, x, z] to the sums of its coarse cells [a, b, z]; see `cpu.tents`."""
+    for axis in (0, 1):
+        x = _summed(x, axis, width)
+    return x.contiguous()
+
+
+def _summed(x: Tensor, axis: int, width: int) -> Tensor:
+    """Sums with tents along one axis, of one voxel of each cell at a time."""
+    n = x.shape[axis]
+    count, (first, share) = cells_of(n, width), tents(n, width)
+    size = list(x.shape)
+    size[axis] = count + 1
+    out = x.new_zeros(size)
+    for begin in range(width):
+        some = range(begin, n, width)  # voxels whose cells differ, so that no sum depends on an order
+        cells, weight = first[some.start :: width], torch.from_numpy(share[some.start :: width]).to(x.device)
+        for shift in (0, 1):
+            new = np.unique(cells + shift, return_index=True)[1]
+            for part in (new, np.setdiff1d(np.arange(len(cells)), new)):  # outer cells may hold two of them
+                if part.size:
+                    here = torch.from_numpy(part).to(x.device)
+                    line = [1, 1, 1]
+                    line[axis] = part.size
+                    factor = (weight[here] if shift else 1 - weight[here]).reshape(line)
+                    at = torch.from_numpy((cells + shift)[part]).to(x.device)
+                    given = x.index_select(axis, here * width + begin) * factor
+                    out.index_copy_(axis, at, out.index_select(axis, at) + given)
+    return out.narrow(axis, 0, count)
+
+
+def add_tents(x: Tensor, factor: float, cells: Tensor, width: int) -> None:
+    """x += factor times the cells [a, b, z], interpolated between their centres. Memory: one volume."""
+    for axis in (1, 0):
+        first, share = (torch.from_numpy(each).to(x.device) for each in tents(x.shape[axis], width))
+        line = [1, 1, 1]
+        line[axis] = -1
+        after = (first + 1).clamp(max=cells.shape[axis] - 1)
+        cells = torch.lerp(cells.index_select(axis, first), cells.index_select(axis, after), share.reshape(line))
+    x.add_(cells, alpha=factor)
+
+
+def filtered(cells: Tensor, transfer: F32) -> Tensor:
+    """Cells [a, b, z] after a filter [a, b of rfft2] along a and b."""
+    waves = torch.fft.rfft2(cells, dim=(0, 1)) * torch.from_numpy(transfer).to(cells.device)[:, :, None]
+    return torch.fft.irfft2(waves, s=cells.shape[:2], dim=(0, 1))
 
 
 def extrapolate(x: Tensor, factor: float, last: Tensor, start: Tensor) -> None:
@@ -251,6 +313,8 @@ class GpuVolumes:
     combine, replace_by_residual = staticmethod(combine), staticmethod(replace_by_residual)
     maximum, add_product = staticmethod(maximum), staticmethod(add_product)
     turn_of_steps, spread = staticmethod(turn_of_steps), staticmethod(spread)
+    dot, norm = staticmethod(dot), staticmethod(norm)
+    tent_sums, add_tents, filtered = staticmethod(tent_sums), staticmethod(add_tents), staticmethod(filtered)
     extrapolate, pulled_step = staticmethod(extrapolate), staticmethod(pulled_step)
     dual_step, primal, denoise = staticmethod(dual_step), staticmethod(primal), staticmethod(denoise)
 

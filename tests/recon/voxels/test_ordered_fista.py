@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.priors import Subsets, ordered_fista
+from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 

@@ -252,6 +252,8 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     lines = Projector(geometry, Grid.matching(geometry)).forward(truth)
     data = lines + rng.normal(0, 0.3, lines.shape).astype(np.float32)
     weights = np.where(lines > 0, 0.2, 1).astype(np.float32) if weighted else None
+    monkeypatch.setattr("recon.voxels.trial.STILL_IN_TRIAL", 0.0005)  # volumes are known to that share
+    monkeypatch.setattr("recon.voxels.trial.MOST_SWEEPS", 300)
     narrow = _trial_of(data, geometry, weights)
     monkeypatch.setattr("recon.voxels.trial.columns_of_matter", lambda *_: None)
     wide = _trial_of(data, geometry, weights)
@@ -259,7 +261,7 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     assert off > 5
     matter = np.hypot(x, y)[0, off:-off, off:-off] < 18
     for make in (
-        lambda trial: trial.volume_of_weight(0.02),
+        lambda trial: trial.volume_of_weight(0.005),
         lambda trial: trial.volume_by(lambda part, first: pnp_dct(part, first, 0.01, steps=15)),
     ):
         few, many = make(narrow)[matter], make(wide)[off:-off, off:-off][matter]

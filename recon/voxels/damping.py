@@ -1,0 +1,125 @@
+"""Damping: longer steps for fine detail, whose eigenvalues are small, than for coarse shapes, whose are large.
+
+The eigenvalue of AᵀA of a wave of f cycles a side falls as 1 / f. A step that is safe for the coarsest shapes is short
+for fine detail, which then needs hundreds of sweeps. Here coarse shapes are damped: with L that keeps them and lets
+fine detail go, steps follow P g = gain (1 - L) g, up to `gain` times as long for fine detail.
+
+    L(f) = 1 - clip(f / 2 cycles a side, 1, gain) / gain
+
+L acts on coarse cells of the slice plane (tents of `recon.kernels.cpu.tents`), so that it costs little beside a
+projection, and on each slice alone, so that slabs do not depend on each other. (Preconditioners for tomography: Fessler
+& Booth 1999, IEEE Trans. Image Process. 8, 688, eq. 24. Proximal steps in another metric: Combettes & Vũ 2014.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigh_tridiagonal
+
+from recon.base.arrays import F32
+from recon.kernels.cpu.tents import cells_of, least_width, spectrum_of_tents
+from recon.voxels.devices import VoxelDevice, projector_on, voxel_device
+from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import one_of_like_rows
+
+_CELLS = 64  # along the longer side, at most: what is finer is not damped
+_UNDAMPED, _MOST = 2.0, 32.0  # cycles a side from which steps are longer; the largest gain
+_GAIN_A_VIEW = 2 / 3  # more detail than views resolve would only raise noise
+_LEAST_OF_TENTS = 0.2  # of a wave, that tents leave, below which it is not made up for
+_LANCZOS_STEPS, _MARGIN = 8, 1.1  # they err to the lower side
+_NOTHING = 1e-6  # rounding
+
+
+@dataclass(frozen=True)
+class Damping:
+    """L of volumes of one shape.
+
+    Attributes:
+        shape: [y, x, z] of a volume.
+        gain: of the finest detail over the coarsest shapes; 1: L is zero.
+    """
+
+    shape: tuple[int, int, int]
+    gain: float
+
+    @classmethod
+    def of(cls, shape: tuple[int, int, int], n_views: int) -> Damping:
+        """The damping for steps from so many views."""
+        return cls(shape, min(max(_GAIN_A_VIEW * n_views, 1.0), _MOST))
+
+    @property
+    def width(self) -> int:
+        """Voxels of a cell."""
+        return least_width(max(self.shape[:2]), _CELLS)
+
+    @cached_property
+    def _transfer(self) -> F32:
+        """[a, b of rfft2] what L leaves of a wave in the sums of cells."""
+        rows, cols = (cells_of(n, self.width) for n in self.shape[:2])
+        down = np.fft.fftfreq(rows) * rows
+        across = np.fft.rfftfreq(cols) * cols
+        given = ((down, rows), (across, cols))
+        kept = [
+            np.maximum(spectrum_of_tents(f.astype(np.float64), n * self.width, self.width), _LEAST_OF_TENTS)
+            for f, n in given
+        ]
+        side = max(rows, cols)
+        cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
+        left = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
+        left = np.minimum(left / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L keeps less than all
+        return (left / self.width**2).astype(np.float32)
+
+    def cells(self, device: VoxelDevice[Any], x: Any) -> Any:
+        """The sums of a volume [y, x, z] in coarse cells, on which L acts."""
+        return device.tent_sums(x, self.width)
+
+    def take_off(self, device: VoxelDevice[Any], x: Any, cells: Any) -> None:
+        """x -= L of what has these `cells`, in place."""
+        device.add_tents(x, -1.0, device.filtered(cells, self._transfer), self.width)
+
+
+def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -> float:
+    """An upper estimate of the largest eigenvalue of gain (1 - L) AᵀWA: by Lanczos' steps, from noise.
+
+    It is that of the symmetric √W A gain (1 - L) Aᵀ √W. Where all rows are alike it is computed on one of them.
+    (Lanczos 1950, J. Res. Natl. Bur. Stand. 45, 255; from a random vector: Kuczyński & Woźniakowski 1992, SIAM J.
+    Matrix Anal. Appl. 13, 1094.)
+    """
+    device = voxel_device(projector.device)
+    plain = one_of_like_rows(projector.plain, weight)
+    lines, (nz, ny, nx) = projector_on(device, plain), plain.grid.shape
+    here = replace(damping, shape=(ny, nx, nz))
+    root = None if weight is None else device.array(np.sqrt(weight))
+    noise = np.random.default_rng(0).standard_normal(_ray_shape(plain), np.float32)
+    q = device.array(noise if weight is None else noise * (weight > 0))
+    size, before = device.norm(q), device.zeros(noise.shape)
+    diagonal, beside = list[float](), list[float]()
+    for _ in range(_LANCZOS_STEPS):
+        if size <= _NOTHING * math.sqrt(noise.size):
+            break
+        device.combine(1 / size, q, 0.0, q, q)
+        back = lines.adjoint_lines(q if root is None else q * root)
+        here.take_off(device, back, here.cells(device, back))
+        image = lines.forward_lines(back)
+        if root is not None:
+            image *= root
+        beside.append(size)
+        device.combine(1.0, image, -size if diagonal else 0.0, before, image)
+        diagonal.append(device.dot(q, image))
+        device.combine(1.0, image, -diagonal[-1], q, image)
+        before, q = q, image
+        size = device.norm(q)
+    if not diagonal or not (largest := float(eigh_tridiagonal(diagonal, beside[1:], eigvals_only=True)[-1])) > 0:
+        return math.inf  # no ray meets the box
+    return _MARGIN * projector.gain(weight) * here.gain * largest
+
+
+def _ray_shape(projector: Projector) -> tuple[int, int, int]:
+    """[view, col, row] of the lines of a projector."""
+    views, rows, cols = projector.projection_shape
+    return views, cols, rows

@@ -1,0 +1,302 @@
+"""Ordered subsets of FISTA: total variation beside the views, in steps until the volume stands still.
+
+    min ½||A x - p||² + μ TV(x), x >= 0
+
+The first sweeps take steps from subsets of the views, which is faster by about their number and ends only near the
+minimum. The other sweeps take a step from all views, and end at it (Kim, Ramani & Fessler 2015, IEEE Trans. Med.
+Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183; O'Donoghue & Candès 2015). Steps are damped, see
+`recon.voxels.damping`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32
+from recon.base.empirical import LEAST_OF_SUBSET, STANDS_STILL, SWEEPS_OF_VIEWS
+from recon.base.geometry import Geometry
+from recon.base.registry import MethodEntry, in_folders, loaded
+from recon.voxels.damping import Damping, largest_damped
+from recon.voxels.devices import LineProjector, projector_on, voxel_device
+from recon.voxels.priors import NoiseBalance
+from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import (
+    Momentum,
+    TotalVariationProx,
+    VoxelProblem,
+    difference_weights,
+    interleaved,
+    largest_eigenvalue,
+    whitened,
+)
+
+SUBSETS, MANY_SUBSETS = 3, 9
+"""Of the views, at most: with damped steps, and without damping."""
+MOST_SWEEPS, USUAL_SWEEPS = 60, 30
+"""Sweeps, at most, and as a rule until the volume stands still."""
+ENDED = "ended"
+"""Name of the setting that says how the sweeps ended."""
+_STILL = "still"  # name of the decision whether the volume stands still
+_LEAST_OF_MANY = 12  # views of a subset without damping
+_LEAST_ON_SUBSETS = 6  # sweeps
+MOST_MOMENTUM = 0.9
+"""Of damped steps. More of it adds up the errors of proximal steps, which take three dual steps: of views whose air
+weighs five times as much as their matter, volumes then change by 1 % in four sweeps for ever."""
+MIRRORED = 4
+"""Sweeps after which total variation takes the same differences again, see `TotalVariationProx`: volumes so many sweeps
+apart are compared."""
+_LOOKED_AT = 9  # views of a sweep whose residual is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Subsets:
+    """Subsets of the views of a problem, which all runs with these views and weights can share.
+
+    Attributes:
+        views: indices, of each subset.
+        projectors: of these views.
+        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
+        plain_norm: the same eigenvalue, of the projector that is not sharpened.
+        damping: of steps; its gain is 1 where they are not damped.
+        damped_step: the same as `step`, of damped steps.
+        of_all: the damping of steps from all views.
+    """
+
+    views: Sequence[NDArray[np.intp]]
+    projectors: Sequence[Projector]
+    step: float
+    plain_norm: float
+    damping: Damping
+    damped_step: float
+    of_all: Damping
+
+    @classmethod
+    def of(cls, problem: VoxelProblem, most: int = SUBSETS, damped: bool = True) -> Subsets:
+        """At most `most` subsets of the views; see `subsets_of`."""
+        projector, weight = problem.projector, problem.weight
+        count, heaviest = subsets_of(projector.geometry, most, damped), 0
+        views = interleaved(projector, count)
+        projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
+        rays = [None if weight is None else weight[some] for some in views] if count > 1 else [weight]
+        if weight is not None:
+            heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
+        norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
+        step = 1 / (norm * max(part.gain(some) for part, some in zip(projectors, rays, strict=True)))
+        if problem.with_all_columns is not None:
+            step = cls.of(problem.with_all_columns(), most, damped).step
+        nz, ny, nx = projector.grid.shape
+        n_views = projector.geometry.n_views
+        if not damped or (damping := Damping.of((ny, nx, nz), len(views[heaviest]))).gain == 1:
+            none = Damping((ny, nx, nz), 1.0)
+            return cls(views, projectors, step, norm, none, step, none)
+        longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], damping)
+        return cls(views, projectors, step, norm, damping, longest, Damping.of((ny, nx, nz), n_views))
+
+    @property
+    def is_damped(self) -> bool:
+        return self.of_all.gain > 1
+
+
+def subsets_of(geometry: Geometry, most: int = SUBSETS, damped: bool = True) -> int:
+    """Number of subsets: of `LEAST_OF_SUBSET` views or more. Without damping twelve views are one, and two from there
+    on, since with one the sweeps stop far from their end."""
+    if damped:
+        return max(1, min(most, geometry.n_views // LEAST_OF_SUBSET))
+    whole = geometry.n_views // _LEAST_OF_MANY
+    return max(1, min(most, max(whole, 2) if whole else 1))
+
+
+RENEWED = 2
+"""Sweeps after which the volume is made anew towards which steps are pulled."""
+
+
+# Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
+PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
+
+
+def pull_methods(**settings: Any) -> list[Any]:
+    """The methods of `PULLS`, with these settings."""
+    return [getattr(loaded(entry.module), entry.cls)(**settings) for entry in PULLS.values()]
+
+
+class Pull(Protocol):
+    """A volume z that follows x, towards which each step of `ordered_fista` moves a share of the way.
+
+    Attributes:
+        share: c of c (z - x), of a step that is not damped.
+    """
+
+    @property
+    def share(self) -> float: ...
+
+    def target(self, x: F32) -> F32:
+        """z [y, x, z] for a volume x, which is not changed."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The views that a step sees: their projector, and their numbers, or all."""
+
+    projector: LineProjector[Any]
+    views: NDArray[np.intp] | slice
+
+
+class _Descent:
+    """The state of `ordered_fista`: the volume, its momentum, the dual field of total variation, and what a step needs.
+
+    Attributes:
+        x: [y, x, z], on the device.
+        error: Σ weight (A x - p)² of the last sweep, each view before its step.
+        seen: residuals of some views of the last sweep, whitened.
+    """
+
+    def __init__(self, problem: VoxelProblem, x: F32, subsets: Subsets, tv_steps: int, pull: Pull | None) -> None:
+        device = self._device = voxel_device(problem.projector.device)
+        grid = problem.projector.grid
+        self._prox = TotalVariationProx(x.shape, difference_weights(grid), problem.nonnegative, tv_steps, device)
+        self._data, self._rays = device.array(problem.data), None
+        if problem.weight is not None:
+            self._rays = device.array(problem.weight)
+        self._all = _Part(projector_on(device, problem.projector), slice(None))
+        of_subsets = zip(subsets.projectors, subsets.views, strict=True)
+        self._parts = [_Part(projector_on(device, part), some) for part, some in of_subsets]
+        if len(self._parts) == 1:
+            self._parts = [self._all]
+        self._subsets, self._pull, self._problem = subsets, pull, problem
+        self.x = device.array(x)
+        most = MOST_MOMENTUM if subsets.is_damped else 1.0
+        self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
+        self._slope: Any = None  # cells of the slope of total variation at the last point
+        self._target: Any = None
+        self._before: Any = None
+        self.error, self.seen = 0.0, list[F32]()
+
+    def renew_target(self) -> None:
+        """Make the volume anew towards which steps are pulled."""
+        if self._pull is not None:
+            self._target = self._device.array(self._pull.target(self._device.numpy(self.x)))
+
+    def sweep(self, weight: NoiseBalance | float, on_subsets: bool, looked_at: bool) -> None:
+        """One pass over the views; the momentum after its last step is left to `go_ahead`."""
+        self.error, self.seen = 0.0, []
+        parts = self._parts if on_subsets else [self._all]
+        count, made = len(parts), self._subsets
+        damping, share = (made.damping, 1.0) if on_subsets else (made.of_all, 1 / len(self._parts))
+        mu = (weight.value if isinstance(weight, NoiseBalance) else weight) / count
+        for at, s in enumerate(self._problem.rng.permutation(count)):
+            self._residual(parts[s], count, looked_at)
+            self._step(mu, damping, made.step * share, made.damped_step * share)
+            if at + 1 < count:
+                self._ahead(self.x)
+
+    def go_ahead(self) -> None:
+        self._ahead(self.x)
+
+    def _residual(self, part: _Part, count: int, looked_at: bool) -> None:
+        """Put the gradient of these views into `_gradient`, downhill."""
+        device, residual = self._device, part.projector.forward_lines(self.x)
+        data, rays = self._data[part.views], None if self._rays is None else self._rays[part.views]
+        self.error += device.replace_by_residual(data, residual, rays)
+        if looked_at:
+            some = slice(None, None, max(1, count * len(residual) // _LOOKED_AT))
+            unweighted = np.array(device.numpy(residual[some]))
+            self.seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[some])))
+        if rays is not None:
+            residual *= rays
+        part.projector.adjoint_lines(residual, self._gradient)
+
+    def _step(self, mu: float, damping: Damping, step: float, damped_step: float) -> None:
+        """x <- prox of total variation after a step along the gradient; see `ordered_fista`."""
+        device, x, length = self._device, self.x, damping.gain * damped_step
+        if self._pull is not None:
+            pull = self._pull.share / step
+            device.combine(1.0, self._gradient, pull, self._target, self._gradient)
+            device.combine(1.0, self._gradient, -pull, x, self._gradient)
+            length /= 1 + length * pull
+        if damping.gain > 1:
+            cells = damping.cells(device, self._gradient)
+            if self._slope is not None:
+                cells -= self._slope * np.float32(mu)
+            damping.take_off(device, self._gradient, cells)
+        device.combine(1.0, x, length, self._gradient, x)
+        before = damping.cells(device, x) if damping.gain > 1 else None
+        self._prox(x, mu * length)
+        self._prox.turn()
+        if before is not None and mu > 0:
+            self._slope = before
+            self._slope -= damping.cells(device, x)
+            self._slope *= np.float32(1 / (mu * length))
+
+    @property
+    def volume(self) -> F32:
+        return self._device.numpy(self.x)
+
+    def change(self) -> float:
+        """Distance of the volume from that of the last call over its norm; infinite at the first call."""
+        if self._before is None:
+            self._before = self._device.copy(self.x)
+            return math.inf
+        self._device.combine(1.0, self.x, -1.0, self._before, self._before)
+        change, size = self._device.norm(self._before), self._device.norm(self.x)
+        self._device.combine(1.0, self.x, 0.0, self.x, self._before)
+        return change / size if size > 0 else 0.0
+
+
+def ordered_fista(
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
+    pull: Pull | None = None, still: float = STANDS_STILL,
+) -> F32:  # fmt: skip
+    """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume stands still.
+
+        x <- prox_{gain t μ TV}(x + gain t (g - L (g - v))),    g = A_sᵀ W (p_s - A_s x), downhill
+
+    with m subsets s of the views, μ / m for μ, and t the safe step of gain (1 - L) AᵀWA of a subset. v is μ times the
+    slope of total variation at the last point, by the last proximal step: where the volume stands still, g = v, and the
+    steps end at the minimum whatever L is. Without damping (gain 1, L = 0) these are the steps of FISTA.
+
+    After `SWEEPS_OF_VIEWS` projected views, six sweeps at least, each step is from all views, and the sweeps end where
+    four of them together change the volume by less than `still` of its norm. Without damping all sweeps are on subsets,
+    and there are `sweeps` of them. Memory: 7 volumes, 2 x the projections.
+
+    Args:
+        x: [y, x, z], not zero; overwritten.
+        weight: μ, or an object that chooses it after each sweep.
+        sweeps: at most.
+        tv_steps: dual steps of each proximal step, which continue from the last ones.
+        pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is minimised, too.
+        still: share of the norm of the volume; 0: all sweeps are made.
+    """
+    descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
+    n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
+    first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(SWEEPS_OF_VIEWS / n_views))
+    for k in range(sweeps):
+        if k % RENEWED == 0:
+            descent.renew_target()
+        on_subsets = k < first or not subsets.is_damped
+        descent.sweep(weight, on_subsets, by_noise)
+        if isinstance(weight, NoiseBalance):
+            weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(descent.seen)))
+        going = problem.go_on(k + 1, math.sqrt(descent.error) / scale)
+        if not on_subsets and (k - first) % MIRRORED == 0 and _stands_still(problem, descent.change(), still, k + 1):
+            break
+        if not going or k + 1 == sweeps:
+            break
+        descent.go_ahead()
+    return descent.volume
+
+
+def _stands_still(problem: VoxelProblem, change: float, still: float, done: int) -> bool:
+    """Whether the last sweeps changed the volume by less than a share `still`; the record says how far it is."""
+    ends = problem.decide(_STILL, lambda: change < still)
+    problem.decide.settings[ENDED] = (
+        f"the volume stands still after {done} sweeps" if ends
+        else f"{done} sweeps, of which the last {MIRRORED} changed the volume by {change:.2%}"
+    )  # fmt: skip
+    return ends

@@ -1,0 +1,120 @@
+"""Damped steps: L keeps less than all, the step is safe, and the sweeps end at the minimum of steps without damping."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.kernels.cpu.tv import total_variation
+from recon.voxels.damping import Damping, largest_damped
+from recon.voxels.devices import CPU
+from recon.voxels.ordered_fista import ENDED, Subsets, ordered_fista
+from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import VoxelProblem, difference_weights
+
+F32 = NDArray[np.float32]
+
+
+def keeps(damping: Damping) -> NDArray[np.float64]:
+    """The matrix of L, for one slice."""
+    ny, nx, _ = damping.shape
+    columns = []
+    for unit in np.eye(ny * nx, dtype=np.float32).reshape(-1, ny, nx, 1):
+        left = unit.copy()
+        damping.take_off(CPU, left, damping.cells(CPU, unit))
+        columns.append((unit - left).ravel())
+    return np.stack(columns, 1).astype(np.float64)
+
+
+@pytest.mark.parametrize(("shape", "views"), [((16, 16, 1), 8), ((12, 18, 1), 40), ((66, 3, 1), 60), ((70, 4, 1), 5)])
+def test_l_is_symmetric_and_keeps_at_least_nothing_and_less_than_all(shape: tuple[int, int, int], views: int) -> None:
+    damping = Damping.of(shape, views)
+    matrix = keeps(damping)
+    np.testing.assert_allclose(matrix, matrix.T, atol=2e-6)
+    values = np.linalg.eigvalsh((matrix + matrix.T) / 2)
+    assert values.min() > -1e-5 and values.max() < 1 - 0.99 / damping.gain
+
+
+def test_a_gain_of_one_takes_nothing_off(rng: np.random.Generator) -> None:
+    x = rng.normal(size=(9, 9, 2)).astype(np.float32)
+    damping = Damping.of((9, 9, 2), 1)
+    assert damping.gain == 1
+    left = x.copy()
+    damping.take_off(CPU, left, damping.cells(CPU, x))
+    np.testing.assert_allclose(left, x, atol=1e-6)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("cone", [False, True])
+def test_the_step_is_safe(cone: bool, weighted: bool, rng: np.random.Generator) -> None:
+    """1 / step is at least the largest eigenvalue of gain (1 - L) AᵀWA, by a dense matrix in float64."""
+    angles = np.linspace(0, np.pi * (1 + cone), 14, endpoint=False)
+    views = Geometry.cone(angles, (1, 14), 1.0, 40.0, 60.0) if cone else Geometry.parallel(angles, (1, 14))
+    projector = Projector(views, Grid.matching(views))
+    _, ny, nx = projector.grid.shape
+    damping = Damping.of((ny, nx, 1), views.n_views)
+    weight = rng.uniform(0.05, 1, (14, 14, 1)).astype(np.float32) if weighted else None
+    units = np.eye(ny * nx, dtype=np.float32).reshape(-1, ny, nx, 1)
+    a = np.stack([projector.forward_lines(unit).ravel() for unit in units], 1).astype(np.float64)
+    w = np.ones(len(a)) if weight is None else weight.ravel().astype(np.float64)
+    damped = damping.gain * (np.eye(ny * nx) - keeps(damping)) @ (a.T @ (w[:, None] * a))
+    largest = float(np.abs(np.linalg.eigvals(damped)).max())
+    assert largest <= largest_damped(projector, weight, damping) < 2.5 * largest  # sharpening: its bound
+
+
+def test_rays_that_meet_no_voxel_allow_any_step() -> None:
+    views = Geometry.parallel(np.linspace(0, np.pi, 6, endpoint=False), (1, 9))
+    projector = Projector(views, Grid.matching(views))
+    assert np.isinf(largest_damped(projector, np.zeros((6, 9, 1), np.float32), Damping.of((9, 9, 1), 6)))
+
+
+def _problem(cone: bool, weighted: bool) -> tuple[VoxelProblem, F32]:
+    rng = np.random.default_rng(3)
+    angles = np.linspace(0, np.pi * (1 + cone), 20, endpoint=False)
+    views = Geometry.cone(angles, (6, 32), 1.0, 80.0, 120.0) if cone else Geometry.parallel(angles, (6, 32))
+    projector = Projector(views, Grid.matching(views))
+    z, y, x = np.meshgrid(*projector.grid.coordinates(), indexing="ij")
+    size = projector.grid.shape[2] * projector.grid.voxel_size
+    truth = (np.hypot(x, y) < 0.3 * size) * (1 + (np.hypot(x - 0.1 * size, y) < 0.1 * size)) * (np.abs(z) < 0.05 * size)
+    data = projector.forward_lines(np.ascontiguousarray(truth.transpose(1, 2, 0).astype(np.float32)))
+    data += rng.normal(0, 0.02 * data.max(), data.shape).astype(np.float32)
+    weight = rng.uniform(0.3, 1, data.shape).astype(np.float32) if weighted else None
+    start = np.full((*projector.grid.shape[1:], projector.grid.shape[0]), 0.1, np.float32)
+    return VoxelProblem(projector, data, weight, True, rng, lambda *_: True), start
+
+
+@pytest.mark.parametrize(("cone", "weighted"), [(False, False), (True, False), (False, True)])
+def test_damped_steps_end_at_the_minimum_of_steps_without_damping(cone: bool, weighted: bool) -> None:
+    problem, start = _problem(cone, weighted)
+    mu = 0.02 * float(problem.data.max())
+
+    def minimum(most: int, damped: bool, sweeps: int) -> tuple[float, F32]:
+        made = replace(problem, rng=np.random.default_rng(0))
+        x = ordered_fista(
+            made, start.copy(), mu, Subsets.of(made, most, damped), sweeps=sweeps, tv_steps=10, still=0.0
+        )  # fmt: skip
+        residual = made.projector.forward_lines(x) - made.data
+        weight = 1.0 if made.weight is None else made.weight
+        data = 0.5 * float((weight * np.square(residual, dtype=np.float64)).sum())
+        return data + mu * total_variation(x, difference_weights(made.projector.grid)), x
+
+    slow, by_slow = minimum(1, False, 800)
+    fast, by_damped = minimum(3, True, 120)
+    assert fast == pytest.approx(slow, rel=3e-3)
+    assert np.linalg.norm(by_damped - by_slow) < 0.02 * np.linalg.norm(by_slow)
+
+
+def test_the_record_says_how_the_sweeps_ended() -> None:
+    problem, start = _problem(False, False)
+    subsets, mu = Subsets.of(problem), 0.02 * float(problem.data.max())
+    done: list[int] = []
+    watched = replace(problem, go_on=lambda sweep, _: not done.append(sweep))
+    ordered_fista(watched, start.copy(), mu, subsets, sweeps=200, tv_steps=3)
+    assert problem.decide.settings[ENDED] == f"the volume stands still after {len(done)} sweeps" and len(done) < 100
+    ordered_fista(watched, start.copy(), mu, subsets, sweeps=40, tv_steps=3, still=0.0)
+    assert "changed the volume by" in problem.decide.settings[ENDED] and done[-1] == 40
