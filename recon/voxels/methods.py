@@ -83,7 +83,7 @@ class FistaTv(VoxelMethod):
     def refit(self, share: float) -> VoxelMethod:
         """Early iterations on subsets, with this share of their number."""
         given = {each.name: getattr(self, each.name) for each in fields(FistaTv)}
-        subsets, iterations = EarlyTv.subsets, max(1, round(share * EarlyTv.iterations))
+        subsets, iterations = EarlyTv.subsets, max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(**given | {"subsets": subsets, "iterations": iterations})
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
