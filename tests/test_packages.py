@@ -48,10 +48,17 @@ def test_a_missing_add_on_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("recon.base.registry.entry_points_announced", lambda: ())
     monkeypatch.setattr("beamline.cli.main.commands", dict)
     said = CliRunner().invoke(main, ["tango"]).stderr
-    assert "`beamline tango` needs a package that is not installed: pip install splatline-tango." in said
+    assert (
+        "`beamline tango` is in a package that is not installed. Install it with: pip install splatline-tango." in said
+    )
     said = CliRunner().invoke(main, ["study", "structure", "SCAN"]).stderr
-    assert "`beamline study structure` needs a package that is not installed: pip install splatline-structure." in said
-    with pytest.raises(ConfigError, match=r"--cluster needs a package that .* pip install splatline-cluster"):
+    assert (
+        "`beamline study structure` is in a package that is not installed. "
+        "Install it with: pip install splatline-structure."
+    ) in said
+    with pytest.raises(
+        ConfigError, match=r"--cluster is in a package that .* Install it with: pip install splatline-cluster"
+    ):
         cluster("local:2")
     with pytest.raises(UnknownNameError, match="pip install splatline-tango"):
         Registry("method", {})["tango"]

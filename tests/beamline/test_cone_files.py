@@ -138,7 +138,7 @@ def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     seen = list[tuple[Geometry, Grid]]()
     monkeypatch.setattr(estimate, "forecast", lambda method, geometry, grid, now: seen.append((geometry, grid)))
     found = beamline("recon", str(scan), "-m", "sirt", "-o", str(tmp_path / "out.h5"), "--dry-run")
-    assert found.exit_code == 0 and "40 x 48 x 48 voxels by sirt, from 90 views" in found.stdout, found.output
+    assert found.exit_code == 0 and "40 x 48 x 48 voxels with sirt, from 90 projections" in found.stdout, found.output
     geometry = seen[0][0]
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     for words in (("--dry-run",), ()):

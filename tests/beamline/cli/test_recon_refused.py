@@ -50,4 +50,4 @@ def test_a_volume_to_reconstruct_is_named_with_its_method(folder: Path) -> None:
     succeeds("recon", "scan.h5", "-m", "fbp", "-o", "volume.h5", "--no-report")
     result = beamline("recon", "volume.h5")
     assert result.exit_code == 5
-    assert "is a volume, made by fbp" in " ".join(result.stderr.split()) and "beamline view" in result.stderr
+    assert "is a volume made by fbp, not a scan" in " ".join(result.stderr.split()) and "beamline view" in result.stderr

@@ -104,9 +104,10 @@ def test_several_scans_are_taken_in_turn_and_ctrl_c_ends_them(tmp_path: Path, mo
     on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGINT, 9)))
     stopped = scan(SIMULATED, "-o", str(tmp_path / "one"), **taxi)
     assert stopped.exit_code == 4 and "not started" in stopped.stdout and rows(tmp_path / "one") >= 9
-    for option, said in (("--page", "is for one scan"), ("--wait", "needs a terminal")):
+    for option, said in (("--page", "--page works only with a single scan"), ("--wait", "needs a terminal")):
         assert said in scan(SIMULATED, option, "-o", str(tmp_path / "none"), **taxi).stderr
-    assert "is for several scans" in scan("--stop-on-failure").stderr and not (tmp_path / "none").exists()
+    assert "--stop-on-failure works only with several scans" in scan("--stop-on-failure").stderr
+    assert not (tmp_path / "none").exists()
 
 
 def test_0_with_documents_each_is_valid_and_they_lead_to_the_frames(
@@ -358,7 +359,8 @@ def test_7_a_complete_scan_with_alarms_says_so_last(tmp_path: Path, monkeypatch:
     assert result.exit_code == 7
     assert result.stdout.splitlines()[-1].startswith("flagged   stuck 3 alarm; see ")
     assert "Scan complete: 17 frames, 3 WITH AN ALARM" in result.stderr
-    assert "With --flags use, a reconstruction does this: Of 12 views 3 have an alarm and are left out" in result.stderr
+    treated = "With --flags use, a reconstruction does this: Of 12 projections, 3 have an alarm and are left out"
+    assert treated in result.stderr
     assert "complete, but 3 of 17 frames have an alarm of the monitor: stuck 3 alarm" in result.stderr.splitlines()[-1]
     assert rows(tmp_path) == 17
     on(monkeypatch, FakeInstrument(Faults(repeats={9})))

@@ -11,7 +11,7 @@ from tests.beamline.config_file import GOOD, faults, load
 FAULTS = {
     "former key": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {stop_when: null}"),
-        "my.yaml:2: recon.stop_when is no longer a key; leave it out. scan.decide: do with scan.target: {quality_db",
+        "my.yaml:2: recon.stop_when no longer exists; remove it. scan.decide: do with scan.target: {quality_db",
     ),
     "decision": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: perhaps"),
@@ -180,6 +180,6 @@ def test_faults_of_overrides_name_the_override(tmp_path: Path) -> None:
 def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path) -> None:
     large = tmp_path / "large.yaml"
     large.write_text("# " + "x" * 2**20, encoding="utf-8")
-    for path, said in ((tmp_path, "It is a folder"), (large, "at most 1048576 are read")):
+    for path, said in ((tmp_path, "It is a folder"), (large, r"too large \(1048578 bytes, at most 1048576\)")):
         with pytest.raises(ConfigError, match=said):
             load(path)

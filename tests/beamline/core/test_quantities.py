@@ -33,19 +33,19 @@ def numbers_of(schema: Mapping[str, Any]) -> set[str]:
 
 
 MISTAKEN = [
-    ("energy_kev", 25000.0, "42 times", "25 keV (25000 eV)"),
-    ("pixel_size_um", 0.0009, "11 times", "0.9 um (0.0009 mm)"),
-    ("pixel_size_um", 0.003, "3.3 times", "3 um (0.003 mm)"),
-    ("distance_mm", 100000.0, "5 times", "100 mm (100000 um)"),
-    ("max_speed_deg_s", 4000.0, "1.1 times", "4 degrees/s (4000 counts of 0.001 degrees/s)"),
-    ("in_deg", -180000.0, "1.8 times", "-180 degrees (-180000 counts of 0.001 degrees)"),
+    ("energy_kev", 25000.0, "by a factor of 42.", "25 keV (25000 eV)"),
+    ("pixel_size_um", 0.0009, "by a factor of 11.", "0.9 um (0.0009 mm)"),
+    ("pixel_size_um", 0.003, "by a factor of 3.3.", "3 um (0.003 mm)"),
+    ("distance_mm", 100000.0, "by a factor of 5.", "100 mm (100000 um)"),
+    ("max_speed_deg_s", 4000.0, "by a factor of 1.1.", "4 degrees/s (4000 counts of 0.001 degrees/s)"),
+    ("in_deg", -180000.0, "by a factor of 1.8.", "-180 degrees (-180000 counts of 0.001 degrees)"),
 ]
 
 
 @pytest.mark.parametrize(("name", "value", "beyond", "meant"), MISTAKEN)
 def test_a_mistaken_unit(name: str, value: float, beyond: str, meant: str) -> None:
     said = doubt(name, value)
-    assert beyond in said and f"did you mean {meant}" in said
+    assert beyond in said and f"Did you mean {meant}" in said
     assert is_impossible(name, value) is (name in ("energy_kev", "pixel_size_um") and value != 0.003)
 
 
@@ -90,16 +90,16 @@ def test_no_shipped_configuration_is_doubted(name: str) -> None:
     [
         (
             ["optics.energy_kev=25000"],
-            "energy_kev=25000: optics.* did you mean 25 keV .*eV\\)\\? Nothing",
+            "energy_kev=25000: optics.* Did you mean 25 keV .*eV\\)\\? Nothing",
             2,
         ),
-        (["optics.pixel_size_um=0.003"], "Warning: optics.pixel_size_um: .*did you mean 3 um", 0),
-        (["devices.stage.max_speed_deg_s=4000"], "Warning: devices.stage.max_speed_deg_s: 4000 degrees/s is", 0),
-        (["scan.angles.span_deg=3.14159"], "Warning: .*did you mean 180", 0),
+        (["optics.pixel_size_um=0.003"], "Warning: optics.pixel_size_um = 0.003 um .*Did you mean 3 um", 0),
+        (["devices.stage.max_speed_deg_s=4000"], "Warning: devices.stage.max_speed_deg_s = 4000 degrees/s is", 0),
+        (["scan.angles.span_deg=3.14159"], "Warning: .*Did you mean 180", 0),
         (["scan.angles.span_deg=3.14159", "scan.angles.views=3600"], "0.873 counts .* span 1.15 times the angles", 2),
-        (["scan.angles={scheme: sector, views: 90, first_deg: -1.5708, last_deg: 1.5708}"], "did you mean 180", 0),
-        (["scan.angles={scheme: file, path: ANGLES}"], "did you mean 180", 0),
-        (["scan.energies=[8000, 9]", "devices.monochromator.kind=simulated"], "did you mean 8 keV", 2),
+        (["scan.angles={scheme: sector, views: 90, first_deg: -1.5708, last_deg: 1.5708}"], "Did you mean 180", 0),
+        (["scan.angles={scheme: file, path: ANGLES}"], "Did you mean 180", 0),
+        (["scan.energies=[8000, 9]", "devices.monochromator.kind=simulated"], "Did you mean 8 keV", 2),
     ],
 )
 def test_check_tells_a_slip(tmp_path: Path, settings: list[str], said: str, code: int) -> None:

@@ -24,11 +24,13 @@ def test_a_scan_at_even_steps_with_flats_was_looked_at(fake: Any) -> None:
 
 
 def test_each_reason_is_named_with_its_views(fake: Any) -> None:
-    assert said(fake.darks() + fake.views(10)) == ("drift of beam, field, opposite, mass in 10 of 10 views (no flats)",)
-    assert said(fake.references() + fake.views(10), cone=True) == ("opposite in 10 of 10 views (cone beam)",)
+    assert said(fake.darks() + fake.views(10)) == (
+        "drift of beam, field, opposite, mass in 10 of 10 projections (no flats)",
+    )
+    assert said(fake.references() + fake.views(10), cone=True) == ("opposite in 10 of 10 projections (cone beam)",)
     wide = ((0.0, 0.0, 60.0, 0.02),)
     (text,) = said(fake.references() + fake.views(10, discs=wide))
-    assert text == "mass in 10 of 10 views (sample wider than the field)"
+    assert text == "mass in 10 of 10 projections (sample wider than the field of view)"
 
 
 def test_views_at_uneven_angles_and_too_few_of_them_were_not_compared(fake: Any) -> None:
@@ -37,4 +39,4 @@ def test_views_at_uneven_angles_and_too_few_of_them_were_not_compared(fake: Any)
     assert text.startswith(
         "gain, motion, floater, ghost, dips of beam in 7 of 7 projections (no four earlier projections"
     )
-    assert "in 1 of 1 views" in said(fake.references() + fake.views(1))[0]
+    assert "in 1 of 1 projections" in said(fake.references() + fake.views(1))[0]

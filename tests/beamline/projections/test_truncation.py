@@ -40,7 +40,9 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
 def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
     found, (line,) = prepare(scan(radius), SELECTION)
     assert found.projections.air_columns == (0, 0)
-    assert line.startswith("The sample goes on beyond the left and right edge of the field (line integral ")
+    assert line.startswith(
+        "The sample extends beyond the left and right edge of the field of view (line integral there: "
+    )
     volume = fbp(found.projections.data, found.geometry, filter="hann")[1]
     c = (np.arange(64) - 31.5)[None]
     middle = volume[np.hypot(c, c.T) < 28].mean()

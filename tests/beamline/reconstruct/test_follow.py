@@ -188,7 +188,7 @@ SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
         ),
         (FRAMES[:4], "stopped", "0 projections", set()),
         (FRAMES[:5], "stopped", "1 projection", set()),
-        ([f for f in FRAMES if f.kind != 1], "complete", "without flats", set()),
+        ([f for f in FRAMES if f.kind != 1], "complete", "The frames are counts, but flats are missing", set()),
     ],
     ids=["none", "dies", "no views", "one view", "no flats"],
 )

@@ -275,7 +275,7 @@ OF_LINES = (
     ),
     FaultElsewhere(
         "another device at the port",
-        "another device answers",
+        "another device answered",
         ("drivers/stages/test_every_stage.py", "test_the_configured_serial_number_is_required"),
     ),
     FaultElsewhere(

@@ -108,7 +108,7 @@ def test_replaces_in_one_step_when_asked_but_no_file_that_the_system_does_not_le
         write_reconstruction(path, replace(_record(), title=title), replace=True)
     held = Mock(side_effect=PermissionError(13, "it is being used by another process"))
     monkeypatch.setattr(Path, "replace", held)
-    with pytest.raises(DataError, match=r"another process.*untouched"):
+    with pytest.raises(DataError, match=r"another process.*the existing file was not changed"):
         write_reconstruction(path, _record(), replace=True)
     assert read_reconstruction(path).title == "newer"
     assert list(tmp_path.iterdir()) == [path]
