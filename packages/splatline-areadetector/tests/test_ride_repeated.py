@@ -73,9 +73,9 @@ def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -
 
 def test_the_page_of_all_scans_has_one_address_from_before_the_first(tmp_path: Path) -> None:
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", "--page", angles=PLAN) as ride:
-        ride.wait_for(lambda: "Page, to control:" in ride.output)
-        (look,) = re.findall("Page, to watch: (http.*)", ride.output)
-        (act,) = re.findall("Page, to control: .*#act=(.*)", ride.output)
+        ride.wait_for(lambda: "Page to control the scan:" in ride.output)
+        (look,) = re.findall("Page to watch the scan: (http.*)", ride.output)
+        (act,) = re.findall("Page to control the scan: .*#act=(.*)", ride.output)
         opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
         opener.open(look).close()  # its cookie is the token
         base = look.partition("?")[0]
@@ -95,6 +95,6 @@ def test_the_page_of_all_scans_has_one_address_from_before_the_first(tmp_path: P
             with opener.open(f"{base}run/{told['newest']}/api/facts") as answer:
                 facts = json.load(answer)
                 assert facts["run"] == newest.name and facts["may_act"] and act
-        assert ride.output.count("Page, to watch") == 1
+        assert ride.output.count("Page to watch the scan") == 1
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code() == 0

@@ -89,7 +89,7 @@ def test_a_run_as_a_client_sees_it(served: tuple[FollowedRun, Path, Any]) -> Non
     run, runs, device = served
     run.look()
     assert (device.state(), device.ScanStatus, device.SampleName) == (tango.DevState.ON, "idle", "")
-    with pytest.raises(tango.DevFailed, match="There is no run"):
+    with pytest.raises(tango.DevFailed, match="contains no run"):
         device.Stop()
 
     write_run(runs / "2026-01-01T000000_a", *FAILED)
