@@ -160,7 +160,7 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
 
         def shows_a_volume() -> bool:
             if not address:
-                address.extend(re.findall(r"Page, to watch: (\S+)", ride.output)[:1])
+                address.extend(re.findall(r"Page to watch the scan: (\S+)", ride.output)[:1])
                 if address:
                     page.open(address[0]).close()  # it gives the cookie
                 return False
