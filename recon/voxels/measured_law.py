@@ -31,7 +31,7 @@ from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.iterative import Iterating, solve
-from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista
+from recon.voxels.ordered_fista import MOST_SWEEPS, Subsets, ordered_fista
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
@@ -44,9 +44,9 @@ _NOISE_PRODUCT = 0.08, 0.16  # noise x ratio of falls: below the first other err
 _EXPONENT_ERROR = 0.25  # over the exponent: a convention, by which a gain's range is half to one and a half times it
 _GAPS_ERROR = 0.46  # likewise with gaps between views, where exponents from 0.41 to 1.15 were found on ten scans
 _SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
-_VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
+_VOLUME_OVER_VIEWS = 2.1  # times the fall that is measured: views show errors between voxels, too, which stay
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
-_SWEEPS, _TV_STEPS, _TRIAL_VIEWS = 8, 3, 64
+_TV_STEPS, _TRIAL_VIEWS = 3, 64
 _LEAST_FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
 _CIRCLE = 0.95  # of the field's radius, where errors count
@@ -131,11 +131,11 @@ class _TotalVariation:
     """
 
     weight: float
-    iterations: int = _SWEEPS
+    iterations: int = MOST_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
-        subsets = Subsets.of(problem, MANY_SUBSETS, damped=False)
+        subsets = Subsets.of(problem)
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
 
 
@@ -143,7 +143,7 @@ class _TotalVariation:
 class _WeightByNoise:
     """Decides the weight of total variation by the noise of the views, and makes no volume."""
 
-    iterations: int = _SWEEPS
+    iterations: int = MOST_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         problem.decide("weight", lambda: NoiseBalance.of(problem, x, self.iterations).first)

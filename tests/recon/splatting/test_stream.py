@@ -206,7 +206,7 @@ def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
     views = data.copy()
     views[marred, 10, 17] = 1e30
     model = _stream(views, SCATTERED)
-    with pytest.raises(ValueError, match="no value"):
+    with pytest.raises(ValueError, match="no usable value"):
         model.add_views(np.full((1, *SHAPE), 1e30, np.float32), [0.1])
     assert model.n_views == 40
     model.finish(2.0)

@@ -81,7 +81,8 @@ def test_the_descent_is_minus_the_gradient(rng: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_few_views_an_energy_tell_the_share_of_a_material_better_than_one_volume_an_energy() -> None:
-    """The error of the share is at most half of that by FISTA-TV at each energy, with its best of four weights."""
+    """The error of the share is at most two thirds of that by FISTA-TV at each energy, finished, with the best of four
+    weights."""
     fine = np.repeat(np.repeat(balls(64), 2, 2), 2, 3)
     views = views_of(fine, 10, EDGE, noise=0.02, fine=2)
     truth = fine.reshape(2, ROWS, 64, 2, 64, 2).mean((3, 5))
@@ -104,7 +105,7 @@ def test_few_views_an_energy_tell_the_share_of_a_material_better_than_one_volume
         return np.einsum("me,ezyx->mzyx", np.linalg.pinv(EDGE), np.stack(volumes)).astype(np.float32)
 
     apart = min(error(separately(weight)) for weight in (0.003, 0.01, 0.03, 0.1))
-    assert error(fit_materials(views).densities) < 0.5 * apart
+    assert error(fit_materials(views).densities) < 2 / 3 * apart
 
 
 def test_rays_of_weight_zero_do_not_count() -> None:
