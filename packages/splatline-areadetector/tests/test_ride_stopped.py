@@ -83,7 +83,7 @@ def test_a_stop_closes_the_file_and_a_second_ends_the_ride(tmp_path: Path, fps: 
     angles = {"from": "plan", "views": 2000, "start_deg": 0, "step_deg": 9}
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, *given, period_s=1 / fps, angles=angles) as ride:
         with _sending(ioc, fps) as full_speed:
-            ride.wait_for(lambda: "The live volume is ready for views" in ride.output)
+            ride.wait_for(lambda: "The live reconstruction is ready" in ride.output)
             before = ride.frames()
             full_speed()
             ride.wait_for(lambda: ride.frames() > before + fps)

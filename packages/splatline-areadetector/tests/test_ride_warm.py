@@ -47,7 +47,7 @@ def test_the_process_that_has_warmed_up_makes_the_volume(tmp_path: Path, warm: b
         for i in range(VIEWS):
             ioc.post(array_value(np.broadcast_to(lines[i].astype(np.uint16), (32, 64)).copy(), i + 1))
             time.sleep(max(0.0, began + (i + 1) / FPS - time.monotonic()))
-            ready = ready or ("The live volume is ready" in ride.output and time.monotonic() - began) or 0.0
+            ready = ready or ("The live reconstruction is ready" in ride.output and time.monotonic() - began) or 0.0
             pictured = pictured or (any(tmp_path.glob("runs/*/*.live.png")) and time.monotonic() - began) or 0.0
         assert [child.pid for child in _children(ride)] == ([waiting.pid] if warm else [])
         assert ride.exit_code() in (0, 7), ride.output
