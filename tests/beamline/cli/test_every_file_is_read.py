@@ -165,4 +165,4 @@ def test_no_output_takes_the_place_of_what_is_there(written: Path, tmp_path: Pat
     link.symlink_to(away)
     done = beamline(*command, str(link))
     assert (done.exit_code, link.is_symlink(), [*tmp_path.iterdir()]) == (5, True, [link]), done.output
-    assert f"{link} is a link to {away}, which is not there" in done.output and "deleted" not in done.output
+    assert f"{link} is a link to {away}, which does not exist" in done.output and "deleted" not in done.output

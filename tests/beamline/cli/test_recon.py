@@ -90,7 +90,7 @@ def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
 def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     result = succeeds("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
     start = int(read_reconstruction(folder / "scan_r2.h5").parameters["gaussians_at_start"])
-    assert f"Warning: The fit started from {start} Gaussians, not from 99999999" in result.stderr
+    assert f"Warning: The fit started with {start} Gaussians instead of 99999999" in result.stderr
     few = ("--gaussians", "50", "--finish", "0", "-o", "few.h5")
     result = beamline("recon", "scan.h5", "--steps", "2", *few, "--no-report")
     assert result.exit_code == 0 and "The fit started" not in result.stderr

@@ -41,7 +41,7 @@ def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | No
     lit = np.setdiff1d(np.arange(VIEWS), unlit)
     np.testing.assert_array_equal(found.projections.view_ids, FIRST + lit)
     np.testing.assert_allclose(found.geometry.angles, ANGLES[lit])
-    assert sum("without light" in line for line in told) == 1
+    assert sum("had no beam: the shutter was closed" in line for line in told) == 1
     np.testing.assert_allclose(found.projections.data, line_integrals()[lit], atol=0.12)
 
 

@@ -93,7 +93,7 @@ def test_a_run_in_a_budget_is_that_of_the_methods_left(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole.volume.data, same.volume.data)
     assert same.parameters["budget"] == 1000 and "16.7 min for fbp or fista-tv" in chosen
     assert short.method == "fbp" and "fista-tv would take about" in too_few
-    assert any("0.001 s are too short for this scan" in str(event.data) for event in events)
+    assert any("0.001 s is too short for this scan" in str(event.data) for event in events)
 
 
 @pytest.mark.slow

@@ -99,6 +99,6 @@ def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: py
     monkeypatch.setattr("recon.error_bars.solve_views", interrupted)
     result = beamline(*FISTA, "-o", "out.h5")
     assert result.exit_code == 0, result.output
-    assert "There are no error bars: their computation was stopped." in result.stderr
+    assert "No error bars were computed: their computation was stopped." in result.stderr
     record = read_reconstruction(Path("out.h5"))
     assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters

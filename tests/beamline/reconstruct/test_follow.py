@@ -106,7 +106,7 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
         [
             (3.0, "Stopped during the scan: the volume is reconstructed from the first {} projections."),
             (1.5, ""),  # seven views
-            (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 views."),
+            (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 projections."),
         ]
     ),
 )

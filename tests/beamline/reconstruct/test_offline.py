@@ -124,7 +124,7 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     assert record.history["step"][-1] == 150
     assert len(record.history["loss"]) == len(progress)
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
-    for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 views"):
+    for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 projections"):
         assert said in page
     # Slices, profile, differences, quality, projection, sinogram, darks and flats; the axis was given.
     assert page.count("data:image/png;base64,") == 7

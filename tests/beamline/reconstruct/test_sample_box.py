@@ -58,4 +58,4 @@ def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> No
 def test_of_a_sample_beyond_the_field_all_is_made(rows: slice) -> None:
     region = box_around_sample(scan(cylinders((0, 0, 70.0, 0.01, rows))), PLAIN)
     assert region.z == (0, ROWS) and region.y == region.x and region.x[0] == 0 and region.x[1] >= COLS
-    assert "goes on beyond the field at the left and the right" in region.reason
+    assert "the sample extends beyond the field of view at the left and the right" in region.reason

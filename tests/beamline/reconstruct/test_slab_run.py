@@ -141,7 +141,7 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
     assert (all_of_it["seconds"], all_of_it["least_seconds"]) == (1144, 1072)  # what the data choose, is chosen once
     assert all_of_it["scratch"] - rest["scratch"] == rest["output"] and rest["memory"] == all_of_it["memory"]
     said = beamline(*FISTA, "--resume", "out.partial.h5", "--dry-run").stdout
-    assert "2 slabs that are left; 32 of 96" in said
+    assert "2 slabs remaining; 32 of 96" in said
     assert "about 1.67 min; about 50 s where the data end it early; reading" in said
     other = beamline(*FISTA, "--rows", "0:80", "--resume", "out.partial.h5", "--dry-run")
     assert other.exit_code == 5 and "is of 96 slices, this volume has 80" in other.stderr

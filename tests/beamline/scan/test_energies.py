@@ -127,7 +127,7 @@ def test_a_series_that_was_stopped_goes_on(
         without.setattr("beamline.scan.energies.connect", None)  # nothing is missing: no device is connected
         assert beamline("scan", "--resume", series, "--json").exit_code == 0
     other = beamline("scan", config, "--set", "scan.energies=[8.3, 8.4]", "--resume", series)
-    assert other.exit_code == 2 and "`- 8.32`, not `- 8.3`" in other.stderr.replace("\n", " ")
+    assert other.exit_code == 2 and "`- 8.32` instead of `- 8.3`" in other.stderr.replace("\n", " ")
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_a_scan_that_cannot_be_read_is_moved_away_and_taken_anew(config: Path, t
     broken.write_bytes(broken.read_bytes()[:4000])
     ended = beamline("scan", "--resume", series)
     said = " ".join(ended.stderr.split())
-    assert ended.exit_code == 5 and f"{broken.parent} cannot be recovered, move it away" in said, said
+    assert ended.exit_code == 5 and f"{broken.parent} cannot be recovered, move it to another place" in said, said
     broken.parent.rename(tmp_path / "away")
     done = beamline("scan", "--resume", series, "--json")
     assert done.exit_code == 0 and len(json.loads(done.stdout.splitlines()[-1])["scans"]) == 2, done.output

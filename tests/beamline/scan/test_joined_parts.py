@@ -81,7 +81,7 @@ def _without_its_parts(run: Path) -> None:
     others_slow(
         [
             (_fewer_frames, "part-2/scan.h5 has .* frames instead of the"),
-            (_gone, "part-3/scan.h5 is not there"),
+            (_gone, "part-3/scan.h5 does not exist"),
             (_torn, "is cut off"),
             (_without_its_parts, "does not list its parts"),
         ]
@@ -104,7 +104,7 @@ def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, 
     assert_whole(tmp_path / "copy" / JOINED)
     (tmp_path / "alone").mkdir()
     shutil.copy(recovered, tmp_path / "alone")
-    with pytest.raises(DataError, match="as a whole"):
+    with pytest.raises(DataError, match="copy the whole folder of the run"):
         open_scan(tmp_path / "alone" / JOINED)
     ingest(recovered, tmp_path / "archive.h5")
     shutil.copy(tmp_path / "archive.h5", recovered.parent / "archive.h5")

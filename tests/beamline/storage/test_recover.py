@@ -264,7 +264,7 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             np.testing.assert_allclose(source.table.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
         assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
         if (kept := folder / "s.h5.damaged").exists():
-            assert kept.read_bytes() == state and f"The damaged file was renamed to {kept} now" in done.in_words()
+            assert kept.read_bytes() == state and f"The damaged file was renamed to {kept}." in done.in_words()
             anew += 1
         assert not recover(folder / "s.h5").changed
     assert anew  # ways that HDF5 cannot end such a file by

@@ -245,7 +245,7 @@ def test_a_resumed_run_is_one_row_of_all_its_parts(folder: Path, tmp_path: Path)
     assert read_reconstruction(Path("out/scan/recon.h5")).parameters["n_views"] == VIEWS
     assert [row.scan for row in batch._rows([run], before)] == [str(run / "joined.h5")]
     part = beamline("recon", run / "scan.h5", "-m", "fbp", "-o", "part.h5")
-    assert part.exit_code == 5 and f"give {run / 'joined.h5'}" in part.output and not Path("part.h5").exists()
+    assert part.exit_code == 5 and f"use {run / 'joined.h5'}," in part.output and not Path("part.h5").exists()
     (run / "joined.h5").unlink()
     result = beamline("batch", run / "scan.h5", "--config", "recipe.yaml", "-o", "other")
     assert result.exit_code == 5 and f"beamline recover {run}" in _table(folder / "other")["scan"]["message"]

@@ -130,10 +130,10 @@ def test_without_control_there_is_no_verb(tmp_path: Path) -> None:
 
 def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
     with _served(tmp_path, control=True) as (_, client):
-        with pytest.raises(thread.RemoteError, match="There is no run"):
+        with pytest.raises(thread.RemoteError, match="contains no run"):
             client.put("T:StopScan", True, timeout=WITHIN)
         after = client.get("T:StopScan")
-        assert (bool(after), after.severity) == (False, 2) and "There is no run" in after.raw.alarm.message
+        assert (bool(after), after.severity) == (False, 2) and "contains no run" in after.raw.alarm.message
 
 
 ASKED = {
@@ -156,7 +156,7 @@ def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path) ->
         with pytest.raises(thread.RemoteError, match="no scan is running"):
             client.put("T:Decide", "next", timeout=WITHIN)
         with asking(run) as answers:
-            with pytest.raises(thread.RemoteError, match="'offset' cannot be chosen now; on offer: next, enough"):
+            with pytest.raises(thread.RemoteError, match="'offset' cannot be chosen now; possible: next, enough"):
                 client.put("T:Decide", "offset", timeout=WITHIN)
             _put(server, client, "T:Decide", "enough")
             assert answers == ["enough"] and client.get("T:Decide") == ""

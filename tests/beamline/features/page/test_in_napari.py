@@ -65,7 +65,9 @@ def test_labels_of_a_part_of_the_volume_stand_where_they_are(tmp_path: Path, lay
     np.testing.assert_allclose(said["scale"], (0.1, 0.1, 0.1))
     with h5py.File(tmp_path / "l.h5", "r+") as file:
         del file["entry/data/z"]
-    with pytest.raises(DataError, match=r"\(6, 4, 4\); expected whole numbers of \(6, 8, 10\)"):
+    with pytest.raises(
+        DataError, match=r"\(6, 4, 4\); expected whole numbers of the shape of the volume, \(6, 8, 10\)"
+    ):
         show([tmp_path / "v.h5"], tmp_path / "l.h5")
 
 
@@ -94,6 +96,6 @@ def test_labels_of_another_volume_are_refused(tmp_path: Path, layers: dict[str, 
     np.save(tmp_path / "v.npy", RAMP)
     for name, values in {"a.tif": RAMP[:5].astype(np.uint8), "b.tif": RAMP + 0.5}.items():
         tifffile.imwrite(tmp_path / name, values)
-        with pytest.raises(DataError, match=r"expected whole numbers of \(6, 8, 10\)"):
+        with pytest.raises(DataError, match=r"expected whole numbers of the shape of the volume, \(6, 8, 10\)"):
             show([tmp_path / "v.npy"], tmp_path / name)
     assert not layers

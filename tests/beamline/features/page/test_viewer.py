@@ -169,7 +169,7 @@ def test_no_slice_of_a_volume_with_scales_costs_more_than_a_bounded_read(
 def test_an_array_of_a_file_with_several_is_shown_by_its_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", a=RAMP, b=3 * RAMP)
     path = str(tmp_path / "two.npz")
-    with pytest.raises(DataError, match=r"holds 2 volumes .*FILE::NAME"):
+    with pytest.raises(DataError, match=r"contains 2 volumes .*FILE::NAME"):
         ShownVolume(tmp_path / "two.npz")
     found, name = view_command._named(f"{path}::b")
     volume = ShownVolume(found, dataset=name)

@@ -193,14 +193,14 @@ def test_an_axis_that_leans_is_turned_back_by_what_is_said() -> None:
     leans = Alignment(79.5, 0.0, 0.0, math.radians(0.5), math.radians(0.05), 3.0, 0.0, 144)
     axis, tilt, _ = leans.lines()
     assert "move" not in axis
-    assert "1.25 px from first to last row; turn the axis 0.500° clockwise" in tilt
+    assert "1.25 px between the first and the last row; rotate the axis by 0.500° clockwise" in tilt
     unknown = Alignment(79.5, 0.0, 0.0, math.nan, math.nan, math.nan, 0.0, 144)
     assert "not known" in unknown.lines()[1] and "not known" in unknown.lines()[2]
 
 
 def test_views_without_contrast_are_refused_and_the_instrument_is_safe() -> None:
     instrument = FakeInstrument()
-    with pytest.raises(QualityError, match="two views"):
+    with pytest.raises(QualityError, match="two projections do not match"):
         align(small(), instrument.connected(), StopRequest(), lambda event: None)
     assert_safe(instrument)
 
