@@ -54,8 +54,8 @@ def reconstruct(
             finite, or masked, are filled from their neighbours and weigh nothing. Or what was counted, where photons
             are few. The method is then given line integrals and weights that carry the likelihood of the counts, see
             `recon.prep.counts.line_integrals`; `use.weights` multiply them.
-        method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
-            of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
+        method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
+            settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
             small box holds what the whole volume holds there.
         seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.

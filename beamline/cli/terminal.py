@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -278,10 +278,23 @@ def results(record: ReconRecord) -> str:
             **numbers
         ),
         "chosen": record.chosen,
-        "ended": record.parameters.get("ended"),
+        "ended": _ended(record.parameters),
     }
     lines = [f"{name:<10}{text}" for name, text in rows.items() if text]
     return "\n".join([*lines, "", *_metrics_of(record)])
+
+
+def _ended(settings: Mapping[str, Any]) -> str:
+    """How iterations that end by themselves ended; empty for other methods."""
+    words = {
+        "still": "the volume stands still after {} iterations",
+        "stopped": "stopped after {} iterations, before the volume stood still",
+        "bound": "after {} iterations, before the volume stood still (--iterations allows more)",
+    }
+    how, done = settings.get("ended"), settings.get("ended_after")
+    left = settings.get("last_change")
+    change = "" if how == "still" or left is None else f"; the last four changed the volume by {left:.2%}"
+    return words[how].format(done) + change if how in words else ""
 
 
 def _metrics_of(record: ReconRecord) -> list[str]:

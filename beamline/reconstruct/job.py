@@ -311,6 +311,8 @@ def _is_early(job: Job, result: Reconstruction) -> bool:
     # Voxel refinement, and the factors of several volumes, come after the last step and can also be stopped.
     if isinstance(method, Series) or (isinstance(method, Fit) and method.finish_sweeps > 0):
         return job.stop.stopped
+    if ended := result.settings.get("ended"):  # iterations that end by themselves, before their largest number
+        return job.stop.stopped and ended == "stopped"
     return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))
 
 

@@ -25,7 +25,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.iterative import TrialWatch, Watch, solve_views
 from recon.voxels.methods import PnpDct
-from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods
+from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
 from recon.voxels.priors import NoiseBalance, pnp_dct
 from recon.voxels.projector import Projector
 from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
@@ -71,7 +71,8 @@ def level_of(beyond: F32) -> F32:
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
-    first, parts = GoesOn(problem.go_on), Subsets.of(problem, MANY_SUBSETS, damped=False)
+    count = subsets_of(problem.projector.geometry, MANY_SUBSETS, damped=False)
+    first, parts = GoesOn(problem.go_on), Subsets.of(problem, count, damped=False)
     x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
     if not (first.going and strength):
         return x
@@ -99,7 +100,7 @@ class _Finish:
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                return method.pulled(problem, x, weight, materials, self.iterations, False) if first.going else x
+                return method.pulled(problem, x, weight, materials, self.iterations, damped=False) if first.going else x
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0

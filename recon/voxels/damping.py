@@ -8,7 +8,8 @@ fine detail go, steps follow P g = gain (1 - L) g, up to `gain` times as long fo
 
 L acts on coarse cells of the slice plane (tents of `recon.kernels.cpu.tents`), so that it costs little beside a
 projection, and on each slice alone, so that slabs do not depend on each other. (Preconditioners for tomography: Fessler
-& Booth 1999, IEEE Trans. Image Process. 8, 688, eq. 24. Proximal steps in another metric: Combettes & Vũ 2014.)
+& Booth 1999, IEEE Trans. Image Process. 8, 688. Proximal steps in another metric: Combettes & Vũ 2014,
+Optimization 63, 1289.)
 """
 
 from __future__ import annotations

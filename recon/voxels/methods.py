@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import ClassVar, Self
 
@@ -20,7 +20,16 @@ from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
-from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.ordered_fista import (
+    ENDED,
+    MANY_SUBSETS,
+    MOST_SWEEPS,
+    SUBSETS,
+    USUAL_SWEEPS,
+    Subsets,
+    ordered_fista,
+    subsets_of,
+)
 from recon.voxels.priors import NoiseBalance, pnp_dct
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
@@ -36,30 +45,33 @@ from recon.voxels.voxel_problem import (
     largest_eigenvalue,
 )
 
+QUALITIES: dict[Quality, tuple[float, int]] = {"preview": (4.0, 1), "standard": (1.0, 1), "best": (0.25, 4)}
+"""Factors on the change of a volume that stands still, and on the largest number of iterations."""
+
 
 @dataclass(frozen=True)
 class FistaTv(VoxelMethod):
-    """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.priors`. Memory: 7 volumes,
+    """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
+
+    The iterations end when the volume stands still: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes,
     2 x the projections.
 
-    The sweeps end where the volume stands still: about 20 of 180 views, 35 of 30.
-
     Attributes:
-        iterations: passes over all views, at most.
-        tv_weight: None chooses μ by views held out, or by the noise of the data, see `choose_weight`; a number is the
-            threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
-        subsets: of the views, a step each in the first sweeps, at most.
+        iterations: largest number of iterations over all projections.
+        tv_weight: None: μ follows from held-out projections, or from the noise of the data, see `choose_weight`. A
+            number: the threshold of one step of FISTA in density units, μ = tv_weight x density unit x ||A||².
+        subsets: largest number of subsets in the first iterations, with one step each.
         tv_steps: dual steps of total variation in each step.
-        still: share of the norm of the volume by which four sweeps together change it where it stands still; 0: all
+        still: the volume stands still if four iterations together change it by less than this share of its norm; 0: all
             iterations are made.
     """
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    takes: ClassVar[frozenset[str]] = frozenset({"device", "quality"})
     halo: ClassVar[int] = 12
     error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
-    buffers: ClassVar[Buffers] = Buffers(7.3, 3.0, 4.8, filtered=True)
+    buffers: ClassVar[Buffers] = Buffers(8.3, 3.0, 4.8, filtered=True)
 
     iterations: Count = MOST_SWEEPS
     tv_weight: NonNegative | None = None
@@ -77,20 +89,18 @@ class FistaTv(VoxelMethod):
 
     @property
     def usual_sweeps(self) -> int:
-        """Passes until the volume stands still, as a rule."""
+        """Usual number of iterations until the volume stands still."""
         return min(self.iterations, USUAL_SWEEPS)
 
     def refit(self, share: float) -> VoxelMethod:
-        """Early iterations on subsets, with this share of their number."""
-        given = {each.name: getattr(self, each.name) for each in fields(FistaTv)}
-        subsets, iterations = EarlyTv.subsets, max(1, round(share * min(self.iterations, EarlyTv.iterations)))
-        return EarlyTv(**given | {"subsets": subsets, "iterations": iterations})
+        """`EarlyTv` with this share of its iterations."""
+        iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
+        return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """A volume that is nearer its end, or further from it."""
-        factor = {"preview": 4.0, "standard": 1.0, "best": 0.25}[quality]
-        most = MOST_SWEEPS * 4 if quality == "best" else self.iterations
-        return replace(self, still=factor * self.still, iterations=max(self.iterations, most))
+        """The method that ends nearer to the minimum, or further from it."""
+        still, longer = QUALITIES[quality]
+        return replace(self, still=still * self.still, iterations=longer * self.iterations)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best weight; with one of its own that of the method's volume."""
@@ -116,7 +126,7 @@ class FistaTv(VoxelMethod):
             share, rays = self.tv_weight, problem.weight
             norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
             weight = problem.decide("weight", lambda: share * unit * norm)
-        subsets = Subsets.of(problem, self.subsets, self.damped)
+        subsets = Subsets.of(problem, subsets_of(projector.geometry, self.subsets, self.damped), self.damped)
         x = ordered_fista(
             problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
         )  # fmt: skip
@@ -128,8 +138,10 @@ class FistaTv(VoxelMethod):
 
 @dataclass(frozen=True)
 class EarlyTv(FistaTv):
-    """`FistaTv` with so many sweeps on subsets, which end before the volume stands still: volumes that are compared
-    with each other, and need not be finished."""
+    """`FistaTv` with a fixed number of iterations on subsets, which end before the volume stands still.
+
+    It is for volumes that are only compared with each other.
+    """
 
     iterations: Count = TRIAL_SWEEPS
     subsets: Count = MANY_SUBSETS
@@ -263,6 +275,8 @@ class PnpDct(VoxelMethod):
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not first.going:
             return x
+        for name in ENDED:  # of the first volume; patches follow
+            problem.decide.settings.pop(name, None)
         share = self.patch_threshold
         if share is None:
             strength = choose_patches(problem, weight, trial, self.trial_steps).strength

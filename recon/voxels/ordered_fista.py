@@ -1,18 +1,19 @@
-"""Ordered subsets of FISTA: total variation beside the views, in steps until the volume stands still.
+"""FISTA with ordered subsets and total variation, which ends when the volume stands still.
 
     min ½||A x - p||² + μ TV(x), x >= 0
 
-The first sweeps take steps from subsets of the views, which is faster by about their number and ends only near the
-minimum. The other sweeps take a step from all views, and end at it (Kim, Ramani & Fessler 2015, IEEE Trans. Med.
-Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183; O'Donoghue & Candès 2015). Steps are damped, see
-`recon.voxels.damping`.
+The steps of the first sweeps use subsets of the projections. They are faster by about the number of subsets, but end
+only near the minimum. The steps of the other sweeps use all projections, and end at the minimum (Kim, Ramani & Fessler
+2015, IEEE Trans. Med. Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183; O'Donoghue & Candès 2015).
+Steps are damped, see `recon.voxels.damping`.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -38,35 +39,36 @@ from recon.voxels.voxel_problem import (
 )
 
 SUBSETS, MANY_SUBSETS = 3, 9
-"""Of the views, at most: with damped steps, and without damping."""
+"""Largest number of subsets: with damped steps, and with steps that are not damped."""
 MOST_SWEEPS, USUAL_SWEEPS = 60, 30
-"""Sweeps, at most, and as a rule until the volume stands still."""
-ENDED = "ended"
-"""Name of the setting that says how the sweeps ended."""
+"""Largest number of sweeps, and the usual number until the volume stands still."""
+ENDED = "ended", "ended_after", "last_change"
+"""Names of the settings that say how the sweeps ended ("still": the volume stood still; "stopped"; "bound": all were
+made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
 _STILL = "still"  # name of the decision whether the volume stands still
-_LEAST_OF_MANY = 12  # views of a subset without damping
-_LEAST_ON_SUBSETS = 6  # sweeps
-MOST_MOMENTUM = 0.9
-"""Of damped steps. More of it adds up the errors of proximal steps, which take three dual steps: of views whose air
-weighs five times as much as their matter, volumes then change by 1 % in four sweeps for ever."""
-MIRRORED = 4
-"""Sweeps after which total variation takes the same differences again, see `TotalVariationProx`: volumes so many sweeps
-apart are compared."""
-_LOOKED_AT = 9  # views of a sweep whose residual is looked at
+_LEAST_OF_MANY = 12  # smallest number of projections in a subset, if steps are not damped
+_LEAST_ON_SUBSETS = 6  # smallest number of sweeps on subsets
+_MOST_MOMENTUM = 0.9
+"""Largest momentum of damped steps. A larger one adds up the errors of the proximal steps, which make three dual steps
+only: if the air weighs five times as much as the sample, the volume then changes by 1 % in four sweeps, for ever."""
+_MIRRORED = 4
+"""After this many sweeps total variation takes the same differences again, see `TotalVariationProx`. Therefore volumes
+that are compared lie this many sweeps apart."""
+_LOOKED_AT = 9  # number of projections of a sweep whose residual is kept
 
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """Subsets of the views of a problem, which all runs with these views and weights can share.
+    """Subsets of the projections of a problem. All runs with these projections and weights can share them.
 
     Attributes:
-        views: indices, of each subset.
-        projectors: of these views.
+        views: indices, for each subset.
+        projectors: for each subset.
         step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
-        plain_norm: the same eigenvalue, of the projector that is not sharpened.
-        damping: of steps; its gain is 1 where they are not damped.
-        damped_step: the same as `step`, of damped steps.
-        of_all: the damping of steps from all views.
+        plain_norm: the same eigenvalue, for the projector that is not sharpened.
+        damping: of steps from a subset; its gain is 1 if steps are not damped.
+        damped_step: like `step`, for damped steps and the columns of the problem.
+        damping_of_all: of steps from all projections.
     """
 
     views: Sequence[NDArray[np.intp]]
@@ -75,38 +77,42 @@ class Subsets:
     plain_norm: float
     damping: Damping
     damped_step: float
-    of_all: Damping
+    damping_of_all: Damping
 
     @classmethod
-    def of(cls, problem: VoxelProblem, most: int = SUBSETS, damped: bool = True) -> Subsets:
-        """At most `most` subsets of the views; see `subsets_of`."""
+    def of(cls, problem: VoxelProblem, count: int, damped: bool = True) -> Subsets:
+        """So many subsets, see `subsets_of`."""
         projector, weight = problem.projector, problem.weight
-        count, heaviest = subsets_of(projector.geometry, most, damped), 0
         views = interleaved(projector, count)
         projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
         rays = [None if weight is None else weight[some] for some in views] if count > 1 else [weight]
+        heaviest = 0
         if weight is not None:
             heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
         norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
         step = 1 / (norm * max(part.gain(some) for part, some in zip(projectors, rays, strict=True)))
         if problem.with_all_columns is not None:
-            step = cls.of(problem.with_all_columns(), most, damped).step
+            step = cls.of(problem.with_all_columns(), count, damped=False).step
         nz, ny, nx = projector.grid.shape
-        n_views = projector.geometry.n_views
-        if not damped or (damping := Damping.of((ny, nx, nz), len(views[heaviest]))).gain == 1:
-            none = Damping((ny, nx, nz), 1.0)
-            return cls(views, projectors, step, norm, none, step, none)
-        longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], damping)
-        return cls(views, projectors, step, norm, damping, longest, Damping.of((ny, nx, nz), n_views))
+        undamped = Damping((ny, nx, nz), 1.0)
+        made = cls(views, projectors, step, norm, undamped, step, undamped)
+        of_subset, of_all = (Damping.of(undamped.shape, n) for n in (len(views[heaviest]), projector.geometry.n_views))
+        if not damped or of_subset.gain == 1:
+            return made
+        longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], of_subset)
+        return replace(made, damping=of_subset, damped_step=longest, damping_of_all=of_all)
 
     @property
     def is_damped(self) -> bool:
-        return self.of_all.gain > 1
+        return self.damping_of_all.gain > 1
 
 
 def subsets_of(geometry: Geometry, most: int = SUBSETS, damped: bool = True) -> int:
-    """Number of subsets: of `LEAST_OF_SUBSET` views or more. Without damping twelve views are one, and two from there
-    on, since with one the sweeps stop far from their end."""
+    """Number of subsets, `most` at most: each has `LEAST_OF_SUBSET` projections or more.
+
+    If steps are not damped, each has twelve or more, and there are two from twelve projections on, because with one
+    subset the sweeps stop far from the minimum.
+    """
     if damped:
         return max(1, min(most, geometry.n_views // LEAST_OF_SUBSET))
     whole = geometry.n_views // _LEAST_OF_MANY
@@ -114,10 +120,10 @@ def subsets_of(geometry: Geometry, most: int = SUBSETS, damped: bool = True) -> 
 
 
 RENEWED = 2
-"""Sweeps after which the volume is made anew towards which steps are pulled."""
+"""After this many sweeps the volume is made anew towards which steps are pulled."""
 
 
-# Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
+# Methods with a pull that held-out projections may prefer, also in the refinement of a fit, see `Discrete`.
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
 
 
@@ -142,7 +148,7 @@ class Pull(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The views that a step sees: their projector, and their numbers, or all."""
+    """The projections that a step uses: their projector, and their numbers, or all."""
 
     projector: LineProjector[Any]
     views: NDArray[np.intp] | slice
@@ -153,8 +159,8 @@ class _Descent:
 
     Attributes:
         x: [y, x, z], on the device.
-        error: Σ weight (A x - p)² of the last sweep, each view before its step.
-        seen: residuals of some views of the last sweep, whitened.
+        error: Σ weight (A x - p)² of the last sweep, each projection before its step.
+        seen: whitened residuals of some projections of the last sweep.
     """
 
     def __init__(self, problem: VoxelProblem, x: F32, subsets: Subsets, tv_steps: int, pull: Pull | None) -> None:
@@ -171,7 +177,7 @@ class _Descent:
             self._parts = [self._all]
         self._subsets, self._pull, self._problem = subsets, pull, problem
         self.x = device.array(x)
-        most = MOST_MOMENTUM if subsets.is_damped else 1.0
+        most = _MOST_MOMENTUM if subsets.is_damped else 1.0
         self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
         self._slope: Any = None  # cells of the slope of total variation at the last point
         self._target: Any = None
@@ -184,11 +190,11 @@ class _Descent:
             self._target = self._device.array(self._pull.target(self._device.numpy(self.x)))
 
     def sweep(self, weight: NoiseBalance | float, on_subsets: bool, looked_at: bool) -> None:
-        """One pass over the views; the momentum after its last step is left to `go_ahead`."""
+        """One pass over all projections; the momentum after its last step is left to `go_ahead`."""
         self.error, self.seen = 0.0, []
         parts = self._parts if on_subsets else [self._all]
         count, made = len(parts), self._subsets
-        damping, share = (made.damping, 1.0) if on_subsets else (made.of_all, 1 / len(self._parts))
+        damping, share = (made.damping, 1.0) if on_subsets else (made.damping_of_all, 1 / len(self._parts))
         mu = (weight.value if isinstance(weight, NoiseBalance) else weight) / count
         for at, s in enumerate(self._problem.rng.permutation(count)):
             self._residual(parts[s], count, looked_at)
@@ -197,10 +203,11 @@ class _Descent:
                 self._ahead(self.x)
 
     def go_ahead(self) -> None:
+        """Move the volume on by the momentum, to the start of the next step."""
         self._ahead(self.x)
 
     def _residual(self, part: _Part, count: int, looked_at: bool) -> None:
-        """Put the gradient of these views into `_gradient`, downhill."""
+        """Put the gradient of these projections into `_gradient`, downhill."""
         device, residual = self._device, part.projector.forward_lines(self.x)
         data, rays = self._data[part.views], None if self._rays is None else self._rays[part.views]
         self.error += device.replace_by_residual(data, residual, rays)
@@ -239,14 +246,16 @@ class _Descent:
         return self._device.numpy(self.x)
 
     def change(self) -> float:
-        """Distance of the volume from that of the last call over its norm; infinite at the first call."""
+        """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""
+        device, change = self._device, math.inf
         if self._before is None:
-            self._before = self._device.copy(self.x)
-            return math.inf
-        self._device.combine(1.0, self.x, -1.0, self._before, self._before)
-        change, size = self._device.norm(self._before), self._device.norm(self.x)
-        self._device.combine(1.0, self.x, 0.0, self.x, self._before)
-        return change / size if size > 0 else 0.0
+            self._before = device.copy(self.x)
+        else:
+            device.combine(1.0, self.x, -1.0, self._before, self._before)
+            size = device.norm(self.x)
+            change = device.norm(self._before) / size if size > 0 else 0.0
+            device.combine(1.0, self.x, 0.0, self.x, self._before)
+        return change
 
 
 def ordered_fista(
@@ -257,18 +266,19 @@ def ordered_fista(
 
         x <- prox_{gain t μ TV}(x + gain t (g - L (g - v))),    g = A_sᵀ W (p_s - A_s x), downhill
 
-    with m subsets s of the views, μ / m for μ, and t the safe step of gain (1 - L) AᵀWA of a subset. v is μ times the
-    slope of total variation at the last point, by the last proximal step: where the volume stands still, g = v, and the
-    steps end at the minimum whatever L is. Without damping (gain 1, L = 0) these are the steps of FISTA.
+    with m subsets s of the projections, μ / m for μ, and t the safe step of gain (1 - L) AᵀWA of a subset. v is μ times
+    the slope of total variation at the last point, by the last proximal step: if the volume stands still, g = v, and
+    the steps end at the minimum whatever L is. Without damping (gain 1, L = 0) these are the steps of FISTA.
 
-    After `SWEEPS_OF_VIEWS` projected views, six sweeps at least, each step is from all views, and the sweeps end where
-    four of them together change the volume by less than `still` of its norm. Without damping all sweeps are on subsets,
-    and there are `sweeps` of them. Memory: 7 volumes, 2 x the projections.
+    After `SWEEPS_OF_VIEWS` projections, and six sweeps at least, each step uses all projections. The sweeps end when
+    four of them together change the volume by less than `still` of its norm; the settings `ENDED` say how they ended.
+    If steps are not damped, all sweeps are on subsets, and there are `sweeps` of them. Memory: 8 volumes, 2 x the
+    projections.
 
     Args:
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
-        sweeps: at most.
+        sweeps: largest number.
         tv_steps: dual steps of each proximal step, which continue from the last ones.
         pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is minimised, too.
         still: share of the norm of the volume; 0: all sweeps are made.
@@ -276,27 +286,27 @@ def ordered_fista(
     descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
     n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
     first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(SWEEPS_OF_VIEWS / n_views))
+    change, ended, done = math.inf, "bound", 0
     for k in range(sweeps):
+        done = k + 1
         if k % RENEWED == 0:
             descent.renew_target()
         on_subsets = k < first or not subsets.is_damped
         descent.sweep(weight, on_subsets, by_noise)
         if isinstance(weight, NoiseBalance):
             weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(descent.seen)))
-        going = problem.go_on(k + 1, math.sqrt(descent.error) / scale)
-        if not on_subsets and (k - first) % MIRRORED == 0 and _stands_still(problem, descent.change(), still, k + 1):
+        going = problem.go_on(done, math.sqrt(descent.error) / scale)
+        if not on_subsets and (k - first) % _MIRRORED == 0:
+            change = descent.change()
+            if problem.decide(_STILL, partial(operator.lt, change, still)):
+                ended = "still"
+                break
+        if not going:
+            ended = "stopped"
             break
-        if not going or k + 1 == sweeps:
-            break
-        descent.go_ahead()
+        if done < sweeps:
+            descent.go_ahead()
+    if subsets.is_damped:
+        values = ended, done, change
+        problem.decide.settings |= {name: value for name, value in zip(ENDED, values, strict=True) if value != math.inf}
     return descent.volume
-
-
-def _stands_still(problem: VoxelProblem, change: float, still: float, done: int) -> bool:
-    """Whether the last sweeps changed the volume by less than a share `still`; the record says how far it is."""
-    ends = problem.decide(_STILL, lambda: change < still)
-    problem.decide.settings[ENDED] = (
-        f"the volume stands still after {done} sweeps" if ends
-        else f"{done} sweeps, of which the last {MIRRORED} changed the volume by {change:.2%}"
-    )  # fmt: skip
-    return ends

@@ -56,6 +56,11 @@ class Scaled(Fbp):
         )
 
 
+def test_it_is_a_name_in_the_library(data: F32) -> None:
+    by_name = recon.reconstruct(data, VIEWS, "auto", grid=GRID)
+    assert by_name.method in [each.name for each in Auto().candidates] and by_name.chosen
+
+
 def test_it_takes_the_method_that_predicts_unseen_views_best_and_says_so(data: F32) -> None:
     auto = Auto((Scaled(factor=0.5), Scaled(factor=1.0), Scaled(factor=1.5)))
     found = recon.reconstruct(data, VIEWS, auto)

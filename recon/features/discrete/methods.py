@@ -11,17 +11,27 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.choices import Quality
 from recon.base.decisions import GoesOn, MaterialPrior, Prior
+from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
-from recon.base.setting import Count
+from recon.base.setting import Count, NonNegative
 from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.methods import EarlyTv, FistaTv
-from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.methods import QUALITIES, EarlyTv, FistaTv
+from recon.voxels.ordered_fista import (
+    MANY_SUBSETS,
+    MOST_SWEEPS,
+    SUBSETS,
+    USUAL_SWEEPS,
+    Subsets,
+    ordered_fista,
+    subsets_of,
+)
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
 from recon.voxels.trial import TV_STEPS, Trial
@@ -33,7 +43,7 @@ MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
 of the middle between two levels).
 """
-REFIT_SWEEPS = 16  # of error bars, in all
+_REFIT_SWEEPS = 16  # iterations of which error bars make a share
 _TRIALS = 6  # usual number of test reconstructions with levels
 
 
@@ -52,18 +62,20 @@ class Discrete(VoxelMethod):
         iterations: largest number of iterations over all projections after those of FISTA-TV.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
             voxels are pulled weakly to given levels.
+        still: as of `FistaTv`.
     """
 
     name: ClassVar[str] = "discrete"
     label: ClassVar[str] = "Discrete"
-    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    takes: ClassVar[frozenset[str]] = frozenset({"device", "quality"})
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 3.0, 0.2
-    buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
+    buffers: ClassVar[Buffers] = Buffers(10.6, 3.0, 4.8, filtered=True)
     first_sweeps: ClassVar[int] = MOST_SWEEPS
 
     iterations: Count = MOST_SWEEPS
     levels: tuple[float, ...] | None = None
+    still: NonNegative = STANDS_STILL
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
@@ -71,9 +83,14 @@ class Discrete(VoxelMethod):
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """As of `FistaTv`."""
+        still, longer = QUALITIES[quality]
+        return replace(self, still=still * self.still, iterations=longer * self.iterations)
+
     def refit(self, share: float) -> VoxelMethod:
-        """Early iterations of total variation, with this share of the number that a finish makes."""
-        return EarlyTv(iterations=max(1, round(share * REFIT_SWEEPS)), allow_negative=self.allow_negative)
+        """`EarlyTv` with this share of the iterations for which the error bars are calibrated."""
+        return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
     @property
     def usual_sweeps(self) -> int:
@@ -122,9 +139,9 @@ class Discrete(VoxelMethod):
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return EarlyTv(iterations=self.iterations).iterate(problem, x)
+            return FistaTv(self.iterations, still=self.still).iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
-        x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+        x, weight = FistaTv(still=self.still).with_weight(replace(problem, go_on=first), x, trial)
         materials = self.materials(problem, weight, trial)
         if materials is None or not first.going:
             return x
@@ -155,9 +172,10 @@ class Discrete(VoxelMethod):
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
-        subsets = Subsets.of(problem, SUBSETS if damped else MANY_SUBSETS, damped)
+        count = subsets_of(problem.projector.geometry, SUBSETS if damped else MANY_SUBSETS, damped)
+        subsets = Subsets.of(problem, count, damped)
         x = ordered_fista(
-            further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
+            further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS, still=self.still,
             pull=MaterialPull(drawn_apart(materials), where, thin),
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: undecided_share(x[where], materials))

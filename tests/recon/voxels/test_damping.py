@@ -13,7 +13,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import CPU
-from recon.voxels.ordered_fista import ENDED, Subsets, ordered_fista
+from recon.voxels.ordered_fista import ENDED, Subsets, ordered_fista, subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights
 
@@ -109,12 +109,32 @@ def test_damped_steps_end_at_the_minimum_of_steps_without_damping(cone: bool, we
     assert np.linalg.norm(by_damped - by_slow) < 0.02 * np.linalg.norm(by_slow)
 
 
-def test_the_record_says_how_the_sweeps_ended() -> None:
+@pytest.mark.parametrize(
+    ("sweeps", "still", "stop_at", "ended"),
+    [(200, 0.005, 999, "still"), (40, 0.0, 999, "bound"), (200, 0.0, 3, "stopped"), (200, 0.0, 30, "stopped")],
+)
+def test_the_settings_say_how_the_sweeps_ended(sweeps: int, still: float, stop_at: int, ended: str) -> None:
     problem, start = _problem(False, False)
-    subsets, mu = Subsets.of(problem), 0.02 * float(problem.data.max())
     done: list[int] = []
-    watched = replace(problem, go_on=lambda sweep, _: not done.append(sweep))
-    ordered_fista(watched, start.copy(), mu, subsets, sweeps=200, tv_steps=3)
-    assert problem.decide.settings[ENDED] == f"the volume stands still after {len(done)} sweeps" and len(done) < 100
-    ordered_fista(watched, start.copy(), mu, subsets, sweeps=40, tv_steps=3, still=0.0)
-    assert "changed the volume by" in problem.decide.settings[ENDED] and done[-1] == 40
+
+    def go_on(sweep: int, residual: float) -> bool:
+        done.append(sweep)
+        return sweep < stop_at
+
+    made, mu = replace(problem, go_on=go_on), 0.02 * float(problem.data.max())
+    subsets = Subsets.of(made, subsets_of(made.projector.geometry))
+    ordered_fista(made, start, mu, subsets, sweeps=sweeps, tv_steps=3, still=still)
+    settings = made.decide.settings
+    assert settings[ENDED[0]] == ended and settings[ENDED[1]] == len(done) == done[-1]
+    if stop_at == 3:  # no volume was compared with an earlier one
+        assert ENDED[2] not in settings
+    else:
+        assert (settings[ENDED[2]] < 0.005) is (ended == "still") or still == 0
+
+
+def test_steps_that_are_not_damped_make_all_sweeps_and_say_nothing() -> None:
+    problem, start = _problem(False, False)
+    done: list[int] = []
+    made = replace(problem, go_on=lambda sweep, _: not done.append(sweep))
+    ordered_fista(made, start, 0.1, Subsets.of(made, 1, damped=False), sweeps=25, tv_steps=3, still=1.0)
+    assert len(done) == 25 and not set(ENDED) & made.decide.settings.keys()

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.slopes import slopes_at, windowed
-from recon.kernels.cpu.vectors import add_product, combine, dot, extrapolate, replace_by_residual, turn_of_steps
+from recon.kernels.cpu.vectors import add_product, combine, dot, extrapolate, norm, replace_by_residual, turn_of_steps
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 33, 70), (2, 64, 5), (1, 7, 100)])
@@ -87,6 +87,7 @@ def test_results_equal_those_of_numpy(n: int, rng: np.random.Generator) -> None:
     a, b, w = (rng.normal(size=n).astype(np.float32) for _ in range(3))
     wide = [v.astype(np.float64) for v in (a, b, w)]
     assert dot(a, b) == pytest.approx(float(wide[0] @ wide[1]), rel=1e-6, abs=1e-6 * n)
+    assert norm(a) == pytest.approx(float(np.linalg.norm(wide[0])), rel=1e-6)
     out = np.empty_like(a)
     combine(2.0, a, -0.5, b, out)
     np.testing.assert_allclose(out, 2 * wide[0] - 0.5 * wide[1], atol=1e-6)

@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch.overrides import TorchFunctionMode
 
-from recon.kernels.cpu import patches, tv, vectors
+from recon.kernels.cpu import patches, tents, tv, vectors
 from recon.kernels.cpu.spread import passes_of, spread
+from recon.voxels.devices import CPU
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 
 volumes = importlib.import_module("recon.kernels.gpu.volumes")
@@ -74,6 +75,38 @@ def test_the_turn_of_steps_is_the_cpus(at_once: int, rng: np.random.Generator, m
     found, size = gpu.turn_of_steps(*map(gpu.array, given)), float(np.prod(given[0].shape))
     assert found == pytest.approx(vectors.turn_of_steps(*given), abs=1e-6 * size)
     assert type(found) is float and abs(found) > 1e-2 * size
+
+
+@pytest.mark.parametrize("at_once", [1, 1 << 20])
+def test_products_and_norms_are_the_cpus(
+    at_once: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(volumes, "_AT_ONCE", at_once)
+    a, b = drawn(rng, (7, 11, 30), 2)
+    assert gpu.dot(gpu.array(a), gpu.array(b)) == pytest.approx(vectors.dot(a, b), rel=1e-5)
+    assert gpu.norm(gpu.array(a)) == pytest.approx(vectors.norm(a), rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("width", [1, 2, 3, 8])
+def test_sums_in_coarse_cells_and_what_they_add_are_the_cpus(
+    shape: Shape, width: int, rng: np.random.Generator
+) -> None:
+    x = drawn(rng, shape, 1)[0]
+    there, expected = gpu.array(x), tents.tent_sums(x, width)
+    sums = gpu.tent_sums(there, width)
+    assert_close(sums, expected, 32)
+    np.testing.assert_array_equal(gpu.numpy(there), x)
+    gpu.add_tents(there, -0.7, sums, width)
+    tents.add_tents(x, -0.7, expected, width)
+    assert_close(there, x, 64)
+
+
+@pytest.mark.parametrize("shape", [(8, 6, 3), (7, 5, 2), (1, 4, 5), (1, 1, 2)])
+def test_filtered_cells_are_the_cpus(shape: Shape, rng: np.random.Generator) -> None:
+    cells = drawn(rng, shape, 1)[0]
+    transfer = rng.uniform(0, 1, (shape[0], shape[1] // 2 + 1)).astype(np.float32)
+    assert_close(gpu.filtered(gpu.array(cells), transfer), CPU.filtered(cells, transfer), 16)
 
 
 def test_sums_are_of_float64() -> None:
