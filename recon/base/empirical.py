@@ -63,15 +63,6 @@ OS-SIRT-TV: -5.6 dB on cement in a cone."""
 
 # When does total variation end?
 
-LEAST_OF_SUBSET = 15
-"""Smallest number of projections in a subset, because the steps of smaller subsets disagree; there are at most three
-subsets. Without it, with one subset of 30 projections: half as many iterations more."""
-
-SWEEPS_OF_VIEWS = 540
-"""Projections that are used on subsets before each step uses all of them: 18 iterations of 30 projections, 6 of 90.
-Without it: iterations on subsets alone end up to 0.5 dB beside the minimum, on packed grains from 30 and 45
-projections."""
-
 STANDS_STILL = 0.005
 """Share of the norm of a volume: the iterations end when four of them change the volume by less. Without it, after the
 20 iterations of earlier versions: -1 to -3 dB of FISTA-TV on packed grains from 30 and 45 projections."""

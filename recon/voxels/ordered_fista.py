@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.empirical import LEAST_OF_SUBSET, STANDS_STILL, SWEEPS_OF_VIEWS
+from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
 from recon.base.registry import MethodEntry, in_folders, loaded
 from recon.voxels.damping import Damping, largest_damped
@@ -46,8 +46,10 @@ ENDED = "ended", "ended_after", "last_change"
 """Names of the settings that say how the sweeps ended ("still": the volume stood still; "stopped"; "bound": all were
 made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
 _STILL = "still"  # name of the decision whether the volume stands still
-_LEAST_OF_MANY = 12  # smallest number of projections in a subset, if steps are not damped
-_LEAST_ON_SUBSETS = 6  # smallest number of sweeps on subsets
+_LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset: with damped steps, and without
+# Subsets save time and do not change where the damped steps end. With one subset, 45 sweeps of 30 projections instead of
+# 31, and 29 of 180 instead of 23; 0 to 15 % more CPU time. With subsets up to the end: -0.1 to -1.0 dB.
+_LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540  # sweeps, and projections in sweeps, on subsets: the larger of the two
 _MOST_MOMENTUM = 0.9
 """Largest momentum of damped steps. A larger one adds up the errors of the proximal steps, which make three dual steps
 only: if the air weighs five times as much as the sample, the volume then changes by 1 % in four sweeps, for ever."""
@@ -108,13 +110,13 @@ class Subsets:
 
 
 def subsets_of(geometry: Geometry, most: int = SUBSETS, damped: bool = True) -> int:
-    """Number of subsets, `most` at most: each has `LEAST_OF_SUBSET` projections or more.
+    """Number of subsets, `most` at most: each has `_LEAST_OF_SUBSET` projections or more.
 
     If steps are not damped, each has twelve or more, and there are two from twelve projections on, because with one
     subset the sweeps stop far from the minimum.
     """
     if damped:
-        return max(1, min(most, geometry.n_views // LEAST_OF_SUBSET))
+        return max(1, min(most, geometry.n_views // _LEAST_OF_SUBSET))
     whole = geometry.n_views // _LEAST_OF_MANY
     return max(1, min(most, max(whole, 2) if whole else 1))
 
@@ -270,7 +272,7 @@ def ordered_fista(
     the slope of total variation at the last point, by the last proximal step: if the volume stands still, g = v, and
     the steps end at the minimum whatever L is. Without damping (gain 1, L = 0) these are the steps of FISTA.
 
-    After `SWEEPS_OF_VIEWS` projections, and six sweeps at least, each step uses all projections. The sweeps end when
+    After `_VIEWS_ON_SUBSETS` projections, and six sweeps at least, each step uses all projections. The sweeps end when
     four of them together change the volume by less than `still` of its norm; the settings `ENDED` say how they ended.
     If steps are not damped, all sweeps are on subsets, and there are `sweeps` of them. Memory: 8 volumes, 2 x the
     projections.
@@ -285,7 +287,7 @@ def ordered_fista(
     """
     descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
     n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
-    first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(SWEEPS_OF_VIEWS / n_views))
+    first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(_VIEWS_ON_SUBSETS / n_views))
     change, ended, done = math.inf, "bound", 0
     for k in range(sweeps):
         done = k + 1

@@ -103,7 +103,6 @@ REMOVED: dict[str, Removed] = {
     "SHARE_OF_NOISE": Removed(1.0, BY_NOISE, by_noise=True),
     "MOST_BY_RESIDUAL": Removed(1.0, BY_NOISE, by_noise=True),
     "MANY_VIEWS": Removed(0.0, BY_NOISE, by_noise=True),
-    "LEAST_OF_SUBSET": Removed(1, PATCHES),
     "SPREAD": Removed(1.0, FITS),
     "WILD_PIXEL": Removed(math.inf, ("one wild pixel",), recon.R2(steps=400)),
     "EMPTY": Removed(math.inf, ("region",)),

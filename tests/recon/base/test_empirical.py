@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.base import empirical
 
 SOURCE = Path(empirical.__file__)
-MOST = 36
+MOST = 34
 
 
 def _constants() -> list[tuple[list[str], str]]:
