@@ -80,7 +80,10 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except Exception as error:  # readers of foreign files raise various errors if one is damaged
         raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
     if not arrays:
-        raise DataError(f"{path} is not an OME-Zarr image. Name an array in it; in `view` as {path.name}::NAME.")
+        raise DataError(
+            f"{path} is not an OME-Zarr image. Name one of its arrays with --dataset NAME. In `beamline view`, write "
+            f"{path.name}::NAME."
+        )
     finest, *coarser = arrays
     _require_volume(path, finest)
     scales = [finest, *(array for array in coarser if is_halved(finest.shape[-3:], array))]

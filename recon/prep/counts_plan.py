@@ -46,9 +46,10 @@ class CorrectionSettings:
         zinger_threshold: a pixel counts as a zinger if it is brighter by this many standard deviations than its
             surroundings and than the neighbouring projections, see `recon.prep.spots.spots`; inf: no zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
-            Each projection is divided by their level, or by the line through the levels of both sides.
-        sample_from: line integral at the edges from which on "auto" takes the edges for sample, see
-            `references.edge_depth`.
+            Each projection is divided by the level of these columns. If both sides have such columns, it is divided by
+            the line through the levels of both sides.
+        sample_from: limit of the line integral at the edges of the detector. Above it, "auto" decides that the edges
+            show sample and not air, see `references.edge_depth`.
     """
 
     floor: float = 1e-4

@@ -91,12 +91,12 @@ class Tuning:
             ),
             (
                 "view",
-                f"transmission {middle:.3g} (median), {low:.3g} in its darkest hundredth, at {degrees(self.angle)}",
+                f"transmission {middle:.3g} (median), {low:.3g} in its darkest 1 %, at {degrees(self.angle)}",
             ),
             (
                 "noise",
-                f"of a line integral in one projection at the advised exposure: {at_middle:.3g}, {at_low:.3g} in the "
-                "darkest hundredth",
+                f"of a line integral in one projection at the advised exposure: {at_middle:.3g} (median), {at_low:.3g} "
+                "in the darkest 1 % of the projection",
             ),
             (
                 "exposure",
@@ -109,7 +109,7 @@ class Tuning:
                 ("X-rays", f"{self.x_rays:.3g} photons per count, from optics.light_path (for --photons-per-count)")
             ]
         if math.isnan(self.advised):
-            words[3:] = [("exposure", "not known until the fault is mended")]
+            words[3:] = [("exposure", "not known until the fault is fixed")]
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
 
 

@@ -227,15 +227,15 @@ def without_background(
 
 
 def _described(fitted: Background, levelled: float) -> str:
-    """The surface in words, and the line that was subtracted before it."""
+    """The fitted polynomial in words, and the line that was subtracted before the fit."""
     from recon.prep.background import LEAST_SIZE
 
     before = ""
     if abs(levelled) >= LEAST_SIZE:
         before = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
     return (
-        f"{before}the air is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line "
-        f"integral, fitted to the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
+        f"{before}a polynomial of order {fitted.order} in column and row was fitted to the {fitted.air:.0%} of the "
+        f"rays that miss the sample, and its values are {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line integral"
     )
 
 

@@ -254,8 +254,8 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
             f"Give the angles with --angles FILE (degrees, one per line): {file.filename} has no "
-            "/exchange/theta, and neither /process/acquisition/rotation nor attributes of /exchange "
-            "state one start and one step of the rotation of at most 180 degrees. Some programs assume 0 "
+            "/exchange/theta. Neither /process/acquisition/rotation nor the attributes of /exchange state a single "
+            "start and a single step of the rotation (the step may be at most 180 degrees). Some programs assume 0 "
             "to 180 degrees in this case; this one does not."
         )
     angles = datasets.radians(theta, default="degrees")

@@ -53,12 +53,17 @@ def charges_of(ctx: click.Context, param: click.Parameter, value: str | None) ->
     metavar="KEV",
     help="Step between the energies of a scene in keV.",
 )
-@click.option("--material", metavar="NAME", help="Material of the scene. Default: the one with a state of charge.")
+@click.option(
+    "--material",
+    metavar="NAME",
+    help="Material of the scene whose contrast is measured. Default: the only material with a state_of_charge (how far "
+    "a battery cathode is charged).",
+)
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random numbers of a scene."
 )
 @click.option("--states", "charges", metavar="CHARGE,...", callback=charges_of,
-              help="Simulate the scene with its material in each of these states of charge, 0 to 1.")  # fmt: skip
+              help="Simulate the scene once for each of these states of charge of the material, 0 to 1.")  # fmt: skip
 @click.option("--region", "regions", multiple=True, callback=lambda ctx, param, values: tuple(map(box, values)),
               metavar=_BOX, help="Where the frames of a file show the material. Default: everywhere.")  # fmt: skip
 @click.option("--around", callback=lambda ctx, param, value: None if value is None else box(value), metavar=_BOX,

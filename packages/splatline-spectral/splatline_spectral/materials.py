@@ -64,7 +64,10 @@ def read_spectra(path: Path) -> Spectra:
     except (OSError, csv.Error, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a table of spectra ({error}). Expected {_TABLE}.") from error
     if head[0].strip() != "energy_kev" or not names or len({name.casefold() for name in names}) < len(names):
-        raise DataError(f"{path} begins with {','.join(head)[:80]!r}. Expected {_TABLE}, with different names.")
+        raise DataError(
+            f"{path} begins with {','.join(head)[:80]!r}. Expected {_TABLE}. Each NAME may occur only once, "
+            "and capitals do not make a name different."
+        )
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
         raise DataError(f"{path}: energies must differ, and all values must be finite and 0 or more.")
     if any(name != safe_name(name) for name in names):

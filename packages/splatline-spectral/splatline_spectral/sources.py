@@ -46,7 +46,7 @@ def series_of_scene(
 
     Args:
         name: a scene file, or the name of a scene in the package.
-        material: the material whose contrast is measured; None: the one with a state of charge.
+        material: the material whose contrast is measured; None: the only one with a `state_of_charge`.
         seed: seed of all random numbers.
         charge: state of charge, 0 to 1, of the material; None: that of the scene.
 

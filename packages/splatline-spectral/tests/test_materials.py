@@ -140,7 +140,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "different names"),
+        ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "Each NAME may occur only once"),
         ('energy_kev,"a\nb"\n8.3,1\n8.4,2\n', "parts of file names"),
         ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "cannot be read as a table of spectra"),
         ("energy_kev,a\n8.3,1\n8.3,2\n", "energies must differ"),

@@ -143,5 +143,6 @@ def _because(still: float, moved: float, moves: bool) -> str:
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, because {judged}"
     return (
-        f"no motion: {judged}, which is lower, but not by enough to be sure. If the sample moved, compare with --moves"
+        "no motion, because the lower residual with motion may be chance: "
+        f"{judged}. If the sample moved, make a second volume with --moves and compare the two"
     )

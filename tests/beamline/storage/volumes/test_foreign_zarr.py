@@ -107,7 +107,7 @@ def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     zarr.create_group(str(tmp_path / "bare.zarr"))
     zarr.create_array(str(tmp_path / "channels.zarr"), shape=(3, 4, 4, 4), dtype="u1", chunks=(1, 4, 4, 4))
     _write(tmp_path / "cut.zarr", 3, "zstd")
-    for name, said in (("bare", "Name an array in it"), ("channels", "one time and one channel")):
+    for name, said in (("bare", "Name one of its arrays"), ("channels", "one time and one channel")):
         with pytest.raises(DataError, match=said), opened_volume(tmp_path / f"{name}.zarr"):
             pass
     with pytest.raises(DataError, match="as a Zarr"), opened_volume(tmp_path / "bare.zarr", "nothing"):
