@@ -47,8 +47,8 @@ ENDED = "ended", "ended_after", "last_change"
 made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
 _STILL = "still"  # name of the decision whether the volume stands still
 _LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset: with damped steps, and without
-# Subsets save time and do not change where the damped steps end. With one subset, 45 sweeps of 30 projections instead of
-# 31, and 29 of 180 instead of 23; 0 to 15 % more CPU time. With subsets up to the end: -0.1 to -1.0 dB.
+# Subsets save time and do not change where the damped steps end. With one subset: 45 sweeps of 30 projections instead
+# of 31, and 29 of 180 instead of 23; 0 to 15 % more CPU time. With subsets up to the end: -0.1 to -1.0 dB.
 _LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540  # sweeps, and projections in sweeps, on subsets: the larger of the two
 _MOST_MOMENTUM = 0.9
 """Largest momentum of damped steps. A larger one adds up the errors of the proximal steps, which make three dual steps
