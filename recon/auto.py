@@ -87,14 +87,14 @@ class Auto(Method):
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
-            return TrialChoice(f"{problem.geometry.n_views} views are too few to hold any out")
+            return TrialChoice(f"{problem.geometry.n_views} projections are too few to hold any out")
         trial = _trial(problem, "", control, self.candidates)
         if trial is None and problem.geometry.is_cone:
             trial = _trial(*_coarse(problem), control, self.candidates)
         if control.stop():
             return TrialChoice("stopped before the choice")
         if trial is None:
-            return TrialChoice("views held out show nothing of the rows with most matter")
+            return TrialChoice("the held-out projections have no valid rays in the rows with the most material")
         with threads_for(problem.grid):
             choice = trial.compare(self.candidates, self.least_gain)
         if trial.ended:

@@ -20,7 +20,7 @@ LEAST_GAIN = 0.02
 """Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
 time."""
 
-_MEASURE = "root mean square left of views held out, in line integrals"  # by which a choice is explained
+_MEASURE = "root mean square residual in held-out projections, as line integrals"  # by which a choice is explained
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
 TRIALS = 4
@@ -149,7 +149,7 @@ class TrialChoice(NamedTuple):
         given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
         listed = [f"{name} {mean:#.4g}" for name, mean in given]
         remarks = [each.remark for each in self.predictions if each.remark]
-        return f"trials on {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
+        return f"test reconstructions of {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
 
     @property
     def _of_the_best(self) -> str:
@@ -158,10 +158,11 @@ class TrialChoice(NamedTuple):
             return ""
         (simple, mine), (best, least) = ((self.predictions[at].name, self.tried[at]) for at in (self.at, self.best))
         less, error = ((mine - least).mean() / mine.mean(), _standard_error(mine - least) / mine.mean())
-        by = f"{self.least_gain:.2%} less, and less " if self.least_gain else "less "
+        by = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
         return (
-            f". {best} leaves {less:.2%} less than {simple}, with a standard error of {error:.2%}. {simple} is taken, "
-            f"because it is simpler, and a costlier method must leave {by}by more than one standard error"
+            f". The residual of {best} is {less:.2%} smaller than that of {simple} (standard error {error:.2%}). "
+            f"{simple} was chosen, because it is simpler: the residual of a costlier method must be smaller by {by}one "
+            "standard error"
         )
 
 

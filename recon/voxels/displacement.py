@@ -88,7 +88,7 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
         ValueError: for a cone, whose rays a shift of the sample turns.
     """
     if geometry.is_cone:
-        raise ValueError("views of a cone beam are not corrected by shifts: they differ by more than these")
+        raise ValueError("shifts cannot correct projections of a cone beam, because they differ by more than shifts")
     x, y, z, turn, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)
     across, down = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch

@@ -74,8 +74,8 @@ def measured_law(
         raise ValueError("the law of the error is not measured for a cone beam")
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
-            f"{n} views and {len(open_beam)} frames of the open beam are there, "
-            f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed to measure the law of the error"
+            f"the law of the error needs {LEAST_VIEWS} projections and {_LEAST_FRAMES} frames of the open beam; "
+            f"got {n} and {len(open_beam)}"
         )
     sample = sample_radius(Views(data, geometry))
     width = 1.0 if sample is None else sample.radius / geometry.reach  # of the sample, over the field's
@@ -85,7 +85,7 @@ def measured_law(
     method = _TotalVariation(slab.chosen_weight())
     volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
     if not volumes[1].any():
-        raise ValueError("these views show no matter, so that no law of the error is measured")
+        raise ValueError("the law of the error was not measured, because the projections show no sample")
     copy, second_copy = slab.copies(volumes[1], rng)
     copied = [slab.volume(method, copy, used) for used in (half, most)]
     errors = [slab.square_error(volume, volumes[1]) for volume in copied]

@@ -260,7 +260,9 @@ class PnpDct(VoxelMethod):
         Of a sample wider than the field it is not tried beside simpler methods, see `Trial.wide`.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
-            return Prediction(self.name, remark=f"{self.name} not tried, as the sample is wider than the field")
+            return Prediction(
+                self.name, remark=f"{self.name} not tried, because the sample is wider than the field of view"
+            )
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)

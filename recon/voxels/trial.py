@@ -43,6 +43,7 @@ from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 _WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
 TV_STEPS = 3  # of a trial, and of the finish of a fit
+_LEVELS_PREDICT = "discrete levels predict the held-out projections better"
 PATCH_STEPS = 35
 """Steps with sparse patches of a trial, and by default of `PnpDct`."""
 
@@ -355,7 +356,7 @@ class Trial:
         for each in candidates:
             try:
                 prediction = (
-                    Prediction(each.name, remark=f"{each.name} not tried, as few materials predict the views")
+                    Prediction(each.name, remark=f"{each.name} not tried, because {_LEVELS_PREDICT}")
                     if least_gain > 0 and choice.few_materials
                     else each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
                 )  # fmt: skip

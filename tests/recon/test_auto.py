@@ -68,7 +68,7 @@ def test_it_takes_the_method_that_predicts_unseen_views_best_and_says_so(data: F
     assert found.settings["rows"] == 40  # the whole scan in the end
     assert found.settings["chosen_method"] == "fbp"
     because = found.settings["chosen_because"]
-    assert because.startswith("trials on 16 rows, root mean square left of views held out")
+    assert because.startswith("test reconstructions of 16 rows, root mean square residual in held-out projections")
 
 
 def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> None:
@@ -156,7 +156,7 @@ def test_patches_are_not_tried_of_a_sample_wider_than_the_field(data: F32, monke
             return trial.predicted(self)
 
     choice = Auto((Asking(), recon.PnpDct())).choose(problem, recon.RunControl())
-    assert choice.at == 0 and "pnp-dct not tried, as the sample is wider than the field" in choice.reason
+    assert choice.at == 0 and "pnp-dct not tried, because the sample is wider than the field of view" in choice.reason
     assert priors == [Prior(0.5)]  # and none is sought for its volume
 
 
@@ -167,7 +167,7 @@ def test_where_nothing_can_be_tried_the_last_one_runs(data: F32) -> None:
             return Reconstruction(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
 
     found = recon.reconstruct(data[:12], VIEWS.select(np.arange(0, 24, 2)), Auto((Scaled(), Blank())))
-    assert not found.volume.data.any() and "12 views are too few" in found.settings["chosen_because"]
+    assert not found.volume.data.any() and "12 projections are too few" in found.settings["chosen_because"]
 
 
 TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)

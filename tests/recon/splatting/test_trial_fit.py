@@ -60,7 +60,7 @@ def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: Recon
 def test_few_views_and_a_stop_choose_nothing(problem: ReconProblem) -> None:
     few = replace(problem, views=problem.views.select(np.arange(12)))
     none = Auto().choose(few, RunControl())
-    assert none.at is None and none.prior is None and "12 views are too few" in none.reason
+    assert none.at is None and none.prior is None and "12 projections are too few" in none.reason
     looks = iter([False] * 30)
     stopped = Auto().choose(problem, RunControl(lambda: next(looks, True)))
     assert stopped.at is None and stopped.reason == "stopped before the choice"

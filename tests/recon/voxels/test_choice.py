@@ -112,10 +112,13 @@ def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
         return TrialChoice("16 rows", least_gain, tuple(given)).reason
 
     small = reason(0.004, 0.02)
-    assert "tv 1.000; r2 0.9960. r2 leaves 0.40% less than tv, with a standard error of 0.00%. tv is taken" in small
-    assert small.endswith("a costlier method must leave 2.00% less, and less by more than one standard error")
+    assert (
+        "tv 1.000; r2 0.9960. The residual of r2 is 0.40% smaller than that of tv (standard error 0.00%). tv was chosen"
+        in small
+    )
+    assert small.endswith("residual of a costlier method must be smaller by 2% and by more than one standard error")
     by_chance = reason(1e-5, 0.0, SCATTER)
-    assert "tv is taken" in by_chance and by_chance.endswith("must leave less by more than one standard error")
+    assert "tv was chosen" in by_chance and by_chance.endswith("must be smaller by more than one standard error")
     assert reason(0.1, 0.02).endswith("tv 1.000; r2 0.9000")
 
 
@@ -129,7 +132,9 @@ def test_a_choice_is_the_same_from_a_file() -> None:
     ):
         choice = choice.after(prediction)
     assert (choice.at, choice.prior) == (2, None)
-    assert choice.reason.startswith("trials on 16 rows, root mean square left of views held out")
+    assert choice.reason.startswith(
+        "test reconstructions of 16 rows, root mean square residual in held-out projections"
+    )
     assert choice.reason.endswith("fista-tv 2.000; r2 1.000; fbp: not these; r2 stopped")
     again = TrialChoice.of(json.loads(json.dumps(choice)))
     assert (again.at, again.reason) == (choice.at, choice.reason)
