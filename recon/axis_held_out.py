@@ -39,24 +39,27 @@ def axis_by_views(
     *,
     lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
-    """The axis column for which a volume of two thirds of the views predicts the other views best.
+    """The axis column for which a volume of two thirds of the projections predicts the other projections best.
 
-    The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
-    best candidate. A parabola through three candidates on finer pixels ends it. The box of a sample wider than its
-    field is twice as wide; half a turn of such a sample in parallel beam is better left to `find_axis`.
+    Within some tenths of the detector's width, the residual has only one minimum. A coarse search halves its step
+    around the best candidate. Then a parabola through three candidates on finer pixels gives the column. If the sample
+    is wider than the field of view, the box of voxels is twice as wide. For 180° of such a sample in parallel beam,
+    use `find_axis` instead.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
-        geometry: of these views; the search begins at its `axis_col`.
+        geometry: of these projections; the search begins at its `axis_col`.
         progress: takes the number of candidates tried so far.
         lit: [row, col] or [view, row, col], pixels that measured something; None: all.
 
     Returns:
-        Not confident where the best candidate leaves nearly as much as the others.
+        The estimate. It is not confident if the residual of the best candidate is nearly as large as that of the
+        others.
 
     Raises:
-        AxisError: no minimum lies within a fifth of the detector's width of the start.
-        ValueError: fewer than 12 views.
+        AxisError: the best candidate is farther from `axis_col` of `geometry` than a fifth of the detector's width, or
+            the held-out projections show no material.
+        ValueError: fewer than 12 projections.
     """
     check_arguments(axis_by_views, locals())
     if geometry.n_views < _LEAST_VIEWS:

@@ -107,7 +107,7 @@ class VolumeDone(Event, event="done"):
 
 
 class TrialsStarted(Event, event="trials_started"):
-    """The trials of a table (`tradeoff` or `study`) start. by: the metric by which they are compared."""
+    """A command (`tradeoff`, `study` or `sweep`) starts its trials. by: the metric that compares the trials."""
 
     file: Path | str
     table: str

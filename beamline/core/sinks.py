@@ -264,7 +264,7 @@ class Warnings:
             self._sink(event_of_sentence(text, self._clock.now()))
 
     def withdraw(self, beginning: str) -> None:
-        """Remove messages with this beginning from the report, because they are no longer true."""
+        """Remove the messages that begin with `beginning` from the report; call it when they are no longer true."""
         self.messages = [text for text in self.messages if not text.startswith(beginning)]
 
 

@@ -76,7 +76,8 @@ class Selection:
         """What this selects of a scan.
 
         Raises:
-            ConfigError: rows outside the detector, bins larger than what is left, or pixels that no detector has.
+            ConfigError: the rows lie outside the detector, a bin is larger than the selected rows or the width of
+                the detector, or the pixel size is impossible.
         """
         size_mm, whose = self.pixel_size_mm, "--pixel-size-um"
         if size_mm is None:

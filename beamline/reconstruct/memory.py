@@ -178,9 +178,9 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels need "
-            f"{size(needs.at_once)} of memory, but {size(memory)} is allowed. Use {rows}--bin, because volumes in time "
-            "cannot be made in slabs. Nothing was written."
+            f"Use {rows}--bin, because volumes in time cannot be made in slabs: {options.method.volumes} volumes, "
+            f"each of {Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of memory, but "
+            f"{size(memory)} is allowed. Nothing was written."
         )
     poses = stated_poses(source, options.selection)
     whole = {

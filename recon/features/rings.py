@@ -221,9 +221,10 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
         return ""
     return (
         f"Expect ring artefacts: pixel sensitivities differ by {steady.odd:.2g} in line integral, {steady.score:.1f} "
-        "times the noise of a column. Nothing was removed. Use --rings auto (a filter on the projections), or on a "
-        "finished scan --calibrate gains (measures the sensitivities with the volume). If the sample has layers "
-        "around the rotation axis, compare the volumes."
+        "times the noise of a column. Nothing was removed. To remove the rings, use --rings auto, which filters the "
+        "projections. If the scan is finished, you can use --calibrate gains instead, which measures the sensitivities "
+        "with the volume. If the sample has layers around the rotation axis, compare the volume with rings removed "
+        "with the present one, because layers look like rings."
     )
 
 

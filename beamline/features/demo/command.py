@@ -66,7 +66,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
 
 def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:
-    """Scan with a live reconstruction, then compare its volume and the FBP of the same views with the truth.
+    """Scan with a live reconstruction, then compare its volume and FBP of the same projections with the ground truth.
 
     The event `done` is the last one.
 
@@ -78,7 +78,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         command: the command line, which the report shows.
 
     Raises:
-        ConfigError: the configuration is of a real instrument, so that there is no ground truth.
+        ConfigError: the configuration names real devices; only a simulator knows the ground truth.
         DataError: the live reconstruction failed; the scan is in its file.
     """
     from beamline.core.files import RECON, RECON_LOG

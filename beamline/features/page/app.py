@@ -48,6 +48,10 @@ _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
 _KEPT = 64  # answers kept for the next client
 _NO_VERB = "do what is no verb"
+_ONLY_WATCHES = (
+    "This address can only watch the scan. To control the scan, open the address that `beamline scan --page` "
+    "or `beamline watch --control` prints for this purpose. Nothing was sent to the scan."
+)
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'",
@@ -269,7 +273,7 @@ class _Server:
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
             self._log(f"not done: {name} from {client}, because the token for controlling the scan is missing")
-            return JSONResponse({"message": "This is possible only with the address for controlling the scan."}, 403)
+            return JSONResponse({"message": _ONLY_WATCHES}, 403)
         if folder is None or verb is None:
             return JSONResponse({"message": f"{name} is not possible: no scan is running in this folder."}, 404)
         self._log(f"{name}, asked for from {client}")

@@ -62,7 +62,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     down or harm it. Only this computer can open the page. To open it from another one, use an ssh tunnel or --bind
     (not encrypted).
 
-    Exit code: 0 ended by Ctrl-C, 2 no run or no free port, 5 not a scan of this program.
+    Exit code: 0 you pressed Ctrl-C, 2 there is no run or no port is free, 5 the file is not a scan of this program.
     """
     from beamline.features.page.app import page  # these load HDF5 and the server, which help does not need
     from beamline.features.page.serve import open_port, start
@@ -130,7 +130,7 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     shown. The state `died` means that the process ended before it could write its last state; a line then says what
     you can do.
 
-    Exit code: 0 done (also if there is no run), 2 no such folder or no free port.
+    Exit code: 0 the list is complete (it may be empty), 2 the folder does not exist or no port is free.
     """
     from beamline.scan.runs import HEAD, cells, describe, runs_in
 
@@ -226,7 +226,8 @@ def view(
 
     --napari shows VOLUME and OTHER in napari, in their units, with labels and the centres of the Gaussians.
 
-    Exit code: 0 ended by Ctrl-C, 2 no free port or no napari, 5 neither a scan nor a volume.
+    Exit code: 0 you pressed Ctrl-C, 2 no port is free or napari is not installed, 5 the file is neither a scan nor a
+    volume.
     """
     if labels is not None and not in_napari:
         raise click.UsageError("--labels works only with --napari.")

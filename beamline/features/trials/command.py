@@ -108,8 +108,10 @@ def tradeoff(request: TradeoffRequest) -> None:
     With --seconds, each method runs once, and all methods get the same time.
 
     Quality is PSNR and SSIM against --truth. Without --truth it is the residual in projections that no trial uses.
-    The command writes a folder with tradeoff.csv, pictures and an HTML page. Ctrl-C keeps the trials that are done
-    (exit code 4); before the first one is done, it writes nothing (exit code 130).
+    The command writes a folder with tradeoff.csv, pictures and an HTML page.
+
+    Ctrl-C keeps the trials that are done (exit code 4). Before the first trial is done, Ctrl-C leaves no folder (exit
+    code 130).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_tradeoff
@@ -203,8 +205,10 @@ def study(request: StudyRequest) -> None:
 
     Each volume is compared with the volume from all projections by the same method, in PSNR, SSIM, SNR and CNR; with
     --truth, PSNR and SSIM against the ground truth are added. Rows that need more projections than the scan has are
-    left out. The command writes a folder with study.csv, pictures and report.html. Ctrl-C keeps the rows that are done
-    (exit code 4; 130 and no folder if there are none).
+    left out. The command writes a folder with study.csv, pictures and report.html.
+
+    Ctrl-C keeps the rows that are done (exit code 4). Before the first row is done, Ctrl-C leaves no folder (exit code
+    130).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_study

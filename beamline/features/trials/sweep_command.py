@@ -145,8 +145,10 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
 
     One of eight projections is held out, and the score of each value is the residual in the held-out projections. The
     best value is marked, and so are values that do not differ significantly from it. The slice is the middle row of
-    the detector, or of --rows. The command writes a folder with sweep.csv, pictures and report.html. Ctrl-C keeps the
-    slices that are done (exit code 4; before the first one is done: exit code 130, no folder).
+    the detector, or of --rows. The command writes a folder with sweep.csv, pictures and report.html.
+
+    Ctrl-C keeps the slices that are done (exit code 4). Before the first slice is done, Ctrl-C leaves no folder (exit
+    code 130).
     """
     from beamline.features.trials.runner import compare
     from beamline.features.trials.sweep import planned_sweep

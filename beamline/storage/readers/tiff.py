@@ -130,7 +130,9 @@ def _of_png(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
     """A grey picture. Raises ValueError for colours, a palette, or more bytes than allowed."""
     with Image.open(file, formats=["PNG"]) as picture:
         if not picture.mode.startswith(("L", "I")) or picture.mode == "LA" or 4 * math.prod(picture.size) > most:
-            raise ValueError(f"its pixels are {picture.mode}, {picture.width} x {picture.height}; expected grey ones")
+            raise ValueError(
+                f"it has {picture.width} x {picture.height} pixels of kind {picture.mode}; expected grey pixels"
+            )
         return np.asarray(picture)
 
 

@@ -70,8 +70,9 @@ class Sart(VoxelMethod):
 class Cgls(VoxelMethod):
     """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); stopping early is its regularisation.
 
-    Negative values are clipped at the end. In float32, the directions are no longer conjugate after about eight
-    iterations. From then on the residual is one iteration behind. Memory: 3 volumes, 3 x the projections.
+    Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about
+    eight iterations. After that the residual is only as small as exact arithmetic makes it one iteration earlier.
+    Memory: 3 volumes, 3 x the projections.
     """
 
     name: ClassVar[str] = "cgls"

@@ -139,10 +139,11 @@ def fit_series(
     time, and is the identity in the middle of the scan (module `motion`). This is the problem of `fit_materials` with
     knots in place of materials and hat functions in place of cross sections. z_j are the orthonormal components of all
     x_k; the first one is their common part. If nothing moves, and if it predicts held-out projections better, the
-    volumes become the mean volume times smooth factors. This suits bodies that each take up or lose something at their
-    own time. Steps, memory, `go_on` and `stop` are as in `fit_materials`. The tests of weights, of whether the sample
-    moves, of the motion and of factors each count down to 0. After the iterations, the steps of the factors count down.
-    If they are ended early, the volumes are those without factors.
+    volumes become the mean volume times smooth factors. These factors suit a sample of particles, if each particle
+    takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in `fit_materials`. Four tests
+    each count down to 0: of the weights, of whether the sample moves, of the motion, and of the factors. After the
+    iterations, the steps of the factors count down. If you end these steps early, the volumes are those without
+    factors.
 
     Args:
         knots: number of volumes, 2 or more.

@@ -74,7 +74,7 @@ class JosephRays:
             ValueError: a projection is rolled, tilted or has a centre, or the box reaches the source.
         """
         if not geometry.is_straight:
-            raise ValueError("these GPU kernels need straight projections, without roll, tilt and centres")
+            raise ValueError("these GPU kernels work only if no projection of the geometry has roll, tilt or centres")
         with np.errstate(invalid="ignore"):  # the source of a parallel beam is infinitely far away
             table, steep, views = cone.ray_table(geometry, grid)
         rise, (z, y, x) = geometry.pixel_pitch / grid.spacing[0], (n // 2 for n in grid.shape)

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 _AUTO = "auto"
 _NO_FILTER = (
-    "No filter predicts the held-out projections better (of 16 or more); give --phase paganin:RATIO for delta/beta."
+    "To apply a phase filter, give --phase paganin:RATIO (delta/beta). --phase auto found no filter: either no "
+    "filter predicts held-out projections better than no filter does, or the scan has fewer than 16 projections."
 )
 
 

@@ -125,7 +125,7 @@ def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
 def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: None)
     found = _prepared(_rimmed(0.8))
-    assert "No filter predicts" in found.done["phase"].sentence
+    assert "--phase auto found no filter" in found.done["phase"].sentence
     np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
 
 
