@@ -71,8 +71,8 @@ def level_of(beyond: F32) -> F32:
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
-    count = subsets_of(problem.projector.geometry, MANY_SUBSETS, damped=False)
-    first, parts = GoesOn(problem.go_on), Subsets.of(problem, count, damped=False)
+    count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
+    first, parts = GoesOn(problem.go_on), Subsets.of(problem, count, to_the_end=False)
     x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
     if not (first.going and strength):
         return x
@@ -100,7 +100,11 @@ class _Finish:
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                return method.pulled(problem, x, weight, materials, self.iterations, damped=False) if first.going else x
+                return (
+                    method.pulled(problem, x, weight, materials, self.iterations, to_the_end=False)
+                    if first.going
+                    else x
+                )
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0

@@ -50,7 +50,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
     projected = now()
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
-    parts = subsets_of(geometry, MANY_SUBSETS, damped=False)
+    parts = subsets_of(geometry, MANY_SUBSETS, to_the_end=False)
     return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
 
 
@@ -88,7 +88,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     if seconds <= 0:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
-    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, damped=False) + _FIRST_SWEEPS) * sweep
+    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, to_the_end=False) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried

@@ -80,7 +80,7 @@ class FistaTv(VoxelMethod):
     still: NonNegative = STANDS_STILL
     allow_negative: bool = False
 
-    damped: ClassVar[bool] = True
+    to_the_end: ClassVar[bool] = True
 
     @property
     def trial_sweeps(self) -> int:
@@ -126,7 +126,7 @@ class FistaTv(VoxelMethod):
             share, rays = self.tv_weight, problem.weight
             norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
             weight = problem.decide("weight", lambda: share * unit * norm)
-        subsets = Subsets.of(problem, subsets_of(projector.geometry, self.subsets, self.damped), self.damped)
+        subsets = Subsets.of(problem, subsets_of(projector.geometry, self.subsets, self.to_the_end), self.to_the_end)
         x = ordered_fista(
             problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
         )  # fmt: skip
@@ -146,7 +146,7 @@ class EarlyTv(FistaTv):
     iterations: Count = TRIAL_SWEEPS
     subsets: Count = MANY_SUBSETS
 
-    damped: ClassVar[bool] = False
+    to_the_end: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)

@@ -196,8 +196,8 @@ class Trial:
         self.scan, self.problem, self.start = scan, replace(slab, go_on=self._go_on), start
         self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
         early, geometry = settings.early, scan.projector.geometry
-        count = subsets_of(geometry, MANY_SUBSETS if early else SUBSETS, damped=not early)
-        self._subsets = Subsets.of(slab, count, damped=not early)
+        count = subsets_of(geometry, MANY_SUBSETS if early else SUBSETS, to_the_end=not early)
+        self._subsets = Subsets.of(slab, count, to_the_end=not early)
         self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None

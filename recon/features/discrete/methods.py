@@ -165,15 +165,15 @@ class Discrete(VoxelMethod):
 
     def pulled(
         self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int,
-        damped: bool = True,
+        to_the_end: bool = True,
     ) -> F32:  # fmt: skip
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
-        `damped` as in `Subsets.of`."""
+        `to_the_end` as in `Subsets.of`."""
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
-        count = subsets_of(problem.projector.geometry, SUBSETS if damped else MANY_SUBSETS, damped)
-        subsets = Subsets.of(problem, count, damped)
+        count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
+        subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS, still=self.still,
             pull=MaterialPull(drawn_apart(materials), where, thin),

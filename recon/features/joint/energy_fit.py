@@ -162,7 +162,7 @@ class EnergyFit:
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
         self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # empty projections have the residual 0
-        subset = views.parted(subsets_of(views.geometry, _SUBSETS, damped=False))
+        subset = views.parted(subsets_of(views.geometry, _SUBSETS, to_the_end=False))
         self.subsets = []
         for number in range(subset.max() + 1):
             own = [np.flatnonzero((subset == number) & (views.energy == e)) for e in range(counts.size)]

@@ -28,7 +28,7 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 
 FISTA = (
     "recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight", "0.002", "--no-report",
-    "--memory", "4.1M",
+    "--memory", "4.4M",
 )  # fmt: skip
 
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import CPU
-from recon.voxels.ordered_fista import ENDED, Subsets, ordered_fista, subsets_of
+from recon.voxels.ordered_fista import ENDED, MOST_SWEEPS, Subsets, ordered_fista, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import VoxelProblem, difference_weights
+from recon.voxels.voxel_problem import VoxelProblem, difference_weights, largest_eigenvalue
 
 F32 = NDArray[np.float32]
 
@@ -83,7 +84,7 @@ def _problem(cone: bool, weighted: bool) -> tuple[VoxelProblem, F32]:
     truth = (np.hypot(x, y) < 0.3 * size) * (1 + (np.hypot(x - 0.1 * size, y) < 0.1 * size)) * (np.abs(z) < 0.05 * size)
     data = projector.forward_lines(np.ascontiguousarray(truth.transpose(1, 2, 0).astype(np.float32)))
     data += rng.normal(0, 0.02 * data.max(), data.shape).astype(np.float32)
-    weight = rng.uniform(0.3, 1, data.shape).astype(np.float32) if weighted else None
+    weight = rng.uniform(0.6, 1, data.shape).astype(np.float32) if weighted else None
     start = np.full((*projector.grid.shape[1:], projector.grid.shape[0]), 0.1, np.float32)
     return VoxelProblem(projector, data, weight, True, rng, lambda *_: True), start
 
@@ -95,9 +96,9 @@ def test_damped_steps_end_at_the_minimum_of_steps_without_damping(cone: bool, we
 
     def minimum(most: int, damped: bool, sweeps: int) -> tuple[float, F32]:
         made = replace(problem, rng=np.random.default_rng(0))
-        x = ordered_fista(
-            made, start.copy(), mu, Subsets.of(made, most, damped), sweeps=sweeps, tv_steps=10, still=0.0
-        )  # fmt: skip
+        subsets = Subsets.of(made, most, damped)
+        assert subsets.is_damped is damped
+        x = ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, tv_steps=10, still=0.0)
         residual = made.projector.forward_lines(x) - made.data
         weight = 1.0 if made.weight is None else made.weight
         data = 0.5 * float((weight * np.square(residual, dtype=np.float64)).sum())
@@ -136,5 +137,51 @@ def test_steps_that_are_not_damped_make_all_sweeps_and_say_nothing() -> None:
     problem, start = _problem(False, False)
     done: list[int] = []
     made = replace(problem, go_on=lambda sweep, _: not done.append(sweep))
-    ordered_fista(made, start, 0.1, Subsets.of(made, 1, damped=False), sweeps=25, tv_steps=3, still=1.0)
+    ordered_fista(made, start, 0.1, Subsets.of(made, 1, to_the_end=False), sweeps=25, tv_steps=3, still=1.0)
     assert len(done) == 25 and not set(ENDED) & made.decide.settings.keys()
+
+
+HARD = {
+    "without total variation": {},
+    "nine of ten rays without weight": {"zeros": 0.9},
+    "one column of a hundred times the weight": {"column": 100.0},
+    "one view of a hundred times the weight": {"view": 100.0},
+    "weights of four decades": {"spread": 2.0},
+    "a wedge is missing": {"arc": np.pi / 4},
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_scans_end_no_further_from_the_minimum_than_the_early_end(name: str) -> None:
+    """The end by default, against 20 sweeps on many subsets without damping; the minimum is that of 1000 sweeps."""
+    hard: dict[str, float] = HARD[name]
+    rng = np.random.default_rng(5)
+    views = Geometry.parallel(np.linspace(0, hard.get("arc", np.pi), 40, endpoint=False), (1, 48))
+    projector = Projector(views, Grid.matching(views))
+    rows, cols = np.indices((48, 48)) - 23.5
+    truth = (np.hypot(rows, cols) < 20) * 0.5 + (np.hypot(rows - 6, cols) < 7) * 0.5
+    for row, col in rng.uniform(-12, 12, (20, 2)):
+        truth += (np.hypot(rows - row, cols - col) < 2) * 0.3
+    data = projector.forward_lines(truth[:, :, None].astype(np.float32))
+    weight = np.exp(hard.get("spread", 0) * rng.standard_normal(data.shape)).astype(np.float32)
+    weight[rng.random(data.shape) < hard.get("zeros", 0)] = 0
+    weight[:, 20] *= hard.get("column", 1)
+    weight[7] *= hard.get("view", 1)
+    data += (rng.normal(0, 0.02 * data.max(), data.shape) / np.sqrt(np.maximum(weight, 1e-3))).astype(np.float32)
+    problem = VoxelProblem(projector, data, weight if hard else None, True, rng, lambda *_: True)
+    start = np.full((48, 48, 1), 0.1, np.float32)
+    mu = 0 if not hard else 1e-3 * largest_eigenvalue(projector.plain, weight)
+
+    def end(subsets: Subsets, sweeps: int, tv_steps: int, still: float) -> F32:
+        made = replace(problem, rng=np.random.default_rng(0))
+        return ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, tv_steps=tv_steps, still=still)
+
+    def objective(x: F32) -> float:
+        square = np.square(projector.forward_lines(x) - data, dtype=np.float64)
+        return 0.5 * float((weight * square if hard else square).sum()) + mu * total_variation(x, (1, 1, 1))
+
+    minimum = end(Subsets.of(problem, 1, False), 1000, 8, 0.0)
+    early = end(Subsets.of(problem, subsets_of(views, 9, False), False), 20, 3, 0.0)
+    by_default = end(Subsets.of(problem, subsets_of(views)), MOST_SWEEPS, 3, STANDS_STILL)
+    assert objective(by_default) < objective(early)
+    assert not mu or np.linalg.norm(by_default - minimum) < np.linalg.norm(early - minimum)
