@@ -100,11 +100,9 @@ class _Finish:
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                return (
-                    method.pulled(problem, x, weight, materials, self.iterations, to_the_end=False)
-                    if first.going
-                    else x
-                )
+                if not first.going:
+                    return x
+                return method.pulled(problem, x, weight, materials, self.iterations, to_the_end=False)
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0
