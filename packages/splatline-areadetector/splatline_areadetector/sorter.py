@@ -471,8 +471,9 @@ class Sorter:
         gap, is_other = n, known is not None and known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
         if known is not None and is_other and known.count_restarts == seen.count_restarts and not seen.reconnected:
             gap = (seen.number - known.number) // step - 1  # if n or more: another count
-        if gap == 0:
-            return 0, Basis.NUMBERS
+        if gap == 0:  # or the numbers restarted: the last frames of the block before and as many first ones were lost
+            before = self._taken.get(self._now)
+            return 0, Basis.NUMBERS if before is None or before.is_over else Basis.WAITED
         if self._witness is not None and (second is None or second.number == seen.number + step):
             counted = self._witness.counted(seen.time, None if second is None else second.time)
             lost = -1 if counted is None else counted // step - 1
