@@ -138,7 +138,7 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
         record = read_reconstruction(folder / f"{rings}.h5")
         scores[rings] = ring_score(record.volume.data[0], (middle, middle))
         assert record.parameters["rings"] == rings
-        assert ("--rings auto (a filter on the projections)" in result.stderr) == (rings == "none")
+        assert ("To remove the rings, use --rings auto" in result.stderr) == (rings == "none")
     assert "Rings: removed by sort. The height of the stripes fell from" in result.stderr
     assert str(record.parameters["rings_removed"]) in result.stderr
     assert scores["auto"] < 0.5 * scores["none"], scores
