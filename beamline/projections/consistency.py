@@ -60,6 +60,8 @@ _OF_A_STEP = 1 / 3
 _BESIDE_ROW = 8  # rows above and below the plane of the source that count as in the plane
 # times the least disagreement; the least disagreement as a share of the variance; degrees
 _OFTEN, _AGREE, _FAN = 1.3, 0.01, 2.5
+# The same for a fan that is the right one if SDD was stated from the axis; radians from that fan
+_OFTEN_BY_AXIS, _SAME_FAN = 1.15, 0.01
 # columns between the axis found from the moments and the axis used; beyond that, angles are not checked
 _SAME_AXIS = 1.0
 _FAINT = 0.3  # line integral. In fainter samples, the error that the air may have at an edge is a large part
@@ -334,7 +336,10 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
         f"agree for a fan of {shown:.3g} degrees across the detector{away}, but the stated fan has "
         f"{told:.3g} degrees."
     )
-    sure = off > _OFTEN * least and least < min(_AGREE, usual / 2)  # a round sample agrees for every fan
+    by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
+    is_by_axis = abs(math.atan(best * across) - math.atan(by_axis * across)) <= _SAME_FAN
+    often = _OFTEN_BY_AXIS if is_by_axis else _OFTEN
+    sure = off > often * least and least < min(_AGREE, usual / 2)  # a round sample agrees for every fan
     return ConsistencyCondition(
         "rays from both sides", abs(shown - told) if sure else np.nan, _FAN, "degrees of fan", sentence
     )
