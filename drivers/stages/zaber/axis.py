@@ -77,7 +77,7 @@ REASONS = {
     "BADAXIS": "there is no such axis",
     "BADCOMMAND": "it does not know this command or setting",
     "BADDATA": "a value is missing or out of its range",
-    "BADMESSAGEID": "it cannot read the number of the message",
+    "BADMESSAGEID": "the device cannot read the message number of the request",
     "DEVICEONLY": "only the device as a whole can answer this",
     "DRIVERDISABLED": "its driver is disabled",
     "FULL": "its memory is full",
