@@ -103,7 +103,7 @@ class FistaTv(VoxelMethod):
         return replace(self, still=still * self.still, iterations=longer * self.iterations)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best weight; with one of its own that of the method's volume."""
+        """The prediction with the best weight. If the method has a weight of its own: the prediction of its volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
@@ -223,8 +223,8 @@ class PnpDct(VoxelMethod):
 
     Attributes:
         iterations: steps towards the views, five between two thresholds.
-        patch_threshold: of the last round, in density units; None: as views held out prefer, see `choose_patches`,
-            or by the noise.
+        patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
+            `choose_patches`, or the noise sets it.
     """
 
     name: ClassVar[str] = "pnp-dct"
