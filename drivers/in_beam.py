@@ -256,7 +256,9 @@ class ManualSampleMover(_Manual):
     def back(self, aside: float = 0.0) -> None:
         if aside:
             advice = "Configure a stage that moves it (devices.sample_mover)."
-            raise DeviceError("sample mover", f"it cannot be moved {aside:g} mm sideways by hand", advice=advice)
+            raise DeviceError(
+                "sample mover", f"the sample cannot be moved {aside:g} mm sideways by hand", advice=advice
+            )
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 

@@ -230,7 +230,8 @@ class DcamOptions(CheckedSettings):
     )
     exposure_tolerance: float = setting(
         0.01,
-        "By what fraction (and one line time) the camera may change an exposure before the driver stops with an error.",
+        "The driver stops with an error if the camera changes an exposure by more than this fraction plus one "
+        "line time.",
         ge=0,
     )
     ring: int = setting(

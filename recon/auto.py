@@ -28,15 +28,18 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 
 @dataclass(frozen=True, eq=False)
 class Auto(Method):
-    """Tries methods on a part of the scan, and takes the simplest that predicts views held out as well as the best.
+    """Tries methods on a part of the scan, and takes the simplest one that is about as good as the best one.
 
-    The part is the sixteen rows where most matter is, of a cone those in its middle; where these hold little of it, all
-    rows at half the resolution. One of eight views is held out. Trials need at least 16 views; with fewer the last
-    candidate is used. docs/choosing.md has reasons.
+    A method is good if its volume predicts the held-out projections well.
+
+    The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows hold
+    little material, the part is all rows at half the resolution. One of eight projections is held out. Test
+    reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md has
+    reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
-        least_gain: share by which a costlier method must lower the residual of views held out.
+        least_gain: share by which a costlier method must lower the residual in the held-out projections.
     """
 
     name: ClassVar[str] = AUTO

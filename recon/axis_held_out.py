@@ -43,8 +43,8 @@ def axis_by_views(
 
     Within some tenths of the detector's width, the residual has only one minimum. A coarse search halves its step
     around the best candidate. Then a parabola through three candidates on finer pixels gives the column. If the sample
-    is wider than the field of view, the box of voxels is twice as wide. For 180° of such a sample in parallel beam,
-    use `find_axis` instead.
+    is wider than the field of view, the box of voxels is twice as wide. For a 180° scan of a sample wider than
+    the field of view in a parallel beam, use `find_axis` instead.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.

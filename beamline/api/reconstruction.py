@@ -161,8 +161,8 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
     Frames are counts: `frame.counts` uint16 [row, col].
 
-    A slow reader does not slow the scan down, except in the scan's own program, because there reading and writing
-    wait for each other: read a fast scan from another program.
+    Read a fast scan from another program: a slow reader then does not slow the scan down. In the scan's own program,
+    reading and writing wait for each other, so a slow reader slows the scan down.
 
     Args:
         path: a scan file, or the folder of a run (its newest part). It may not exist yet.

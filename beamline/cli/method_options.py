@@ -160,7 +160,7 @@ _OF_ONE_VOLUME = {
 _FINISHED = {"follow": "it needs a finished scan"}
 _PLANNED = {"quality": "--quality sets it"}
 _BY_SECONDS = {"follow": "it needs a finished scan; use --seconds"}
-NOT_WITH_SLABS = {"follow": "a reconstruction of a running scan keeps everything in memory"}
+NOT_WITH_SLABS = {"follow": "a running scan cannot be reconstructed in slabs, because everything must stay in memory"}
 NOT_WITH_ERROR_BARS = dict.fromkeys(
     ("follow", "budget", "seconds"), "error bars need the complete scan, and time for two further fits"
 )

@@ -320,8 +320,8 @@ class Config(Section):
             "one scan at a time; set scan.energies to null": scan.energies is None,
             "a live volume; set recon.live to true": recon.live,
             "a volume that grows during the scan; set recon.method to r2": streams(recon.method),
-            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views for a "
-            "step scan, such as 60": 0 < scan.pass_views < getattr(angles, "views", math.inf)
+            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan set "
+            "scan.pass_views (for example 60)": 0 < scan.pass_views < getattr(angles, "views", math.inf)
             if scan.mode is Mode.STEP
             else interlaced,
         }

@@ -200,9 +200,9 @@ class MotionCheck(Logged):
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
             advice = (
-                f"Compare the encoder of the stage with the plan: the sample turned by {turn:+.1f} steps more than one "
-                "step. Triggers were lost, the stage slipped, or the sample turned on its holder. `beamline recon` "
-                "uses the longer part of the scan, before or after this."
+                "Compare the encoder of the stage with the plan: the rotation of the sample between two frames differs "
+                f"from one step by {turn:+.1f} steps. Triggers were lost, the stage slipped, or the sample turned on "
+                "its holder. `beamline recon` uses only the longer part of the scan, either before or after this jump."
             )
         else:
             return None

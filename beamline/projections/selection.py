@@ -64,7 +64,7 @@ class Selection:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
-        """The step of this class: the given one, or else one with default settings."""
+        """The step of the class `kind` in this selection; if there is none, a new step with default settings."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:

@@ -60,7 +60,7 @@ _OUTDATED = (
 _NEXT_PART = (
     "Correcting all projections again, each with the flats of its own part, because the next part of the run starts"
 )
-_SEVERAL_PARTS = "Correcting all projections again at the end, because the run has several parts"
+_SEVERAL_PARTS = "Correcting all projections again at the end of the run, because the run has several parts"
 _OFFSET = "Correcting all projections again, now together with the laterally offset projections"
 _SHADED = (
     "Correcting all projections again without an object that is in the beam in all projections, but not in the flats"

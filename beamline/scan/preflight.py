@@ -78,7 +78,7 @@ class DryRun:
         if each := self.energies:
             seconds = sum(need.duration for need in each)
             sentence = (
-                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one such scan at each: "
+                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one scan like this at each energy: "
                 f"{hms_text(seconds)} and {size(self.total_bytes)} in total (without the moves of the "
                 "monochromator)"
             )

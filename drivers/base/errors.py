@@ -52,7 +52,7 @@ class DeviceError(Exception):
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error, reported by a device that uses the failed one. changed: parts of the error to replace."""
+        """The same error, reported by `device`, which uses the device that failed. changed: error parts to replace."""
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 

@@ -232,7 +232,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone of wave vectors about the rotation axis that no projection measures.
 
-        It is the smallest tilt of the axis along the beam; 0 if that is at most half a pixel over the field of view.
+        The half angle is the smallest tilt of the axis along the beam. It is 0 if that tilt moves the edge of the field
+        of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0

@@ -122,8 +122,8 @@ class RunControl(Checked):
 
     Attributes:
         should_stop: function that is called between steps or iterations; True ends the reconstruction with the volume
-            so far. Direct methods do not call it. Any function or a `Stop`; methods use the property `stop`, which
-            always exists.
+            so far. Direct methods do not call `should_stop`. Any function or a `Stop`; methods use the property
+            `stop`, which always exists.
         on_progress: called about ten times a second, after each iteration, or after every sixteen slices of FBP.
         on_checkpoint: called with the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.

@@ -41,8 +41,8 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
         cone: True: the first three values are the source. False: they are the direction of the beam (with either sign).
 
     Raises:
-        ValueError: the vectors are not finite [view, 12], or a projection does not match such a detector within
-            `TOLERANCE`.
+        ValueError: the vectors are not finite [view, 12], or the vectors of a projection do not describe such a
+            detector (square pixels, as above) within `TOLERANCE`.
     """
     check_arguments(geometry_of_vectors, locals())
     given = np.asarray(vectors, np.float64)

@@ -60,7 +60,8 @@ class Grid:
         give all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
-        360° scan, as in `of_field`. Material that projections see but that has no voxel would appear in other voxels.
+        360° scan, as in `of_field`. The box is this large because material that
+        projections see outside the box would appear in other voxels.
         """
         check_arguments(cls.matching, locals())
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
@@ -111,7 +112,7 @@ class Grid:
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
         """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis.
 
-        For a cone beam it stops before its corners reach the source.
+        For a cone beam, the box is limited so that its corners do not reach the source.
         """
         most = geometry.source_distance / math.sqrt(2) - self.voxel_size
         half = np.asarray(self.shape[1:]) * self.voxel_size / 2

@@ -139,8 +139,8 @@ def remove_rings(
     """A copy of line integrals without the stripes that cause rings, for use between `recon.correct` and a method.
 
     Args:
-        projections: [view, row, col], in any order. Fewer than 8 projections, or with fewer than 64 columns, are not
-            changed.
+        projections: [view, row, col], in any order. The data are not changed if there are fewer than 8 projections
+            or fewer than 64 columns.
         angles: [view], radians.
         rings: "sort": small and medium stripes (Vo et al. 2018, algorithm 3); "vo": also dead columns and large
             stripes; "none": no removal; "auto": chosen from the data.

@@ -83,7 +83,8 @@ def check(references: References) -> None:
     positions = sorted(p for p, _ in references.flats)
     if len(set(positions)) < len(positions) or not np.isfinite(positions).all():
         raise ValueError(
-            f"each group of flats needs a position of its own, got {positions}; average flats that belong together"
+            f"each group of flats needs a different, finite position in the scan, got {positions}; average flats that "
+            "belong together"
         )
 
 

@@ -31,8 +31,8 @@ class Gaussians:
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), of any non-zero length.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. It makes raw values and their learning rates independent of the units
-            of the data.
+        density_unit: a typical density in 1/mm. Because densities are divided by it, raw values and their learning
+            rates are independent of the units of the data.
         kernel: radial profile.
     """
 

@@ -53,8 +53,8 @@ QUALITIES: dict[Quality, tuple[float, int]] = {"preview": (4.0, 1), "standard": 
 class FistaTv(VoxelMethod):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
 
-    The iterations end when the volume stands still: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes,
-    2 x the projections.
+    The iterations end when the volume stands still: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
+    and 2 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -103,7 +103,7 @@ class FistaTv(VoxelMethod):
         return replace(self, still=still * self.still, iterations=longer * self.iterations)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best weight; with one of its own that of the method's volume."""
+        """The prediction with the best weight. If the method has a weight of its own: the prediction of its volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
@@ -151,7 +151,8 @@ class EarlyTv(FistaTv):
 
 @dataclass(frozen=True)
 class OsSirtTv(VoxelMethod):
-    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
+    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes and 3 times the
+    projections.
 
     It is for views of very few photons (10 to 30 a pixel: up to 2 dB ahead), and with `momentum` for a quick volume.
     Of a cone its weight follows the noise: 2.3 dB behind FISTA-TV on a thorax, whose weight views held out choose.
@@ -222,8 +223,8 @@ class PnpDct(VoxelMethod):
 
     Attributes:
         iterations: steps towards the views, five between two thresholds.
-        patch_threshold: of the last round, in density units; None: as views held out prefer, see `choose_patches`,
-            or by the noise.
+        patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
+            `choose_patches`, or the noise sets it.
     """
 
     name: ClassVar[str] = "pnp-dct"

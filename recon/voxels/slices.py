@@ -52,7 +52,10 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
         ValueError: fewer than two views, or another geometry.
     """
     if len(views) != geometry.n_views or len(views) < 2:
-        raise ValueError(f"{len(views)} views for {geometry.n_views} angles: slices need two views, an angle each")
+        raise ValueError(
+            f"{len(views)} views for {geometry.n_views} angles: slices need at least two views, and one angle for "
+            "each view"
+        )
     if geometry.is_cone or not geometry.is_straight or geometry.shifts[:, 1].any():
         raise ValueError("slices of the views so far need a parallel beam with straight views at one height")
     covered = float(angular_weights(geometry.angles).sum())

@@ -178,7 +178,7 @@ def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
     used = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
     currents = scan.table.currents
     if currents is None or not np.isfinite(currents[used]).all():
-        lacking = "no ring current" if currents is None else "no ring current for some projections or flats"
+        lacking = "no ring current" if currents is None else "projections or flats without a ring current"
         raise ConfigError(f"Omit --ring-current use: {scan.source.path} has {lacking} (control/data of NXtomo).")
     return _to_median(currents, scan.table.views)
 

@@ -270,7 +270,8 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/pixel_mask_applied", "defective pixels are found in the frames", False),
     Entry(
         "detector/pixel_mask",
-        "in frames of whole numbers, pixels that are not 0 in this mask are filled; others are found in the frames",
+        "in frames of whole numbers, pixels that are not 0 in this mask are filled; other defective pixels are found "
+        "in the frames",
     ),
     Entry("detector/flatfield", "flats are the frames with image_key 1", False),
     Entry("detector/angular_calibration_applied", "frames are used as they are", False, _true),

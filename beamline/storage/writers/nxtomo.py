@@ -335,7 +335,7 @@ class NXtomoWriter:
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"
         return DataError(
             f"{self.path} could not {what} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
-            "safe in it: `beamline recover` makes an ordinary file of them."
+            "safe in this file: run `beamline recover` to make an ordinary scan file of them."
         )
 
     def _put_exchange_view(self) -> None:

@@ -59,7 +59,7 @@ ENDINGS = {
     "WV": Meaning("supply voltage out of range", "Check the power supply"),
     "WT": Meaning("controller hot", "Let it cool down"),
     "WS": Meaning("stalled and recovered", "Use a lower speed, acceleration or load"),
-    "WM": Meaning("displaced while at rest", "Find what pushed the stage; search the reference"),
+    "WM": Meaning("displaced while at rest", "Find what pushed the stage, then search the reference"),
     "NC": Meaning("moved by its knob", "Do not touch the knob during a scan"),
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
@@ -77,7 +77,7 @@ REASONS = {
     "BADAXIS": "there is no such axis",
     "BADCOMMAND": "it does not know this command or setting",
     "BADDATA": "a value is missing or out of its range",
-    "BADMESSAGEID": "it cannot read the number of the message",
+    "BADMESSAGEID": "the device cannot read the message number of the request",
     "DEVICEONLY": "only the device as a whole can answer this",
     "DRIVERDISABLED": "its driver is disabled",
     "FULL": "its memory is full",

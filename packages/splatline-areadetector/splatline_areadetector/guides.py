@@ -204,7 +204,8 @@ class PandaGuide(_ByNumbers):
         if not self._rows.size:
             return f"{self._path} {'has no rows' if self._path.exists() else 'does not exist'} yet"
         ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
-        return f"{self._path} has {count(self._rows.size, 'row')}, {ends}: those of this scan, unless it is rewritten"
+        rows = count(self._rows.size, "row")
+        return f"{self._path} has {rows}, {ends}: the angles of this scan, unless the file is rewritten"
 
     def plan(self) -> RidePlan:
         self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait

@@ -200,7 +200,7 @@ class FrameStream:
                 self.name,
                 f"no answer within {within:g} s",
                 advice=UNREACHABLE,
-                state="It was only read, and nothing was changed",
+                state="The value was only read, and nothing was changed",
             ) from None
         except RemoteError as error:
             raise ConfigError(

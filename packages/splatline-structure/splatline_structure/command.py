@@ -92,8 +92,8 @@ class Seen:
     metavar="A B",
     type=_FILE,
     nargs=2,
-    help="The volume reconstructed from each half of the projections, in two files with all slices or only the "
-    "measured ones. Default: both are reconstructed from the scan.",
+    help="Two files: the volumes reconstructed from the two halves of the projections. Each file has all slices, or "
+    "only the measured slices. Default: the command reconstructs both volumes from the scan.",
 )
 @click.option(
     "--scan",

@@ -89,7 +89,7 @@ class Discrete(VoxelMethod):
         return replace(self, still=still * self.still, iterations=longer * self.iterations)
 
     def refit(self, share: float) -> VoxelMethod:
-        """`EarlyTv` with this share of the iterations for which the error bars are calibrated."""
+        """`EarlyTv` with `share` times the number of iterations for which the error bars are calibrated."""
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
     @property

@@ -22,7 +22,7 @@ from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit, diff
 
 @dataclass(frozen=True)
 class Sirt(VoxelMethod):
-    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
+    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes and 3 times the projections."""
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
@@ -45,7 +45,7 @@ class Sirt(VoxelMethod):
 class Sart(VoxelMethod):
     """Simultaneous algebraic reconstruction, one projection per step in random order (Andersen & Kak 1984).
 
-    The relaxation is multiplied by `decay` in each iteration. Memory: 3 volumes, 3 x the projections.
+    The relaxation is multiplied by `decay` in each iteration. Memory: 3 volumes and 3 times the projections.
     """
 
     name: ClassVar[str] = "sart"
@@ -72,7 +72,7 @@ class Cgls(VoxelMethod):
 
     Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about
     eight iterations. After that the residual is only as small as exact arithmetic makes it one iteration earlier.
-    Memory: 3 volumes, 3 x the projections.
+    Memory: 3 volumes and 3 times the projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -123,7 +123,7 @@ class AsdPocs(VoxelMethod):
     Each iteration is one of SART, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times as long as
     the change of the first SART iteration. The steps are multiplied by `alpha_decay` if they undo more than `ratio` of
     the SART iteration and the residual is still above `goal`.
-    Memory: 5 volumes, 3 x the projections.
+    Memory: 5 volumes and 3 times the projections.
 
     Attributes:
         goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 of that of filtered back-projection (FBP or

@@ -202,9 +202,9 @@ def fit_share(
     Args:
         found: result of `fit_materials` from the same projections.
         states: indices of the two materials.
-        go_on: called before each of at most `STEPS` steps with the number that may follow; False ends it with the
-            densities so far.
-        stop: called many times within a step; True also ends it with the densities so far.
+        go_on: called before each of at most `STEPS` steps, with the number of steps that may still follow. If it
+            returns False, the fit ends with the densities so far.
+        stop: called many times within a step. If it returns True, the fit also ends with the densities so far.
 
     Raises:
         ValueError: `states` are not two different materials.

@@ -92,8 +92,8 @@ class TimedVolumes:
         motion: displacement from which each voxel takes its value; None: nothing moves.
         unseen_residuals: residuals in held-out projections of coarse volumes without and with motion; None if held-out
             projections did not decide about motion.
-        smooth: smoothness of the factors (module `proportions`) if each volume is the mean of all times smooth factors.
-            None: each volume is fitted separately.
+        smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
+            factors. None: each volume is fitted separately.
     """
 
     times: F64
@@ -136,14 +136,14 @@ def fit_series(
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
 
     h_k are hat functions, so the volume is linear in time between knots. W displaces the volume, smoothly in space and
-    time, and is the identity in the middle of the scan (module `motion`). This is the problem of `fit_materials` with
-    knots in place of materials and hat functions in place of cross sections. z_j are the orthonormal components of all
-    x_k; the first one is their common part. If nothing moves, and if it predicts held-out projections better, the
-    volumes become the mean volume times smooth factors. These factors suit a sample of particles, if each particle
-    takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in `fit_materials`. Four tests
-    each count down to 0: of the weights, of whether the sample moves, of the motion, and of the factors. After the
-    iterations, the steps of the factors count down. If you end these steps early, the volumes are those without
-    factors.
+    time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the problem of
+    `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the orthonormal
+    components of all volumes x_k; the first one is their common part. If nothing moves, and if it predicts held-out
+    projections better, the volumes become the mean volume times smooth factors. These factors suit a sample of
+    particles, if each particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in
+    `fit_materials`. Four tests each count down to 0: of the weights, of whether the sample moves, of the motion, and of
+    the factors. After the iterations, the steps of the factors count down. If you end these steps early, the volumes
+    are those without factors.
 
     Args:
         knots: number of volumes, 2 or more.

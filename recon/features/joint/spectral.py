@@ -77,11 +77,11 @@ def fit_materials(
         min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0
 
     U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
-    projections). The densities are V S⁻¹ z. The columns of U are orthonormal, so the noise is the same in all
-    components z_k, and the fit is as well conditioned as one at a single energy. An iteration takes as long as one with
-    the same number of projections at a single energy. Steps are those of `ordered_fista`; after each step, densities
-    below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to spectra in one
-    step.)
+    projections). The densities are V S⁻¹ z. The columns of U are orthonormal. Therefore the noise is the same in all
+    components z_k, and the fit is as well conditioned as a fit to projections at a single energy. An iteration takes as
+    long as one with the same number of projections at a single energy. Steps are those of `ordered_fista`; after each
+    step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to
+    spectra in one step.)
     Memory: seven volumes per material, three times the projections.
 
     Args:

@@ -76,7 +76,7 @@ def test_a_file_that_its_file_system_takes_no_longer(tmp_path: Path) -> None:
     failed = [row for row in rows if "recover" in str(row["done"])]
     assert len({row["committed"] for row in failed}) > 6
     for row in failed:
-        assert f"first {row['committed']} frames are safe in it: `beamline recover`" in row["done"]
+        assert f"first {row['committed']} frames are safe in this file: run `beamline recover`" in row["done"]
         assert row["under"] == row["recover"] == row["committed"], row
     _assert_said_in_a_sentence(rows)
     _assert_all_is_there(rows)

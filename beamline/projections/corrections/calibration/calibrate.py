@@ -245,7 +245,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     try:
         learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
     except ValueError as error:
-        raise DataError(f"--calibrate gains: {error}. Omit it, or give --rings.") from error
+        raise DataError(f"--calibrate gains: {error}. Omit --calibrate gains, or give --rings instead.") from error
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
     judged = (
         f"the residual in held-out projections is {learnt.without:.4g} without the correction and "
