@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
 _RUN = 4096  # values summed in float32 before they join the float64 sum
+_PARTS = 64  # of a sum; not the number of threads, so that results do not depend on it
 
 
 @njit(**OPTIONS)
@@ -31,7 +32,7 @@ def _dot(a: F32, b: F32, sums: NDArray[np.float64]) -> None:
 
 def dot(a: F32, b: F32) -> float:
     """<a, b> of two arrays of one shape."""
-    sums = np.empty(get_num_threads())
+    sums = np.empty(_PARTS)
     _dot(a.reshape(-1), b.reshape(-1), sums)
     return float(sums.sum())
 
@@ -87,7 +88,7 @@ def _replace_by_residual(data: F32, model: F32, weight: F32, scale: F32, sums: N
 def replace_by_residual(data: F32, model: F32, weight: F32 | None = None, scale: F32 | None = None) -> float:
     """Replace `model` by scale (data - model); returns Σ weight (data - model)². None: all 1."""
     empty = np.empty(0, np.float32)
-    sums = np.empty(get_num_threads())
+    sums = np.empty(_PARTS)
     weights, scales = (empty if array is None else array.reshape(-1) for array in (weight, scale))
     _replace_by_residual(data.reshape(-1), model.reshape(-1), weights, scales, sums)
     return float(sums.sum())
@@ -111,7 +112,7 @@ def _turn_of_steps(before: F32, start: F32, end: F32, sums: NDArray[np.float64])
 
 def turn_of_steps(before: F32, start: F32, end: F32) -> float:
     """<start - end, end - before>: above zero where the step from `start` to `end` points back to `before`."""
-    sums = np.empty(get_num_threads())
+    sums = np.empty(_PARTS)
     _turn_of_steps(before.reshape(-1), start.reshape(-1), end.reshape(-1), sums)
     return float(sums.sum())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -110,3 +111,17 @@ def test_results_equal_those_of_numpy(n: int, rng: np.random.Generator) -> None:
 def test_a_long_sum_keeps_its_digits() -> None:
     ones = np.full(5_000_001, 0.1, np.float32)
     assert dot(ones, ones) == pytest.approx(ones.size * float(np.float32(0.1)) ** 2, rel=3e-6)
+
+
+def test_a_sum_does_not_depend_on_the_number_of_threads(rng: np.random.Generator) -> None:
+    """Workers of a cluster have fewer threads than the computer that asks them."""
+    a, b = rng.normal(size=(2, 100_003)).astype(np.float32)
+    threads = numba.get_num_threads()
+    try:
+        sums = list[tuple[float, float]]()
+        for n in {1, threads}:
+            numba.set_num_threads(n)
+            sums.append((dot(a, b), replace_by_residual(a, b.copy())))
+    finally:
+        numba.set_num_threads(threads)
+    assert len(set(sums)) == 1
