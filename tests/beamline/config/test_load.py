@@ -62,7 +62,7 @@ def test_names_of_keys_in_the_last_version_are_understood_with_their_places(tmp_
     [
         (
             (),
-            "scan.decide ask needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan set",
+            "scan.decide ask needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan",
         ),
         (("scan.pass_views=6",), "needs passes"),  # a fly scan
         (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs passes"),
