@@ -156,13 +156,19 @@ class TrialChoice(NamedTuple):
         """By how much the best is better than a simpler one that is taken; empty where the best is taken."""
         if self.at is None or self.best is None or self.at == self.best:
             return ""
-        (simple, mine), (best, least) = ((self.predictions[at].name, self.tried[at]) for at in (self.at, self.best))
-        less, error = ((mine - least).mean() / mine.mean(), _standard_error(mine - least) / mine.mean())
-        by = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
+        (simple, of_simple), (best, of_best) = (
+            (self.predictions[at].name, self.tried[at]) for at in (self.at, self.best)
+        )
+        improvement, error = (
+            (of_simple - of_best).mean() / of_simple.mean(),
+            _standard_error(of_simple - of_best) / of_simple.mean(),
+        )
+        margin = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
         return (
-            f". The residual of {best} is {less:.2%} smaller than that of {simple} (standard error {error:.2%}). "
-            f"{simple} was chosen, because it is simpler: the residual of a costlier method must be smaller by {by}one "
-            "standard error"
+            f". The residual of {best} is {improvement:.2%} smaller than that of {simple} "
+            f"(standard error {error:.2%}). "
+            f"{simple} was chosen, because it is simpler: the residual of a costlier method must be smaller by "
+            f"{margin}one standard error"
         )
 
 

@@ -94,30 +94,30 @@ def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -
     device = voxel_device(projector.device)
     plain = one_of_like_rows(projector.plain, weight)
     lines, (nz, ny, nx) = projector_on(device, plain), plain.grid.shape
-    here = replace(damping, shape=(ny, nx, nz))
+    row_damping = replace(damping, shape=(ny, nx, nz))
     root = None if weight is None else device.array(np.sqrt(weight))
     noise = np.random.default_rng(0).standard_normal(_ray_shape(plain), np.float32)
     q = device.array(noise if weight is None else noise * (weight > 0))
-    size, before = device.norm(q), device.zeros(noise.shape)
-    diagonal, beside = list[float](), list[float]()
+    size, previous = device.norm(q), device.zeros(noise.shape)
+    diagonal, off_diagonal = list[float](), list[float]()
     for _ in range(_LANCZOS_STEPS):
         if size <= _NOTHING * math.sqrt(noise.size):
             break
         device.combine(1 / size, q, 0.0, q, q)
         back = lines.adjoint_lines(q if root is None else q * root)
-        here.take_off(device, back, here.cells(device, back))
+        row_damping.take_off(device, back, row_damping.cells(device, back))
         image = lines.forward_lines(back)
         if root is not None:
             image *= root
-        beside.append(size)
-        device.combine(1.0, image, -size if diagonal else 0.0, before, image)
+        off_diagonal.append(size)
+        device.combine(1.0, image, -size if diagonal else 0.0, previous, image)
         diagonal.append(device.dot(q, image))
         device.combine(1.0, image, -diagonal[-1], q, image)
-        before, q = q, image
+        previous, q = q, image
         size = device.norm(q)
-    if not diagonal or not (largest := float(eigh_tridiagonal(diagonal, beside[1:], eigvals_only=True)[-1])) > 0:
+    if not diagonal or not (largest := float(eigh_tridiagonal(diagonal, off_diagonal[1:], eigvals_only=True)[-1])) > 0:
         return math.inf  # no ray meets the box
-    return _MARGIN * projector.gain(weight) * here.gain * largest
+    return _MARGIN * projector.gain(weight) * row_damping.gain * largest
 
 
 def _ray_shape(projector: Projector) -> tuple[int, int, int]:

@@ -151,8 +151,8 @@ def _by_slabs(
     mean = sum(projections[view] / np.float32(looked_at.size) for view in looked_at)
     beyond, weights = continuation(mean, geometry, weights, zeros, filter)
     z, y, x = grid.coordinates()
-    there = voxel_device(device)
-    volume = there.zeros((y.size, x.size, z.size))
+    compute_device = voxel_device(device)
+    volume = compute_device.zeros((y.size, x.size, z.size))
     slab = max(1, SLAB_BYTES // (4 * math.prod(geometry.detector_shape)))
     for start in range(0, geometry.n_views, slab):
         some = slice(start, start + slab)
@@ -165,7 +165,7 @@ def _by_slabs(
             lines = slice(layers.start, layers.stop)
             kernel(prepared, *of_views, x, y[lines], z, volume[lines])
             on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
-    return volume_slices(there.numpy(volume))
+    return volume_slices(compute_device.numpy(volume))
 
 
 def _prepared_views(

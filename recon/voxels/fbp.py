@@ -96,12 +96,12 @@ def continuation(
     if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW:
         weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
     cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
-    there = np.flatnonzero(cut.any(axis=1))
-    if not there.size:
+    cut_rows = np.flatnonzero(cut.any(axis=1))
+    if not cut_rows.size:
         return None, given
     filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
     ends = sample_reach(mean, axis)
-    for row in there:
+    for row in cut_rows:
         reach = min(max(ends[row], *np.abs(edges * cut[row])), FARTHEST * edges.max())
         length = max(*zeros, math.ceil(reach - edges.min()))
         fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))

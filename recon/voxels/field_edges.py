@@ -51,17 +51,17 @@ def sample_reach(mean: F32, axis: float) -> F64:
     slope and the square of their difference. By the edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385) FBP of packed
     grains loses 0.4 dB where the can is twice as wide as the field (0.1 dB on two packings that nothing was tuned on).
     """
-    way, squares = (np.arange(mean.shape[1]) - axis) ** 2, np.asarray(mean, np.float64) ** 2
+    squared_distance, squares = (np.arange(mean.shape[1]) - axis) ** 2, np.asarray(mean, np.float64) ** 2
     slopes = []
-    for part in (way >= 0, outer := way >= (1 - _OUTER) ** 2 * way.max()):
-        apart = way[part] - way[part].mean()
+    for part in (squared_distance >= 0, outer := squared_distance >= (1 - _OUTER) ** 2 * squared_distance.max()):
+        apart = squared_distance[part] - squared_distance[part].mean()
         slopes.append(-(squares[:, part] @ apart) / max(float(apart @ apart), 1e-30))
     level = squares[:, outer].mean(axis=1)
     rest = squares[:, outer] - level[:, None] + slopes[1][:, None] * apart
     variance = _ALIKE * (rest**2).mean(axis=1) / max(float(apart @ apart), 1e-30)
     differ = slopes[0] - slopes[1]
     fall = slopes[1] + differ * variance / (variance + differ**2 + 1e-30)
-    return np.asarray(np.sqrt(way[outer].mean() + level / np.maximum(fall, 1e-30)))
+    return np.asarray(np.sqrt(squared_distance[outer].mean() + level / np.maximum(fall, 1e-30)))
 
 
 @dataclass(frozen=True)
@@ -196,11 +196,11 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
     if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
         return None
     deepest = images.mean(axis=1).max(axis=0)
-    there = np.flatnonzero(deepest > AIR * deepest.max())
+    filled = np.flatnonzero(deepest > AIR * deepest.max())
     axis, width = geometry.axis_col + geometry.shifts[:, 0], geometry.detector_shape[1]
-    if not there.size:
+    if not filled.size:
         return None
-    half = (1 + 2 * BESIDE_MATTER) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
+    half = (1 + 2 * BESIDE_MATTER) * max(axis.max() - filled[0], filled[-1] - axis.min()) + 2
     first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
     if stop - first == width:
         return None
@@ -240,7 +240,7 @@ def busiest_rows(data: F32, height: int) -> slice:
     rows = data.shape[1]
     if rows <= height:
         return slice(0, rows)
-    some = data[:: max(1, len(data) // 8)]
-    matter = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
-    first = int(np.argmax(matter[height:] - matter[:-height]))
+    sampled = data[:: max(1, len(data) // 8)]
+    cumulative = np.concatenate(([0.0], np.cumsum(np.abs(sampled).sum(axis=(0, 2), dtype=np.float64))))
+    first = int(np.argmax(cumulative[height:] - cumulative[:-height]))
     return slice(first, first + height)

@@ -285,35 +285,40 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     """
     factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
     factor = min(factor, *volume.shape)
-    shown, found = _blocks(reference, factor), _blocks(volume, factor)
-    ny, nx = shown.shape[1:]
+    reference_blocks, volume_blocks = _blocks(reference, factor), _blocks(volume, factor)
+    ny, nx = reference_blocks.shape[1:]
     y, x = np.mgrid[:ny, :nx]
     disc = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
-    inside = np.repeat(disc[None], len(shown), axis=0)
+    inside = np.repeat(disc[None], len(reference_blocks), axis=0)
     if seen is not None:
-        blocks = seen[: len(shown) * factor].reshape(-1, factor).all(axis=1)
+        blocks = seen[: len(reference_blocks) * factor].reshape(-1, factor).all(axis=1)
         inside &= ndimage.binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
-    smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in shown.shape]
-    shown, found = (gaussian_filter(values, smooth, mode="nearest") for values in (shown, found))
+    smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in reference_blocks.shape]
+    reference_blocks, volume_blocks = (
+        gaussian_filter(values, smooth, mode="nearest") for values in (reference_blocks, volume_blocks)
+    )
     if not inside.any():
         return None
-    level, noise = air_level(shown[inside])
-    matter = (shown - level > _ABOVE_AIR * noise) & inside
+    reference_air, noise = air_level(reference_blocks[inside])
+    matter = (reference_blocks - reference_air > _ABOVE_AIR * noise) & inside
     air = inside & ~binary_dilation(matter, iterations=_MARGIN)
     if noise == 0 or air.sum() < _LEAST_AIR:
         return None
-    own = float(found[air].mean(dtype=np.float64))
-    gone = matter & (found - own < _LEFT * (shown - level))
-    core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
-    parts, n = ndimage.label(ndimage.binary_opening(gone, np.ones(core)))
+    volume_air = float(volume_blocks[air].mean(dtype=np.float64))
+    lost = matter & (volume_blocks - volume_air < _LEFT * (reference_blocks - reference_air))
+    core = [min(n, wide) for n, wide in zip(lost.shape, _CORE, strict=True)]
+    parts, n = ndimage.label(ndimage.binary_opening(lost, np.ones(core)))
     sizes = np.bincount(parts.ravel())[1:]
     if not n or sizes.max() < _LEAST_REGION:
         return None
-    at = int(sizes.argmax())
-    region = parts == at + 1
-    kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
+    largest = int(sizes.argmax())
+    region = parts == largest + 1
+    kept_share = float(
+        (volume_blocks[region] - volume_air).sum(dtype=np.float64)
+        / (reference_blocks[region] - reference_air).sum(dtype=np.float64)
+    )
     return LostMatter(
-        tuple((part.start * factor, part.stop * factor) for part in ndimage.find_objects(parts)[at]), kept
+        tuple((part.start * factor, part.stop * factor) for part in ndimage.find_objects(parts)[largest]), kept_share
     )
 
 

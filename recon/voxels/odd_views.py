@@ -74,16 +74,16 @@ def odd_views(
     found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
-        near = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
-        around = differences[near] ** 2
+        neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
+        around = differences[neighbours] ** 2
         usual = np.minimum(around, _OUTLIER**2 * (1 + np.median(around, axis=0))).mean(axis=0)
         score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
         if abs(peak) > LIMIT:
             parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
-            there = np.nonzero(parts == parts[worst])
-            spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in there]
+            region = np.nonzero(parts == parts[worst])
+            spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in region]
             found.append(OddView(int(order[place]), peak, spans[0], spans[1]))
     return tuple(sorted(found, key=lambda odd: odd.view))
 
@@ -140,31 +140,37 @@ def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[in
     """
     geometry, weights = whole.geometry, whole.weights
     rows, cols = (n // side for n in geometry.detector_shape)
-    # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
-    # light, and the difference.
-    cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
+    # Means over cells. `weight` is the square root of the intensity, 0 in unknown pixels. The means are those of: the
+    # weighted difference, its part that edges explain, the known pixels, the weighted projection, the weight, and the
+    # difference without weight.
+    cells, edges, known_cells, weighted_cells, weight_cells, mean_difference = (
+        np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6)
+    )
     compared = 0
     for views, part, model, sharp in _projected(volume, geometry):
         measured = whole.data[views, part]
         difference = measured - model
         known = np.ones_like(model) if weights is None else (weights[views, part] > 0).astype(np.float32)
-        bright = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
-        there = views, slice(part.start // side, part.stop // side)
-        cells[there], lit[there] = bin_views(difference * bright, side), bin_views(known, side)
-        seen[there], light[there] = bin_views(measured * bright, side), bin_views(bright, side)
-        left[there], edges[there] = bin_views(difference * known, side), bin_views(sharp * bright, side)
+        weight = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
+        block = views, slice(part.start // side, part.stop // side)
+        cells[block], known_cells[block] = bin_views(difference * weight, side), bin_views(known, side)
+        weighted_cells[block], weight_cells[block] = bin_views(measured * weight, side), bin_views(weight, side)
+        mean_difference[block] = bin_views(difference * known, side)
+        edges[block] = bin_views(sharp * weight, side)
         compared += len(model) * model.shape[1]
         progress(min(compared // (rows * side), geometry.n_views), geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
-        own = deviation_between_neighbours(seen[view], 3)  # the finest detail of the sample counts as noise
-        noise = max(own, _LEAST_NOISE / side * float(np.abs(seen[view]).max()))
-        if not lit[view].any() or not noise > 0:
+        # the finest detail of the sample counts as noise
+        detail = deviation_between_neighbours(weighted_cells[view], 3)
+        noise = max(detail, _LEAST_NOISE / side * float(np.abs(weighted_cells[view]).max()))
+        if not known_cells[view].any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue
-        cell -= np.float32(np.median(left[view][lit[view] > 0])) * light[view]
-        # Sums over existing, lit cells, by their own noise; fewer at an edge, and with a single row.
-        there = uniform_filter(lit[view], _BROAD, mode="constant")
-        scale = np.divide(_BROAD / noise, np.sqrt(there), out=np.zeros_like(there), where=there > 0)
+        cell -= np.float32(np.median(mean_difference[view][known_cells[view] > 0])) * weight_cells[view]
+        # Sums over cells with known pixels, divided by their noise. There are fewer cells at an edge, and with a single
+        # row.
+        known_share = uniform_filter(known_cells[view], _BROAD, mode="constant")
+        scale = np.divide(_BROAD / noise, np.sqrt(known_share), out=np.zeros_like(known_share), where=known_share > 0)
         cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
         edge[...] = uniform_filter(_SHARP * edge, _BROAD, mode="constant") * scale
     return cells, edges

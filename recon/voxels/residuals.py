@@ -72,7 +72,7 @@ def residuals_of(volume: Volume, views: Views) -> F64:
 
 
 def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
-    sums = [[np.square(view[there], dtype=np.float64).sum() for view, there in zip(images, counts, strict=True)]
+    sums = [[np.square(view[counted], dtype=np.float64).sum() for view, counted in zip(images, counts, strict=True)]
             for images in (left, views)]  # fmt: skip
     return SquaresLeft(np.array(sums[0]), np.array(sums[1]), counts.sum(axis=(1, 2), dtype=np.float64))
 
