@@ -180,8 +180,8 @@ def scan(
 ) -> ScanResult:  # fmt: skip
     """Connect, run one scan, and close the devices.
 
-    Arguments and errors are those of `connect` and `Instrument.scan`. `set` applies to both, so it may also change
-    how the devices are opened.
+    Arguments and errors are those of `connect` and `Instrument.scan`. `set` replaces values for the
+    connection and for the scan, so it may also change how the devices are opened.
     """
     with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)

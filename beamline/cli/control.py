@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 CHOICES = tuple(Choice)
 _LOOKS = 50  # a tenth of a second apart, because the log of events may be written a moment after the state
-_EXIT_CODES = "Exit code: 0 the scan has done it, 2 no scan runs there or it does not answer, 5 disk error."
+_EXIT_CODES = "Exit code: 0 the scan has carried it out, 2 no scan runs there or it does not answer, 5 disk error."
 
 
 def _command(verb: str, help_text: str) -> click.Command:
@@ -100,8 +100,8 @@ def decide(words: tuple[str, ...]) -> None:
     those without a frame), or enough (no further pass). Without RUN, the command goes to the only running scan in
     ./runs.
 
-    Exit code: 0 the scan takes the choice, 2 no scan runs there, it does not ask, or it takes another choice, 5 disk
-    error.
+    Exit code: 0 the scan takes your choice, 2 no scan runs there, it does not ask, it does not offer your choice, or
+    your choice came too late, 5 disk error.
     """
     *run, choice = words
     if len(run) > 1 or choice not in CHOICES:
@@ -115,8 +115,7 @@ pause = _command(
     "pause",
     "Pause a running scan, from another terminal.\n\n\b\nbeamline pause        the only running scan in ./runs\n"
     "beamline pause RUN    the scan in the folder RUN\n\nThe stage stops and the shutter closes. No projection is lost "
-    "or "
-    "taken twice. `beamline resume` continues the scan.",
+    "or taken twice. `beamline resume` continues the scan.",
 )
 resume = _command(
     "resume",
@@ -127,8 +126,8 @@ stop = _command(
     "stop",
     "Stop a running scan cleanly, from another terminal, as the first Ctrl-C does.\n\n\b\n"
     "beamline stop        the only running scan in ./runs\nbeamline stop RUN    the scan in the folder RUN\n\n"
-    "Frames in flight and the remaining darks and flats are taken, and the stage returns. `beamline scan --resume RUN` "
-    "continues the run later.",
+    "The scan still stores the frames that are already triggered, takes the remaining darks and flats, and returns the "
+    "stage. `beamline scan --resume RUN` continues the run later.",
 )
 abort = _command(
     "abort",
@@ -214,9 +213,9 @@ def recover(file: Path, as_json: bool) -> None:
     beamline recover RUN            repair all files in the folder of a run
     beamline recover RUN/scan.h5    repair one file
 
-    All complete frames are kept; a frame that was being written is dropped. Any program can then open the file; it
-    has the group /exchange and the status `failed`. A file that is in order is not changed. The frames are copied,
-    which takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
+    The command keeps all complete frames, and drops a frame that was being written. The repaired file has the group
+    /exchange and the status `failed`. The command does not change a file that is in order. It copies the frames, which
+    takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
     """
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan
@@ -319,7 +318,7 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, connect: bool,
     beamline check my.yaml
     beamline check my.yaml --connect    also connect to every device
 
-    The plan has the speed of the stage, its run-up, the angular step in counts of the stage, motion blur and
+    The plan lists the speed of the stage, its run-up, the angular step in counts of the stage, motion blur and
     rolling-shutter skew in pixels, the duration, the size of the data and the free disk space.
 
     Exit code: 0 valid, 2 wrong configuration or violated limit, 3 a device does not answer.

@@ -61,7 +61,8 @@ class ScanRequest:
         "--documents",
         metavar="FILE|tcp://HOST:PORT",
         type=click.Path(dir_okay=False),
-        help="Write bluesky documents: append them to FILE, one a line, or send them to a 0MQ proxy. "
+        help="Write bluesky documents: append them to FILE, one document a line, or send them to the 0MQ "
+        "proxy at HOST:PORT. "
         'Needs: pip install "splatline[bluesky]".',
     )
     stop_on_failure: bool = set_by(
@@ -120,8 +121,8 @@ def scan(request: ScanRequest) -> None:
     Several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), run one after the other. If one scan
     fails, the next one starts anyway; Ctrl-C ends all of them.
 
-    If CONFIG has `scan.energies`, a scan is taken at each energy, all in one folder. --resume can continue such a
-    series, too.
+    If CONFIG has `scan.energies`, the command takes a scan at each energy, and puts all of them in one folder. --resume
+    can continue such a series, too.
 
     Exit codes are listed in `beamline --help`. 6: darks or flats cannot be used. 7: the scan is complete, but frames
     have an alarm of the monitor, or darks or flats have a fault.

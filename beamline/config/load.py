@@ -306,7 +306,7 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     if isinstance(angles, FileAngles) and not Path(angles.path).is_file():
         yield (
             ("scan", "angles", "path"),
-            f"scan.angles.path: there is no file {angles.path}; expected degrees",
+            f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
         )
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():

@@ -156,7 +156,7 @@ class LiveSlices:
             slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
             count = f"{n} of {of}" if of > n else str(n)
             place = (
-                "the detector middle, because it is not known yet: crescents are expected (set optics.axis_col or "
+                "the detector middle, because the axis is not known yet: expect crescents (set optics.axis_col or "
                 "--axis)"
                 if axis_col is None
                 else f"column {col:.1f}"

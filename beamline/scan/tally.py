@@ -137,8 +137,8 @@ def _of_block(taken: BlockTally) -> str:
         )
     if taken.shift:
         text += (
-            f" The angles of a pass may all be wrong by up to {taken.shift} steps, because it is not "
-            "known at which of its ends frames are missing or too many."
+            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra frames, "
+            "and it is not known whether at its start or at its end."
         )
     if text and taken.off > DOUBTFUL:
         text += (

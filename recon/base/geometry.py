@@ -368,7 +368,7 @@ class Geometry:
         return replace(self, **both)
 
     def straightened(self) -> Geometry:
-        """The same projections without roll, tilt and centres."""
+        """The same projections with roll, tilt and `centres` set to 0."""
         none = frozen(np.zeros(self.n_views))
         return replace(self, roll=none, tilt=none, centres=frozen(np.zeros((self.n_views, 3))))
 

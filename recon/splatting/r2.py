@@ -39,8 +39,8 @@ class R2(Fit):
         steps: number of steps. 0: the result is the starting point. None: 400 steps, or with `seconds` as many as time
             allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
-            learning rates decay over this time. It includes the compilation of kernels if `warm_up` was not called. The
-            start and one step are always made.
+            learning rates decay over this time limit. The limit includes the compilation of kernels if `warm_up` was
+            not called. The start and one step are always made.
         gaussians: number of Gaussians at the start, or the Gaussians to start from. None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.

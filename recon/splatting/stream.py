@@ -234,7 +234,8 @@ class StreamingFit:
         """Replace the line integrals [row, col] of the newest projection, after a changed correction.
 
         Raises:
-            ValueError: as for `add_views`, or there is no projection; nothing is changed.
+            ValueError: the projection does not fit (see `add_views`), or the model has no projection yet. The model
+                is unchanged.
         """
         if not self._angles:
             raise ValueError("there is no projection to replace")

@@ -294,8 +294,8 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
     beamline batch "runs/*/scan.h5" --config recipe.yaml -o RESULTS
 
     SCANS are files, or patterns in quotes. Each scan gets a folder in --output with its volume and report. The table
-    batch.csv lists the result of each scan, and why it failed if it did. If you call the command again, only scans
-    without a volume are reconstructed. Ctrl-C keeps the scans that are done.
+    batch.csv lists the result of each scan, and the reason if a scan failed. If you call the command again, it
+    reconstructs only the scans without a volume. Ctrl-C keeps the scans that are done.
 
     Exit code: 0 all scans have a volume, 4 stopped, 5 a scan failed.
     """

@@ -196,8 +196,8 @@ def study(request: StudyRequest) -> None:
 
     \b
     fixed-views      360, 180, 90 and 45 evenly spread projections
-    sector           only 30-150, 45-135 and 60-120 degrees: fewer projections,
-                     and as many as before
+    sector           only 30-150, 45-135 and 60-120 degrees: with fewer projections
+                     in a narrower range, and with equal numbers in all ranges
     random           random projections, compared with evenly spread ones
     window-average   means of neighbouring projections, separate and overlapping
     structure        numbers of the microstructure; needs splatline-structure

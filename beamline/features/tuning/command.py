@@ -38,10 +38,10 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     \b
     beamline tune my.yaml
 
-    Two darks, two flats and one projection are taken: the shutter opens, the sample moves out and back, and the stage
-    turns to the angle of the projection and back. The difference of two equal frames shows the noise. Flats and
-    projection are also taken with an eighth and a 64th of the exposure time, in case they saturate. No file is
-    written.
+    The command takes two darks, two flats and one projection. The shutter opens, the sample moves out and back, and
+    the stage turns to the angle of the projection and back. The difference of two frames of one kind shows the noise.
+    The command also takes flats and the projection with an eighth and a 64th of the exposure time, in case they
+    saturate. It writes no file.
 
     Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.
     """

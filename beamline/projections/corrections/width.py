@@ -151,7 +151,8 @@ class Width:
             *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
             *([f"a projection is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
                 "the edge of the field of view)"] if motion.arc else []),
-            *([f"the last row is seen {turned[1]:.2g} degrees later than the first"] if motion.skew else []),
+            *([f"the last detector row is exposed {turned[1]:.2g} degrees later than the first"]
+              if motion.skew else []),
         ]  # fmt: skip
         parameters |= {
             "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],

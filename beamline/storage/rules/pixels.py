@@ -53,10 +53,10 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         WRAPPED,
-        "Make the frames again from those of the camera, as 32-bit or real numbers: the 16-bit integers "
-        f"overflowed. In {sum(map(len, frames))} frames checked, {what}. This happens if values beyond "
-        f"{most} start again at {least}, for example in sums of pixels or frames, or if values fall below "
-        f"{least} because a dark was subtracted. The true values of these pixels are lost, and other "
+        "Convert the frames of the camera again, to 32-bit integers or to floats: the 16-bit integers "
+        f"overflowed. In {sum(map(len, frames))} frames checked, {what}. Two things cause this. A sum of pixels or "
+        f"frames went above {most} and wrapped to {least}. Or a dark was subtracted and the result went below "
+        f"{least}. The true values of these pixels are lost, and other "
         "flats or darks do not help.",
     )
 

@@ -71,7 +71,8 @@ def ride(
     does not slow the scan down. The first Ctrl-C closes the file properly.
 
     Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server answers,
-    4 stopped, 5 frames are missing (a message says which, and who lost them), 7 alarms of the monitor.
+    4 stopped, 5 frames are missing (a message lists them, and says what lost them if that is known),
+    7 alarms of the monitor.
 
     Example: beamline ride my.yaml --page
     """

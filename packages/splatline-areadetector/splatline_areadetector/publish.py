@@ -46,13 +46,14 @@ def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option("--port", default=None, type=click.IntRange(0, 65535),
               help="TCP port of the image. Default: that of EPICS or, if it is taken, any free one.")  # fmt: skip
 @click.option("--files", default=None, type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="FOLDER",
-              help="Let clients have frames written to files below this folder. Default: no files.")  # fmt: skip
+              help="Let clients request that frames are written to files below this folder. "
+                   "Default: no files.")  # fmt: skip
 def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | None) -> None:
     """Show a running scan to programs that expect an EPICS areaDetector, such as viewers and bluesky.
 
     Publishes the frames of the newest run in the folder RUNS (default ./runs). The command only reads the files of the
     run, so it cannot slow a scan down, and no client can start, stop or change the scan. With --files, everybody who
-    reaches the address can have frames written below that folder.
+    reaches the address can make it write frames below that folder.
 
     Exit codes: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be used.
 

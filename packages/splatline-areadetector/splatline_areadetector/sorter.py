@@ -87,11 +87,11 @@ class Seen:
 class Basis(Enum):
     """How the number of a block's first frame was found, as the end of a sentence."""
 
-    GIVEN = "the one that ride.first_id states"
-    NUMBERS = "the one whose number follows that of the frame before the block"
-    COUNTER = "the one that the camera's own count shows"
-    WAITED = "the first that arrived"
-    UNKNOWN = "the first that arrived, although others may have come before it"
+    GIVEN = "the frame that ride.first_id states"
+    NUMBERS = "the frame whose number is the next after the last frame before the block"
+    COUNTER = "the frame that the camera's own count shows"
+    WAITED = "the first frame that arrived"
+    UNKNOWN = "the first frame that arrived, although others may have come before it"
 
     @property
     def is_sure(self) -> bool:

@@ -158,8 +158,8 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)
     if not method.allow_negative and volume.data.max(initial=0) > _TOP * method.highest * unit:
         warnings.warn(
-            f"give a larger `highest` than {method.highest:g}: densities reach the highest density of the field, "
-            f"{method.highest * unit:.4g}",
+            f"give a larger `highest` than {method.highest:g}: the volume reaches the highest density that the "
+            f"network can represent, {method.highest * unit:.4g}",
             stacklevel=2,
         )
     record = {**asdict(method), "steps": fit.step, "planned_steps": method.steps, "seed": problem.seed}

@@ -78,8 +78,8 @@ def xafs(sources: Sequence[str], output: Path | None, as_json: bool, **values: A
 
     SCENE is a YAML file or the name of a scene that comes with the package. Its radiographs are simulated at all
     energies from --from to --to. FILE is a text table of energy and absorption, an HDF5 file with `energy` and
-    either `mu` or `frames` and `flats`, or the folder of a series of scans (`scan.energies`). Several FILEs, --region
-    or --states are drawn in one picture, each with its edge.
+    either `mu` or `frames` and `flats`, or the folder of a series of scans (`scan.energies`). If you give
+    several FILEs, --region or --states, one picture shows all of them, each with its edge.
 
     Exit code 6: no edge was found. Picture and table are written in this case, too.
 

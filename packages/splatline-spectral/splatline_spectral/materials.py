@@ -87,7 +87,8 @@ def read_spectra(path: Path) -> Spectra:
 @click.option("--register", is_flag=True,
               help="Find and correct how the sample moved, and the magnification of each scan.")  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="Two of the materials are two states of one; the fraction of the second is smooth.")  # fmt: skip
+              help="These two materials are states of one material, such as charged and discharged. Their sum stays; "
+              "the fraction of each is made smooth.")  # fmt: skip
 @click.option(
     "--axis", type=float, metavar="COL", help="Column of the rotation axis. Default: found in the first scan."
 )

@@ -119,8 +119,9 @@ class Seen:
     "--memory",
     metavar="SIZE",
     callback=parsed(memory_size),
-    help="Memory to use, such as 8G. Of a larger volume only the middle slices that fit are measured, and "
-    "all slices for fractions and surface; several volumes must fit whole. Default: what is free.",
+    help="Memory to use, such as 8G. If the volume needs more, only the middle slices that fit are measured; "
+    "fractions and surface are still measured on all slices. Several volumes must fit completely. Default: the free "
+    "memory.",
 )
 @click.option(
     "--slices",
@@ -175,11 +176,11 @@ class Seen:
 def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
     """Measure the microstructure of a volume, each number with an interval.
 
-    Measured are fractions of materials, particles, surface, contacts, cracks, connected share and tortuosity.
+    The command measures fractions of materials, particles, surface, contacts, cracks, connected share and tortuosity.
 
-    Each interval is one of 80 %. It has four causes: few projections (the volume is reconstructed again from each half
-    of them), uncertain grey levels of the materials, the size of a voxel, and the number of particles. A number whose
-    interval is wider than half of its value is printed as not determined.
+    Each interval is an 80 % interval. It covers four sources of error: few projections (the volume is reconstructed
+    again from each half of them), uncertain grey levels of the materials, the size of a voxel, and the number of
+    particles. If an interval is wider than half of its number, the number is printed as not determined.
 
     Several volumes are a series in time. The new folder contains report.html, numbers.csv, structure.json,
     particles.csv and labels.

@@ -54,12 +54,13 @@ class Discrete(VoxelMethod):
     φ pulls voxels to a few discrete levels, and leaves partial voxels between them; see
     `recon.features.discrete.mixture`. Memory: as `FistaTv`, plus 2 volumes.
 
-    Held-out projections choose the number of levels, their values, the share of μ, and β. The result is the FISTA-TV
+    Held-out projections choose the number of levels, their values, the factor on the FISTA-TV weight μ,
+    and β. The result is the FISTA-TV
     volume if discrete levels do not predict the held-out projections significantly better, or if there are too few
     projections to hold any out. If it starts from a first volume, it uses total variation alone.
 
     Attributes:
-        iterations: largest number of iterations over all projections after those of FISTA-TV.
+        iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
             voxels are pulled weakly to given levels.
         still: as of `FistaTv`.

@@ -126,10 +126,10 @@ class AsdPocs(VoxelMethod):
     Memory: 5 volumes and 3 times the projections.
 
     Attributes:
-        goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 of that of filtered back-projection (FBP or
-            FDK). For a short cone scan, which FDK cannot reconstruct, it is 0.15 of that of one iteration of
-            ordered-subset SIRT. Both have about the same residual: 0.085 to 0.12, and FDK 0.075 to 0.11 (a box in a
-            box, 20 to 180 projections, 0 and 2 % noise).
+        goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 times the residual of filtered back-projection
+            (FBP or FDK). FDK cannot reconstruct a short cone scan; the goal is then 0.15 times the residual after one
+            iteration of ordered-subset SIRT. Both have about the same residual: 0.085 to 0.12, and
+            FDK 0.075 to 0.11 (a box in a box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"

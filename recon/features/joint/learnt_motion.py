@@ -181,10 +181,11 @@ def register_energies(
 ) -> tuple[EnergyViews, tuple[Displacement, ...]]:
     """Align the scans at all energies: correct for the position of the sample and for the optics (parallel beam).
 
-    The energy with the most projections is the reference. A volume at this energy predicts the others, scaled by their
-    mean absorption. Six parameters explain the differences (see `recon.voxels.displacement`): the sample is shifted
-    along x, y and z and rotated about the axis; the image is shifted along the rows and magnified. The edges determine
-    these parameters, so a material whose absorption differs between two energies does no harm.
+    The energy with the most projections is the reference. The volume at the reference energy, scaled by the mean
+    absorption at another energy, predicts the projections at that energy. Six parameters explain the differences (see
+    `recon.voxels.displacement`): the sample is shifted along x, y and z and rotated about the axis; the image is
+    shifted along the rows and magnified. The edges determine these parameters, so a material whose absorption differs
+    between two energies does no harm.
 
     Returns:
         The projections (interpolated if their magnification differs), and the displacement at each energy. Nothing is

@@ -139,11 +139,11 @@ def fit_series(
     time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the problem of
     `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the orthonormal
     components of all volumes x_k; the first one is their common part. If nothing moves, and if it predicts held-out
-    projections better, the volumes become the mean volume times smooth factors. These factors suit a sample of
+    projections better, the volumes become the mean volume times smooth factors. Smooth factors suit a sample of
     particles, if each particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in
     `fit_materials`. Four tests each count down to 0: of the weights, of whether the sample moves, of the motion, and of
-    the factors. After the iterations, the steps of the factors count down. If you end these steps early, the volumes
-    are those without factors.
+    the factors. After the iterations, `go_on` gets a countdown of the steps that fit the factors. If you end these
+    steps early, the result is the volumes without factors.
 
     Args:
         knots: number of volumes, 2 or more.

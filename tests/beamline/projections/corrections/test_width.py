@@ -65,7 +65,7 @@ def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
     np.testing.assert_allclose(after.angles, before.angles + sense * ARC / 2)
     assert done.sentence == (
         "Ray width in the reconstruction: a projection is the mean over 1.6 degrees (2.8 px at the edge of the field "
-        f"of view), the last row is seen {sense * 0.25:.2g} degrees later than the first."
+        f"of view), the last detector row is exposed {sense * 0.25:.2g} degrees later than the first."
     )
     assert done.parameters == {
         "ray_width": "none",
