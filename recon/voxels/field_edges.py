@@ -240,7 +240,7 @@ def busiest_rows(data: F32, height: int) -> slice:
     rows = data.shape[1]
     if rows <= height:
         return slice(0, rows)
-    sampled = data[:: max(1, len(data) // 8)]
-    cumulative = np.concatenate(([0.0], np.cumsum(np.abs(sampled).sum(axis=(0, 2), dtype=np.float64))))
+    some = data[:: max(1, len(data) // 8)]
+    cumulative = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
     first = int(np.argmax(cumulative[height:] - cumulative[:-height]))
     return slice(first, first + height)

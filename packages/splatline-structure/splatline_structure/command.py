@@ -150,7 +150,7 @@ class Seen:
     default=0.8,
     show_default=True,
     help="Two touching parts count as one particle if the neck has at least this fraction of the width of the narrower "
-    "part; 0: always.",
+    "part; 0: touching parts always count as one.",
 )
 @click.option(
     "--side",
