@@ -54,16 +54,19 @@ def key(name: str) -> str:
 
 
 def licence(package: Distribution) -> str:
-    """The licence as an SPDX expression if the metadata give one; "" if they give nothing short enough to be a name."""
+    """The licence as an SPDX expression if the metadata give one; "" if they give nothing short enough to be a name.
+
+    Each field is looked for first: where the package importlib_metadata is installed, a missing one raises KeyError.
+    """
     said = package.metadata
     if key(said["Name"]) in READ:
         return READ[key(said["Name"])]
-    if said["License-Expression"]:
-        return str(said["License-Expression"])
+    if expression := "License-Expression" in said and said["License-Expression"]:
+        return str(expression)
     classes = [line.split(" :: ")[-1] for line in said.get_all("Classifier") or () if line.startswith("License :: ")]
     if named := [_CLASSES.get(name, name) for name in classes if name != "OSI Approved"]:
         return " AND ".join(named)
-    text = str(said["License"] or "").strip()
+    text = str(("License" in said and said["License"]) or "").strip()
     return text if len(text) < 60 and "\n" not in text else ""
 
 
