@@ -146,7 +146,7 @@ NOT_RUN = {
     ("docs/first_day.md", "beamline scan my.yaml --rehearse --set scan.angles.views=60 --set scan.period_s=0.5"):
     "minutes of frames of the whole detector",
     ("docs/first_day.md", "beamline tune my.yaml                         # counts, saturation, transmission, and the "
-     "exposure to use"): "an instrument",
+     "recommended exposure time"): "an instrument",
     ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, size, free disk; "
      "nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline recon runs/NAME/scan.h5 -m fbp --bin 4 -o quick.h5   # is the axis right, is the "
