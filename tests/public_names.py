@@ -188,7 +188,7 @@ def page() -> str:
     """The page as Markdown."""
     parts = [
         "# Public names",
-                "With this page you can see which Python names you may rely on. The names below and their required parameters\n"
+        "With this page you can see which Python names you may rely on. The names below and their required parameters\n"
         "stay the same within a major version ([releases](releases.md#what-a-version-promises)). The required\n"
         "parameters are in brackets after the name; pass those after a star by keyword. A later version may add\n"
         "optional parameters. Any name that is not on this page may change with any version.\n\n"
@@ -200,7 +200,7 @@ def page() -> str:
         "## For plans of bluesky",
         *map(_section, FOR_BLUESKY),
         "## For packages that add devices, formats and methods",
-                "A package registers what it adds under entry points: `splatline.method`, `splatline.correction`, and in the\n"
+        "A package registers what it adds under entry points: `splatline.method`, `splatline.correction`, and in the\n"
         "same way `reader`, `volume_format`, `stage`, `wire`, `camera`, `check` and `effect`\n"
         "([contributing](contributing.md)).",
         *map(_section, FOR_PACKAGES),
