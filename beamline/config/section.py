@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import MISSING
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -52,13 +53,18 @@ class Section(BaseModel):
 
 def declared(settings: type[Any]) -> dict[str, Any]:
     """Type and default of the key of each field of a driver's settings, for `section_of`."""
-    types = get_type_hints(settings)
+    types = _types(settings)
     return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
+
+
+@cache
+def _types(settings: type[Any]) -> Mapping[str, Any]:
+    return get_type_hints(settings)
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
     """The driver's settings from a section with the same keys."""
-    types, told = get_type_hints(settings), settings_of(settings).items()
+    types, told = _types(settings), settings_of(settings).items()
     return settings(**{name: _inside(made, types[name], getattr(section, made.key_of(name))) for name, made in told})
 
 

@@ -6,11 +6,13 @@ It is imported where it is needed, so that an instrument loads no simulator.
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib import import_module
+from pathlib import Path
 from uuid import uuid4
 
 from beamline.config.beam import (
@@ -179,12 +181,20 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
             )
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:
-        scene = load_scene(mapping, volumes_beside(folder))
+        phantom = mapping.get("phantom")
+        of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # which may change
+        scene = (_scene.__wrapped__ if of_files else _scene)(pickle.dumps(mapping), folder)
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
         _refuse_unrecordable(config, scene)
     return scene
+
+
+@lru_cache(maxsize=2)
+def _scene(mapping: bytes, folder: Path) -> Scene:
+    """The scene of a pickled mapping, built once for the many scans of a queue that name it."""
+    return load_scene(pickle.loads(mapping), volumes_beside(folder))  # noqa: S301 - pickled by the caller
 
 
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -107,19 +108,14 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
 
 def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
     """The longest runs of equal differences, one after another; a single count is a run of one."""
-    runs: list[TriggerTrain] = []
-    at = 0
-    while at < counts.size:
-        if at + 1 == counts.size:
-            runs.append(TriggerTrain(int(counts[at]), 0, 1))
-            break
-        interval = int(counts[at + 1] - counts[at])
-        end = at + 1
-        while end + 1 < counts.size and counts[end + 1] - counts[end] == interval:
-            end += 1
-        runs.append(TriggerTrain(int(counts[at]), interval, end - at + 1))
+    steps = np.diff(counts)
+    ends = [*(1 + np.flatnonzero(np.diff(steps))).tolist(), steps.size]  # last count of each stretch of equal steps
+    runs, at = list[TriggerTrain](), 0
+    while at < counts.size - 1:
+        end = ends[bisect(ends, at)]
+        runs.append(TriggerTrain(int(counts[at]), int(steps[at]), end - at + 1))
         at = end + 1
-    return runs
+    return [*runs, TriggerTrain(int(counts[at]), 0, 1)] if at < counts.size else runs
 
 
 MOST_PASSES = 100
