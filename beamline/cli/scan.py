@@ -19,6 +19,7 @@ from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
+from beamline.core.files import TABLE
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from beamline.scan.energies import SeriesRun
     from beamline.scan.resume import ResumableRun
     from drivers.in_beam import Ask
-
-TABLE = ".csv"  # suffix of a table of scans
 
 
 @dataclass(frozen=True, eq=False)

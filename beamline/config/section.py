@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING
 from enum import StrEnum
 from functools import cache
@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import BaseModel, ConfigDict, create_model, model_validator
 
 from recon.base.setting import Setting, settings_of
+
+_types: Callable[..., Mapping[str, Any]] = cache(get_type_hints)
 
 
 def port_problem(port: str) -> str:
@@ -55,11 +57,6 @@ def declared(settings: type[Any]) -> dict[str, Any]:
     """Type and default of the key of each field of a driver's settings, for `section_of`."""
     types = _types(settings)
     return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
-
-
-@cache
-def _types(settings: type[Any]) -> Mapping[str, Any]:
-    return get_type_hints(settings)
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:

@@ -130,8 +130,8 @@ def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
         raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         line, what = _line_and_fault(error, text)
-        place = f"{name}:{line}" if line and "\n" in text else name
-        raise ConfigError(f"{place}: this is not YAML ({what}). Nothing was started.") from None
+        place, fault = f"{name}:{line}" if line and "\n" in text else name, f"this is not YAML ({what})"
+        raise ConfigError(f"{place}: {fault}. Nothing was started.", [(place, fault)]) from None
 
 
 def _fitting_loader(text: str, name: str) -> type[Any]:
@@ -210,16 +210,19 @@ def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, st
         at, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
         if at in origins:
             full, before = ".".join(map(str, at)), origins[at].rpartition(":")[2]
-            raise ConfigError(
-                f"{name}:{line}: {full} appears twice (also in line {before}); keep one. Nothing was started."
-            )
+            fault = f"{full} appears twice (also in line {before}); keep one"
+            raise ConfigError(f"{name}:{line}: {fault}. Nothing was started.", [(f"{name}:{line}", fault)])
         origins[at] = f"{name}:{line}"
         _locate(child, at, name, origins)
 
 
+Override = str | tuple[str, str]
+"""`section.key=value`, and where it was given if that was not by --set."""
+
+
 def override(
     tree: Tree,
-    overrides: Iterable[str],
+    overrides: Iterable[Override],
     environment: Mapping[str, str],
     is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
 ) -> Tree:
@@ -238,11 +241,12 @@ def override(
     for name, value in sorted(environment.items()):
         if name.startswith(ENVIRONMENT_PREFIX) and "__" in name:
             changes.append((name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value, name))
-    for word in overrides:
+    for given in overrides:
+        word, place = (given, f"--set {given}") if isinstance(given, str) else given
         key, equals, value = word.partition("=")
         if not equals or not key.strip():
-            raise ConfigError(f"--set {word}: expected section.key=value, such as --set scan.period_s=0.2")
-        changes.append((key.strip().split("."), value, f"--set {word}"))
+            raise ConfigError(f"{place}: expected section.key=value, such as --set scan.period_s=0.2")
+        changes.append((key.strip().split("."), value, place))
     data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
         keys = [*map(str, _present_name(tuple(keys[:2]))), *keys[2:]]
@@ -271,11 +275,11 @@ REMOVED = {
 _ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"
 
 
-def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
-    """One line for each fault, with its place, in the order of the model's keys; one fault per key.
+def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[tuple[str, str]]:
+    """Place and message of each fault, in the order of the model's keys; one fault per key.
 
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
     found = faults_of(error.errors(include_url=False), tree.data, schema, former=REMOVED, advice=_ADVICE)
-    return [f"{tree.origin(fault.key)}: {fault.sentence}" for fault in found]
+    return [(tree.origin(fault.key), fault.sentence) for fault in found]

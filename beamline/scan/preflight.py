@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from beamline.core.events import json_of
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
 from beamline.core.quantities import doubt, doubt_span
-from beamline.core.text import size
+from beamline.core.text import count, size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import ScanContext
@@ -27,12 +28,13 @@ from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
-from beamline.plan.plan import Mode, ScanPlan, Timeline
+from beamline.plan.plan import Mode, ScanPlan, Timeline, summed
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import hms_text, work_out
 from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
+from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from drivers.orca_quest import PITCH_MM
 from recon.methods import streams
@@ -43,6 +45,13 @@ Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earli
 def all_of(plan: ScanPlan) -> ScanPlan:
     """The whole plan."""
     return plan
+
+
+class OperatorRequest(NamedTuple):
+    """What a scan asks the operator to do, and how often at most."""
+
+    request: str
+    times: int
 
 
 class EnergyNeeds(NamedTuple):
@@ -58,6 +67,14 @@ class DryRun:
     """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
     Of a series of energies it is the first scan; `energies` has what each needs.
+
+    Attributes:
+        disk: an existing folder on the disk of the file.
+        parts: s of all scans by what they are spent on, as in `Timeline.parts`.
+        in_beam: s for which the sample is in the beam, in all scans.
+        dose: Gy that the sample absorbs meanwhile; None: the configuration states no dose rate.
+        volume_seconds: s after the last projection in which the live volumes of all scans are finished, at most.
+        requests: what the operator has to do.
     """
 
     plan: ScanPlan
@@ -66,6 +83,22 @@ class DryRun:
     camera: CameraTiming
     free_bytes: int
     energies: tuple[EnergyNeeds, ...] = ()
+    disk: Path = Path()
+    parts: Mapping[str, float] = field(default_factory=dict)
+    in_beam: float = 0.0
+    dose: float | None = None
+    volume_seconds: float = 0.0
+    requests: tuple[OperatorRequest, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        """Seconds of all scans."""
+        return sum(need.duration for need in self.energies) if self.energies else self.timeline.duration
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of all scans."""
+        return (len(self.energies) or 1) * self.timeline.n_frames
 
     @property
     def total_bytes(self) -> int:
@@ -83,7 +116,9 @@ class DryRun:
                 "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
-        return lines
+        if self.dose is not None:
+            lines.append(f"{'dose':<10}{self.dose:.4g} Gy in {self.in_beam:.1f} s in the beam")
+        return [*lines, *(f"{'operator':<10}{request}, {count(times, 'time')}" for request, times in self.requests)]
 
     def data(self) -> Mapping[str, Any]:
         """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
@@ -102,6 +137,11 @@ class DryRun:
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
             "energies": [need._asdict() for need in self.energies],
+            "parts": self.parts,
+            "in_beam": self.in_beam,
+            "dose": self.dose,
+            "volume_seconds": self.volume_seconds,
+            "operator": [request._asdict() for request in self.requests],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
@@ -176,7 +216,36 @@ def dry_run(
         for one, plan in zip(each, plans, strict=True)
     ]
     worked_plan = worked[0] if settings.scan.energies is None else _of_energies(worked)
-    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, there))
+    in_beam, rate = sum(one.timeline.in_beam for one in worked), settings.optics.dose_rate_gy_s
+    return replace(
+        worked_plan,
+        timeline=_lockable(worked_plan.timeline, there),
+        disk=there,
+        parts=summed(*(part for one in worked for part in one.timeline.parts.items())),
+        in_beam=in_beam,
+        dose=None if rate is None else rate * in_beam,
+        volume_seconds=len(worked) * settings.recon.seconds if settings.recon.live else 0.0,
+        requests=tuple(_requests(settings, worked)),
+    )
+
+
+def _requests(config: Config, worked: Sequence[DryRun]) -> Iterator[OperatorRequest]:
+    """What the scans will ask the operator to do."""
+    by_hand, timeline = config.devices.by_hand, worked[0].timeline
+    kinds = [block.kind for block in timeline.blocks if block.n_to_take]
+    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
+    moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
+    for device, states, request in (
+        ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),
+        ("monochromator", [None, *filter(None, [worked[0].plan.energy])], "set the monochromator"),
+        ("shutter", opened, "open or close the shutter"),
+        ("sample_mover", moved_out, "move the sample out of the beam or back"),
+    ):
+        if device in by_hand and (times := sum(before != after for before, after in pairwise(states))):
+            yield OperatorRequest(request, len(worked) * times)
+    if config.scan.decide == "ask":
+        passes = math.ceil(timeline.plan.n_views / (timeline.plan.pass_views or timeline.plan.n_views))
+        yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
 
 
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
