@@ -233,7 +233,9 @@ def test_violations_have_values_and_advice(changes: dict[str, Any], sentence: st
     (violation,) = timeline.violations
     assert sentence in violation
     assert ";" in violation or ". " in violation  # what to do follows
-    assert re.search(r"\b(scan|devices|optics|storage)\.\w+", violation)  # by the first key, the plan of a queue finds the line
+    assert re.search(
+        r"\b(scan|devices|optics|storage)\.\w+", violation
+    )  # by the first key, the plan of a queue finds the line
     # Broken plans are still worked out, so that the operator sees all of it at once.
     assert timeline.n_frames > 0
     assert timeline.duration > 0
