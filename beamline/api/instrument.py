@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -18,7 +18,7 @@ from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals, to_stderr
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
-from beamline.scan.queue_plan import PlannedScan, QueuePlan, plan_queue, queue_of
+from beamline.scan.queue_plan import PlannedScan, QueuePlan, plan_queue
 from beamline.scan.run import run_scan
 from drivers.in_beam import Ask
 from recon.base.registry import loaded
@@ -216,17 +216,17 @@ def plan(
         ConfigError: an argument of the wrong type. What is wrong with a scan is in its `faults`.
     """
     refuse_wrong_arguments(plan, locals())
-    overrides = [override_of(key, value) for key, value in (set or {}).items()]
-    place = None if output is None else Path(output)
-
-    def planned(each: str | Path | Mapping[str, object] | Generator[Any, Any, Any]) -> Iterable[PlannedScan]:
+    described = list[Path | Mapping[str, object] | PlannedScan]()
+    for each in scans:
         if isinstance(each, Generator):
-            return loaded("beamline.bluesky.estimate").scans_of(each)
-        described = Path(each) if isinstance(each, str) else each
-        no_live = None if live else (lambda sentence: None)
-        return plan_queue([described], overrides, place=place, rehearse=rehearse, no_live=no_live).scans
-
-    return queue_of(scan for each in scans for scan in planned(each))
+            described += loaded("beamline.bluesky.estimate").scans_of(each)
+        else:
+            described.append(Path(each) if isinstance(each, str) else each)
+    return plan_queue(
+        described, [override_of(key, value) for key, value in (set or {}).items()],
+        place=None if output is None else Path(output), rehearse=rehearse,
+        no_live=None if live else lambda sentence: None,
+    )  # fmt: skip
 
 
 def _of_devices(config: Config) -> Mapping[str, Any]:

@@ -192,6 +192,7 @@ def dry_run(
     runs: Path | None = None,
     remaining: Remaining = all_of,
     whole: Collection[float | None] = (),
+    locks: Callable[[Path], str] = no_locks,
 ) -> DryRun:
     """Compute the plan of a configuration without devices.
 
@@ -199,6 +200,7 @@ def dry_run(
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
         whole: energies (keV) of a series that were already taken; not all of them.
+        locks: what is wrong with the locks of a folder, as `no_locks` finds out, which writes there.
 
     Raises:
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
@@ -219,7 +221,7 @@ def dry_run(
     in_beam, rate = sum(one.timeline.in_beam for one in worked), settings.optics.dose_rate_gy_s
     return replace(
         worked_plan,
-        timeline=_lockable(worked_plan.timeline, there),
+        timeline=_lockable(worked_plan.timeline, locks(there)),
         disk=there,
         parts=summed(*(part for one in worked for part in one.timeline.parts.items())),
         in_beam=in_beam,
@@ -278,9 +280,8 @@ def _worked(
     return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
 
 
-def _lockable(worked: Timeline, folder: Path) -> Timeline:
-    """The plan, with a violation if files in the folder cannot be locked."""
-    no_locking = no_locks(folder)
+def _lockable(worked: Timeline, no_locking: str) -> Timeline:
+    """The plan, with a violation if files in its folder cannot be locked."""
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
 
@@ -350,7 +351,7 @@ def preflight(
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, disk = camera.timing, disk_of(runs)
     free = shutil.disk_usage(disk).free
-    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), disk)
+    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk))
     refuse_violations(timeline)
     ready = ready_scan(config, timeline, settings, timing, _info(config, instrument, plan, timeline), check_stop)
     if instrument.simulated is not None:

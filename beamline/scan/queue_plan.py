@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from beamline.plan.limits import ROOM
 from beamline.plan.plan import summed
 from beamline.plan.timeline import hms_text
 from beamline.scan.preflight import DryRun, OperatorRequest, doubts, dry_run
+from beamline.storage.writer_lock import no_locks
 
 _CONFIG = "config"  # the column with the configuration's file
 _NOTHING = " Nothing was started."
@@ -84,6 +86,14 @@ class PlannedScan:
         """Seconds of the scan, without moves of shutter and sample; 0 if they cannot be computed."""
         return sum(self.parts.values())
 
+    def cells(self) -> tuple[str, ...]:
+        """Frames, MB, time, requests to the operator and dose (Gy) as text; `-` for what is not known."""
+        dose = "-" if self.dose is None else f"{self.dose:.4g}"
+        if not self.parts:
+            return ("-", "-", "-", "-", dose)
+        asked = sum(times for _, times in self.operator)
+        return (str(self.n_frames), f"{self.total_bytes / 1e6:.1f}", _hms(self.duration), str(asked), dose)
+
     def data(self) -> Mapping[str, Any]:
         """The values for programs: s, bytes, Gy."""
         facts = {name: getattr(self, name) for name in ("source", "sample", "valid", "duration", "warnings")}
@@ -145,18 +155,18 @@ class QueuePlan:
     def lines(self) -> list[str]:
         """A line for each scan, the time by parts, and the sums."""
         rows = [
-            (scan.sample or "-", scan.source, "yes" if scan.valid else "no", str(scan.n_frames),
-             f"{scan.total_bytes / 1e6:.1f}", _hms(scan.duration), str(sum(times for _, times in scan.operator)),
-             "-" if scan.dose is None else f"{scan.dose:.4g}")
+            (scan.sample or "-", scan.source, "yes" if scan.valid else "no", *scan.cells())
             for scan in self.scans
         ]  # fmt: skip
         head = ("scan", "from", "can run", "frames", "size (MB)", "time (h:min:s)", "requests", "dose (Gy)")
+        table = [aligned([head, *rows]), ""]
+        whole = f"{count(len(self.scans), 'scan')}, {len(self.can_run) or 'none'} can run"
+        if not self.can_run:
+            return [*table, whole]
         parts = [(part, _hms(seconds)) for part, seconds in {**self.parts, "all": self.duration}.items()]
-        whole = f"{count(len(self.scans), 'scan')}, {len(self.can_run)} can run"
         rest = f"at most {_hms(self.volume_seconds)} for the live volumes, and " if self.volume_seconds else ""
         return [
-            aligned([head, *rows]),
-            "",
+            *table,
             aligned([("part", "time (h:min:s)"), *parts]),
             "",
             f"{whole}: {size(self.total_bytes)} of {size(self.free_bytes)} free, {hms_text(self.duration)}, plus "
@@ -170,7 +180,7 @@ class QueuePlan:
 
     def refuse_impossible(self) -> None:
         """Raise ConfigError with all faults of all scans. Nothing was started."""
-        found = [f"{_named(scan, fault)}" for scan in self.scans for fault in scan.faults]
+        found = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
         if found or self.faults:
             bad = count(len(self.scans) - len(self.can_run), "scan")
             what = f"{bad} of {len(self.scans)} cannot run" if found else "the scans do not fit on the disk"
@@ -179,7 +189,7 @@ class QueuePlan:
 
 
 def plan_queue(
-    scans: Iterable[Path | Mapping[str, object]],
+    scans: Iterable[Path | Mapping[str, object] | PlannedScan],
     overrides: Sequence[Override] = (),
     *,
     place: Path | None = None,
@@ -189,22 +199,26 @@ def plan_queue(
     """Plan several scans without devices. A scan that cannot run does not end the planning of the others.
 
     Args:
-        scans: files of configurations, tables of scans, and rows of such tables as mappings. A table is a CSV file. Its
-            first line names the column `config`, the file of a configuration (relative to the table), and keys of
-            configurations, whose values go before those of the file; an empty cell changes nothing.
+        scans: files of configurations, tables of scans, rows of such tables as mappings, and scans that were planned
+            already. A table is a CSV file. Its first line names the column `config`, the file of a configuration
+            (relative to the table), and keys of configurations, whose values go before those of the file; an empty cell
+            changes nothing.
         overrides: of all scans, after those of a table.
         place: folder in which the folders of the runs would be created; None: the configured ones.
         rehearse, no_live: as of `load`.
     """
 
-    def read(file: Path, own: Sequence[Override]) -> ReadConfig:
-        return read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+    locks = cache(no_locks)  # once a folder: on a network disk it takes a while
 
-    return queue_of(
-        planned if isinstance(planned, PlannedScan) else _planned(*planned, read, place)
-        for each in scans
-        for planned in _described(each)
-    )
+    def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
+        try:
+            found = read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+        except (ConfigError, DataError, OSError) as error:
+            return PlannedScan(source, faults=_faults_of(error, str(file)))
+        return plan_of_config(found.config, place, source, found, locks)
+
+    described = (scan for each in scans for scan in _described(each))
+    return queue_of(scan if isinstance(scan, PlannedScan) else planned(*scan) for scan in described)
 
 
 _Described = tuple[str, Path, Sequence[Override]]
@@ -231,8 +245,11 @@ def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:
     return QueuePlan(planned, tuple(faults), min((free for _, _, free in room), default=0))
 
 
-def _described(scan: Path | Mapping[str, object]) -> Iterator[_Described | PlannedScan]:
+def _described(scan: Path | Mapping[str, object] | PlannedScan) -> Iterator[_Described | PlannedScan]:
     """The scans of a file, a table or a row; those that are not described as expected are planned with that fault."""
+    if isinstance(scan, PlannedScan):
+        yield scan
+        return
     if isinstance(scan, Path):
         yield from _rows(scan) if scan.suffix.lower() == TABLE else [(str(scan), scan, ())]
         return
@@ -277,36 +294,31 @@ def _rows(table: Path) -> Iterator[_Described | PlannedScan]:
         yield place, table.parent / cells[_CONFIG], own
 
 
-def _planned(
-    source: str,
-    file: Path,
-    own: Sequence[Override],
-    read: Callable[[Path, Sequence[Override]], ReadConfig],
+def plan_of_config(
+    config: Config,
     place: Path | None,
+    source: str,
+    read: ReadConfig | None = None,
+    locks: Callable[[Path], str] = no_locks,
 ) -> PlannedScan:
-    try:
-        found = read(file, own)
-    except (ConfigError, DataError, OSError) as error:
-        return PlannedScan(source, faults=_faults_of(error, str(file)))
-    return plan_of_config(found.config, place, source, read=found)
-
-
-def plan_of_config(config: Config, place: Path | None, source: str, read: ReadConfig | None = None) -> PlannedScan:
     """The planned scan of a configuration.
 
     Args:
+        place, source: as in `plan_queue` and `PlannedScan`.
         read: the configuration with its places, and with what is wrong with it; None: nothing is known to be.
+        locks: as in `dry_run`.
     """
     faults = [] if read is None else [_placed_at(at, sentence) for at, sentence in read.faults]
     sample, worked, warnings = config.sample.name, None, list[str]()
     try:
         warnings = doubts(config)
-        worked = dry_run(config, place)
+        worked = dry_run(config, place, locks=locks)
     except (ConfigError, DataError, OSError) as error:
         if not faults:  # those may be its cause
             faults += [_named_in(read, fault) for fault in _faults_of(error)]
     if worked is None:
         return PlannedScan(source, sample, tuple(faults), tuple(warnings), config=config)
+    warnings = [warning for warning in warnings if all(warning not in fault.message for fault in faults)]
     faults += [_named_in(read, ScanFault(sentence)) for sentence in worked.timeline.violations]
     return PlannedScan(
         source,
@@ -346,9 +358,8 @@ def _named_in(read: ReadConfig | None, fault: ScanFault) -> ScanFault:
 
 def _named(scan: PlannedScan, fault: ScanFault) -> str:
     """A line about a fault, which names its scan."""
-    text = str(fault)
-    named = text if text.startswith(scan.source) else f"{scan.source}: {text}"
-    return f"{scan.sample}: {named}" if scan.sample else named
+    text, sample = str(fault), f" ({scan.sample})" if scan.sample else ""
+    return text if text.startswith(scan.source) else f"{scan.source}{sample}: {text}"
 
 
 def _hms(seconds: float) -> str:

@@ -44,4 +44,4 @@ def test_nothing_is_written_and_no_device_is_used(tmp_path: Path, monkeypatch: p
 
 def test_a_list_is_expected() -> None:
     with pytest.raises(api.ConfigError, match=r"^scans must be "):
-        api.plan(str(SIMULATED))  # type: ignore[arg-type]
+        api.plan(str(SIMULATED))

@@ -1,4 +1,4 @@
-"""A plan of bluesky is estimated by its messages: its scans, moves, waits and single frames; no device does anything."""
+"""A plan of bluesky is estimated by its messages: scans, moves, waits and single frames; no device does anything."""
 
 import math
 from collections.abc import Generator, Iterator

@@ -101,7 +101,7 @@ def test_2_a_dry_run_of_several_scans_states_the_faults_of_all_and_plans_the_oth
     assert [line.split()[:3] for line in result.stdout.splitlines()[1:4]] == [
         ["a", f"{table}:2", "yes"], ["b", f"{table}:3", "no"], ["-", f"{table}:4", "no"],
     ]  # fmt: skip
-    assert f"b: {table}:3: scan.period_s 0.01 is below the camera's minimum" in result.stderr
+    assert f"  {table}:3: scan.period_s 0.01 is below the camera's minimum" in result.stderr
     assert "none.yaml does not exist" in result.stderr and "2 scans of 3 cannot run" in result.stderr
     as_json = CliRunner().invoke(main, ["scan", str(table), "--dry-run", "--json", "-o", str(tmp_path / "runs")])
     (line,) = as_json.stdout.splitlines()

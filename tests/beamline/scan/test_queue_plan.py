@@ -1,4 +1,4 @@
-"""Plan of a queue: every fault of every scan with its line, what each scan needs, and the sums of those that can run."""
+"""Plan of a queue: every fault of every scan with its line, what each needs, and the sums of those that can run."""
 
 from __future__ import annotations
 
@@ -91,8 +91,8 @@ def test_every_fault_of_a_hundred_scans_has_its_file_and_line(tmp_path: Path) ->
 def test_values_that_do_not_go_together_and_limits_are_found_at_once(tmp_path: Path) -> None:
     text = SIMULATED.read_text("utf-8").replace("energy_kev: 25.0", "energy_kev: 25000")
     (tmp_path / "a.yaml").write_text(text.replace("axis_col: null", "axis_col: 9000"), "utf-8")
-    scans = [tmp_path / "a.yaml", {"config": tmp_path / "a.yaml", "scan.period_s": 0.001}]
-    one, other = plan_queue(scans, place=tmp_path).scans
+    changed = {"config": tmp_path / "a.yaml", "scan.period_s": 0.001}
+    one, other = plan_queue([tmp_path / "a.yaml", changed], place=tmp_path).scans
     energy, axis = faults(one)
     assert "a.yaml:89: optics.energy_kev = 25000 keV is outside" in energy
     assert "a.yaml:91: optics.axis_col 9000 is outside the columns of the frame" in axis
@@ -169,7 +169,7 @@ def test_the_table_has_one_value_a_cell_and_the_json_every_value(tmp_path: Path)
         "scan", "from", "can run", "frames", "size (MB)", "time (h:min:s)", "requests", "dose (Gy)",
     ]  # fmt: skip
     assert good.split() == ["battery", str(SIMULATED), "yes", "390", "20.2", "0:00:44", "0", "36.43"]
-    assert bad.split() == ["-", str(tmp_path / "none.yaml"), "no", "0", "0.0", "0:00:00", "0", "-"]
+    assert bad.split() == ["-", str(tmp_path / "none.yaml"), "no", *5 * "-"]
     assert "2 scans, 1 can run: 20.2 MB of " in rest[-1] and "at most 0:30:00 for the live volumes" in rest[-1]
     data = plan.data()
     assert data["duration"] == data["scans"][0]["duration"] == plan.scans[0].duration
