@@ -18,7 +18,8 @@ from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals, to_stderr
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
-from beamline.scan.queue_plan import PlannedScan, QueuePlan, plan_queue
+from beamline.scan.queue_plan import PlannedScan, QueuePlan
+from beamline.scan.queue_planning import plan_queue
 from beamline.scan.run import run_scan
 from drivers.in_beam import Ask
 from recon.base.registry import loaded
@@ -210,7 +211,7 @@ def plan(
 
     Returns:
         `scans` in their order, each with `valid`, `faults` (each with message, file and line), `duration` (s) with its
-        `parts`, `total_bytes`, `dose` (Gy) and what it asks of the `operator`; and the sums of those that can run.
+        `parts`, `total_bytes`, `dose_gy` and what it asks of the `operator`; and the sums of those that can run.
 
     Raises:
         ConfigError: an argument of the wrong type. What is wrong with a scan is in its `faults`.

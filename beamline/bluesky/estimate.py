@@ -19,7 +19,8 @@ from beamline.core.text import degrees
 from beamline.plan.plan import summed
 from beamline.plan.timeline import move_seconds, row_bytes
 from beamline.scan.preflight import OperatorRequest, disk_of
-from beamline.scan.queue_plan import PlannedScan, ScanFault, plan_of_config
+from beamline.scan.queue_plan import PlannedScan, ScanFault
+from beamline.scan.queue_planning import plan_of_config
 from drivers.base.protocols import TriggerSource
 
 MOST = 1_000_000

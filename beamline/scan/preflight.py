@@ -72,7 +72,7 @@ class DryRun:
         disk: an existing folder on the disk of the file.
         parts: s of all scans by what they are spent on, as in `Timeline.parts`.
         in_beam: s for which the sample is in the beam, in all scans.
-        dose: Gy that the sample absorbs meanwhile; None: the configuration states no dose rate.
+        dose_gy: dose that the sample absorbs meanwhile; None: the configuration states no dose rate.
         volume_seconds: s after the last projection in which the live volumes of all scans are finished, at most.
         requests: what the operator has to do.
     """
@@ -86,7 +86,7 @@ class DryRun:
     disk: Path = Path()
     parts: Mapping[str, float] = field(default_factory=dict)
     in_beam: float = 0.0
-    dose: float | None = None
+    dose_gy: float | None = None
     volume_seconds: float = 0.0
     requests: tuple[OperatorRequest, ...] = ()
 
@@ -116,8 +116,8 @@ class DryRun:
                 "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
-        if self.dose is not None:
-            lines.append(f"{'dose':<10}{self.dose:.4g} Gy in {self.in_beam:.1f} s in the beam")
+        if self.dose_gy is not None:
+            lines.append(f"{'dose':<10}{self.dose_gy:.4g} Gy in {self.in_beam:.1f} s in the beam")
         return [*lines, *(f"{'operator':<10}{request}, {count(times, 'time')}" for request, times in self.requests)]
 
     def data(self) -> Mapping[str, Any]:
@@ -139,7 +139,7 @@ class DryRun:
             "energies": [need._asdict() for need in self.energies],
             "parts": self.parts,
             "in_beam": self.in_beam,
-            "dose": self.dose,
+            "dose_gy": self.dose_gy,
             "volume_seconds": self.volume_seconds,
             "operator": [request._asdict() for request in self.requests],
             "blocks": [
@@ -225,7 +225,7 @@ def dry_run(
         disk=there,
         parts=summed(*(part for one in worked for part in one.timeline.parts.items())),
         in_beam=in_beam,
-        dose=None if rate is None else rate * in_beam,
+        dose_gy=None if rate is None else rate * in_beam,
         volume_seconds=len(worked) * settings.recon.seconds if settings.recon.live else 0.0,
         requests=tuple(_requests(settings, worked)),
     )

@@ -21,7 +21,8 @@ from beamline.core.stop import StopRequest
 from beamline.core.text import aligned
 from beamline.instrument.connect import ask_operator
 from beamline.scan.moves import UNSAFE
-from beamline.scan.queue_plan import QueuePlan, plan_queue
+from beamline.scan.queue_plan import QueuePlan
+from beamline.scan.queue_planning import plan_queue
 from drivers.base.clock import SystemClock
 
 
