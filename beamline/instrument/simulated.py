@@ -6,13 +6,13 @@ It is imported where it is needed, so that an instrument loads no simulator.
 from __future__ import annotations
 
 import math
-import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from beamline.config.beam import (
@@ -183,7 +183,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     try:
         phantom = mapping.get("phantom")
         of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # which may change
-        scene = (_scene.__wrapped__ if of_files else _scene)(pickle.dumps(mapping), folder)
+        scene = (_scene.__wrapped__ if of_files else _scene)(_StatedScene(repr(mapping), mapping), folder)
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
@@ -191,10 +191,18 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     return scene
 
 
+@dataclass(frozen=True)
+class _StatedScene:
+    """The plain values of a scene; those with the same text are the same."""
+
+    text: str
+    mapping: Mapping[str, Any] = field(compare=False)
+
+
 @lru_cache(maxsize=2)
-def _scene(mapping: bytes, folder: Path) -> Scene:
-    """The scene of a pickled mapping, built once for the many scans of a queue that name it."""
-    return load_scene(pickle.loads(mapping), volumes_beside(folder))  # noqa: S301 - pickled by the caller
+def _scene(stated: _StatedScene, folder: Path) -> Scene:
+    """The scene, built once for the many scans of a queue that state it."""
+    return load_scene(stated.mapping, volumes_beside(folder))
 
 
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:
