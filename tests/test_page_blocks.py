@@ -117,7 +117,7 @@ SCRIPTS = {
         "Path('b.yaml').write_text(text.replace('mode: fly', 'mode: flyy'))\n"
         "Path('tonight.csv').write_text('config,sample.name\\na.yaml,one\\n')\n",
         "assert [scan.valid for scan in plan.scans] == [True, True, False] and 'did you mean fly?' in str(fault)\n"
-        "assert fault.file == 'b.yaml' and plan.duration > 0",
+        "assert fault.file == 'b.yaml' and plan.needs.duration > 0",
     ),
     "bluesky": Script(
         "docs/python.md", ("from bluesky import RunEngine, plan_stubs", "from bluesky import plan_stubs, plans"),

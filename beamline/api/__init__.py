@@ -19,6 +19,7 @@ from recon.base.registry import loaded
 if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, plan, scan
     from beamline.api.reconstruction import ReconResult, monitor, reconstruct, stream, volumes
+    from beamline.plan.needs import ScanNeeds
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
     from beamline.scan.queue_plan import PlannedScan, QueuePlan, ScanFault
@@ -36,6 +37,7 @@ __all__ = [
     "ReferencesError",
     "ScanAborted",
     "ScanFault",
+    "ScanNeeds",
     "ScanResult",
     "ScanStopped",
     "ScanVerdict",
@@ -56,6 +58,7 @@ _LAZY = {
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reconstruction"),
     **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
     **dict.fromkeys(("PlannedScan", "QueuePlan", "ScanFault"), "beamline.scan.queue_plan"),
+    "ScanNeeds": "beamline.plan.needs",
     "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }

@@ -210,8 +210,9 @@ def plan(
         live: False: without live reconstructions, even if `recon.live` is on.
 
     Returns:
-        `scans` in their order, each with `valid`, `faults` (each with message, file and line), `duration` (s) with its
-        `parts`, `total_bytes`, `dose_gy` and what it asks of the `operator`; and the sums of those that can run.
+        `scans` in their order, each with `valid`, `faults` (each with message, file and line) and `needs`: `duration`
+        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what is asked of the `operator`. The plan's own
+        `needs` are the sums of those that can run.
 
     Raises:
         ConfigError: an argument of the wrong type. What is wrong with a scan is in its `faults`.

@@ -16,9 +16,9 @@ from beamline.bluesky.devices import Rotation, TomoScan
 from beamline.config.load import camera_settings
 from beamline.core.errors import ConfigError
 from beamline.core.text import degrees
-from beamline.plan.plan import summed
+from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
 from beamline.plan.timeline import move_seconds, row_bytes
-from beamline.scan.preflight import OperatorRequest, disk_of
+from beamline.scan.preflight import disk_of
 from beamline.scan.queue_plan import PlannedScan, ScanFault
 from beamline.scan.queue_planning import plan_of_config
 from drivers.base.protocols import TriggerSource
@@ -33,13 +33,10 @@ _DONE = SimpleNamespace(done=True, success=True, exception=lambda timeout=None: 
 class _Messages:
     """What the messages of a plan need besides whole scans: moves of the stage, waits, and frames of the camera."""
 
-    parts: list[tuple[str, float]] = field(default_factory=list)
-    sample: str = ""
-    frames: int = 0
-    bytes: int = 0
-    disk: Path | None = None
+    needs: list[ScanNeeds] = field(default_factory=list)
     faults: list[ScanFault] = field(default_factory=list)
-    requests: list[OperatorRequest] = field(default_factory=list)
+    sample: str = ""
+    disk: Path | None = None
     places: dict[Rotation, float] = field(default_factory=dict)
     values: dict[int, Any] = field(default_factory=dict)  # last one that was set or prepared, by the id of its device
 
@@ -54,9 +51,9 @@ class _Messages:
             case "trigger" | "kickoff", CameraDetector() as camera:
                 self._expose(camera)
             case "sleep", _:
-                self.parts.append(("wait", float(told)))
+                self.needs.append(ScanNeeds({"wait": float(told)}))
             case "input" | "pause", _:
-                self.requests.append(OperatorRequest("answer the plan, or resume it", 1))
+                self.needs.append(ScanNeeds(operator=(OperatorRequest("answer the plan, or resume it", 1),)))
             case "locate", Rotation() as stage:
                 at = math.degrees(self.places.get(stage, stage.radians))
                 return {"setpoint": at, "readback": at}
@@ -69,7 +66,7 @@ class _Messages:
     def _move(self, stage: Rotation, target: float) -> None:
         limits, at = stage.limits, self.places.get(stage, stage.radians)
         self.places[stage] = target
-        self.parts.append(("move", move_seconds(target - at, limits.max_speed, limits.acceleration)))
+        self.needs.append(ScanNeeds({"move": move_seconds(target - at, limits.max_speed, limits.acceleration)}))
         if not limits.low <= target <= limits.high:
             reach = f"{degrees(limits.low)} ... {degrees(limits.high)}"
             self.faults.append(
@@ -83,9 +80,8 @@ class _Messages:
         timing = config.devices.camera.timing_of(camera_settings(config, exposure, TriggerSource.SOFTWARE))
         n = getattr(asked, "number_of_exposures", 1)
         apart = max(timing.min_period, exposure + getattr(asked, "deadtime", 0.0))
-        self.parts.append((str(self.values.get(id(camera.kind), "projection")), n * apart))
-        self.frames += n
-        self.bytes += n * row_bytes(timing.shape, config.storage.preview_bin)
+        kind, size = self.values.get(id(camera.kind), "projection"), row_bytes(timing.shape, config.storage.preview_bin)
+        self.needs.append(ScanNeeds({str(kind): n * apart}, n, n * size))
         self.sample, self.disk = config.sample.name, disk_of(camera.runs)
 
 
@@ -102,7 +98,7 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
             message = plan.send(reply)
             if message.command == "kickoff" and isinstance(message.obj, TomoScan):
                 planned = plan_of_config(message.obj.config, message.obj.runs, source)
-                scans.append(replace(planned, volume_seconds=0.0))  # a scan of a RunEngine makes no volume
+                scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))  # it makes no volume
             reply = others.take(message)
         others.faults.append(ScanFault(f"the plan does not end within {MOST} messages"))
     except StopIteration:
@@ -112,18 +108,8 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
     except Exception as error:  # of the plan, which got no measured values
         what = f"{type(error).__name__}: {error}"
         others.faults.append(ScanFault(f"the plan cannot be followed without running it ({what})"))
-    if others.parts or others.faults or others.requests:
+    if others.needs or others.faults:
         rest = f"{source}, other messages" if scans else source
-        scans.append(
-            PlannedScan(
-                rest,
-                others.sample,
-                tuple(others.faults),
-                parts=summed(*others.parts),
-                n_frames=others.frames,
-                total_bytes=others.bytes,
-                operator=tuple(others.requests),
-                disk=others.disk,
-            )
-        )
+        needs = all_needs(others.needs)
+        scans.append(PlannedScan(rest, others.sample, tuple(others.faults), needs=needs, disk=others.disk))
     return tuple(scans)

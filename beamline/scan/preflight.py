@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +28,8 @@ from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
-from beamline.plan.plan import Mode, ScanPlan, Timeline, summed
+from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
+from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import hms_text, work_out
 from beamline.scan.live_plan import better_order, live_need
@@ -47,13 +48,6 @@ def all_of(plan: ScanPlan) -> ScanPlan:
     return plan
 
 
-class OperatorRequest(NamedTuple):
-    """What a scan asks the operator to do, and how often at most."""
-
-    request: str
-    times: int
-
-
 class EnergyNeeds(NamedTuple):
     """Time (s) and disk space (bytes) of the scan at one energy (keV)."""
 
@@ -70,11 +64,7 @@ class DryRun:
 
     Attributes:
         disk: an existing folder on the disk of the file.
-        parts: s of all scans by what they are spent on, as in `Timeline.parts`.
-        in_beam: s for which the sample is in the beam, in all scans.
-        dose_gy: dose that the sample absorbs meanwhile; None: the configuration states no dose rate.
-        volume_seconds: s after the last projection in which the live volumes of all scans are finished, at most.
-        requests: what the operator has to do.
+        needs: of all scans.
     """
 
     plan: ScanPlan
@@ -82,48 +72,30 @@ class DryRun:
     stage: StageLimits
     camera: CameraTiming
     free_bytes: int
+    needs: ScanNeeds
+    disk: Path
     energies: tuple[EnergyNeeds, ...] = ()
-    disk: Path = Path()
-    parts: Mapping[str, float] = field(default_factory=dict)
-    in_beam: float = 0.0
-    dose_gy: float | None = None
-    volume_seconds: float = 0.0
-    requests: tuple[OperatorRequest, ...] = ()
-
-    @property
-    def duration(self) -> float:
-        """Seconds of all scans."""
-        return sum(need.duration for need in self.energies) if self.energies else self.timeline.duration
-
-    @property
-    def n_frames(self) -> int:
-        """Frames of all scans."""
-        return (len(self.energies) or 1) * self.timeline.n_frames
-
-    @property
-    def total_bytes(self) -> int:
-        """Bytes of the files of all scans."""
-        return sum(need.total_bytes for need in self.energies) if self.energies else self.timeline.total_bytes
 
     def lines(self) -> list[str]:
         """Lines of text, without violations: `refuse_violations` states them."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
-        if each := self.energies:
-            seconds = sum(need.duration for need in each)
+        each, needs = self.energies, self.needs
+        if each:
             sentence = (
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one scan like this at each energy: "
-                f"{hms_text(seconds)} and {size(self.total_bytes)} in total (without the moves of the "
+                f"{hms_text(needs.duration)} and {size(needs.total_bytes)} in total (without the moves of the "
                 "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
-        if self.dose_gy is not None:
-            lines.append(f"{'dose':<10}{self.dose_gy:.4g} Gy in {self.in_beam:.1f} s in the beam")
-        return [*lines, *(f"{'operator':<10}{request}, {count(times, 'time')}" for request, times in self.requests)]
+        if needs.dose_gy is not None:
+            lines.append(f"{'dose':<10}{needs.dose_gy:.4g} Gy")
+        return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
 
     def data(self) -> Mapping[str, Any]:
         """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
         worked, views = self.timeline, self.timeline.views
         return {
+            **self.needs.data(),
             "remarks": worked.remarks,
             "duration": worked.duration,
             "n_frames": worked.n_frames,
@@ -137,11 +109,6 @@ class DryRun:
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
             "energies": [need._asdict() for need in self.energies],
-            "parts": self.parts,
-            "in_beam": self.in_beam,
-            "dose_gy": self.dose_gy,
-            "volume_seconds": self.volume_seconds,
-            "operator": [request._asdict() for request in self.requests],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
@@ -213,38 +180,42 @@ def dry_run(
     there = disk_of(runs or Path(settings.storage.folder))
     free = shutil.disk_usage(there).free
     plans = [remaining(plan_of(one)) for one in each]
+    timelines = [_worked(one, plan, stage, to_counts, camera, free) for one, plan in zip(each, plans, strict=True)]
     worked = [
-        DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
-        for one, plan in zip(each, plans, strict=True)
+        DryRun(plan, timeline, stage, camera, free, _needs(one, timeline), there)
+        for one, plan, timeline in zip(each, plans, timelines, strict=True)
     ]
     worked_plan = worked[0] if settings.scan.energies is None else _of_energies(worked)
-    in_beam, rate = sum(one.timeline.in_beam for one in worked), settings.optics.dose_rate_gy_s
-    return replace(
-        worked_plan,
-        timeline=_lockable(worked_plan.timeline, locks(there)),
-        disk=there,
-        parts=summed(*(part for one in worked for part in one.timeline.parts.items())),
-        in_beam=in_beam,
-        dose_gy=None if rate is None else rate * in_beam,
-        volume_seconds=len(worked) * settings.recon.seconds if settings.recon.live else 0.0,
-        requests=tuple(_requests(settings, worked)),
+    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, locks(there)))
+
+
+def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
+    """The needs of a scan at one energy."""
+    rate = config.optics.dose_rate_gy_s
+    return ScanNeeds(
+        timeline.parts,
+        timeline.n_frames,
+        timeline.total_bytes,
+        dose_gy=None if rate is None else rate * timeline.in_beam,
+        volume_seconds=config.recon.seconds if config.recon.live else 0.0,
+        operator=tuple(_requests(config, timeline)),
     )
 
 
-def _requests(config: Config, worked: Sequence[DryRun]) -> Iterator[OperatorRequest]:
-    """What the scans will ask the operator to do."""
-    by_hand, timeline = config.devices.by_hand, worked[0].timeline
+def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
+    """What the scan will ask the operator to do."""
+    by_hand = config.devices.by_hand
     kinds = [block.kind for block in timeline.blocks if block.n_to_take]
     opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
     moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
     for device, states, request in (
         ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),
-        ("monochromator", [None, *filter(None, [worked[0].plan.energy])], "set the monochromator"),
+        ("monochromator", [None, *filter(None, [config.scan.energy])], "set the monochromator"),
         ("shutter", opened, "open or close the shutter"),
         ("sample_mover", moved_out, "move the sample out of the beam or back"),
     ):
         if device in by_hand and (times := sum(before != after for before, after in pairwise(states))):
-            yield OperatorRequest(request, len(worked) * times)
+            yield OperatorRequest(request, times)
     if config.scan.decide == "ask":
         passes = math.ceil(timeline.plan.n_views / (timeline.plan.pass_views or timeline.plan.n_views))
         yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
@@ -253,12 +224,12 @@ def _requests(config: Config, worked: Sequence[DryRun]) -> Iterator[OperatorRequ
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the violations of all of them."""
     needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
-    total = replace(each[0], energies=tuple(needs))
+    total = replace(each[0], energies=tuple(needs), needs=all_needs(one.needs for one in each))
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
-    if total.total_bytes * ROOM > total.free_bytes:
+    if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
             f"free some space, choose another storage.folder, or set fewer energies: {len(each)} energies "
-            f"need {size(total.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
+            f"need {size(total.needs.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 

@@ -6,6 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -45,7 +46,6 @@ def plan_queue(
         place: folder in which the folders of the runs would be created; None: the configured ones.
         rehearse, no_live: as of `load`.
     """
-
     locks = cache(no_locks)  # once a folder: on a network disk it takes a while
 
     def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
@@ -123,32 +123,16 @@ def plan_of_config(
         locks: as in `dry_run`.
     """
     faults = [] if read is None else [_placed_at(at, sentence) for at, sentence in read.faults]
-    sample, worked, warnings = config.sample.name, None, list[str]()
+    planned = PlannedScan(source, config.sample.name, config=config)
     try:
-        warnings = doubts(config)
+        unusual = doubts(config)
         worked = dry_run(config, place, locks=locks)
-    except (ConfigError, DataError, OSError) as error:
-        if not faults:  # those may be its cause
-            faults += [_named_in(read, fault) for fault in _faults_of(error)]
-    if worked is None:
-        return PlannedScan(source, sample, tuple(faults), tuple(warnings), config=config)
-    warnings = [warning for warning in warnings if all(warning not in fault.message for fault in faults)]
+    except (ConfigError, DataError, OSError) as error:  # which the faults of the values may have caused
+        return replace(planned, faults=tuple(faults or [_named_in(read, fault) for fault in _faults_of(error)]))
+    warnings = [warning for warning in unusual if all(warning not in fault.message for fault in faults)]
     faults += [_named_in(read, ScanFault(sentence)) for sentence in worked.timeline.violations]
-    return PlannedScan(
-        source,
-        sample,
-        tuple(faults),
-        tuple(warnings),
-        parts=worked.parts,
-        n_frames=worked.n_frames,
-        total_bytes=worked.total_bytes,
-        dose_gy=worked.dose_gy,
-        volume_seconds=worked.volume_seconds,
-        operator=worked.requests,
-        disk=worked.disk,
-        config=config,
-        worked=worked,
-    )
+    planned = replace(planned, faults=tuple(faults), warnings=tuple(warnings))
+    return replace(planned, needs=worked.needs, disk=worked.disk, worked=worked)
 
 
 def _faults_of(error: Exception, file: str | None = None) -> tuple[ScanFault, ...]:

@@ -19,10 +19,10 @@ def test_files_tables_and_rows_are_planned_together(tmp_path: Path) -> None:
     plan = api.plan([str(SIMULATED), table, row], set={"scan.angles.views": 120}, output=tmp_path)
     assert [scan.sample for scan in plan.scans] == ["battery", "a", "", "c"]
     assert [scan.valid for scan in plan.scans] == [True, True, False, True] and not plan.valid
-    assert {scan.n_frames for scan in plan.can_run} == {150}
+    assert {scan.needs.n_frames for scan in plan.scans if scan.valid} == {150}
     assert "none.yaml does not exist" in str(plan.scans[2].faults[0])
-    assert plan.volume_seconds == 3 * 1800.0
-    assert api.plan([SIMULATED], output=tmp_path, live=False).volume_seconds == 0.0
+    assert plan.needs.volume_seconds == 3 * 1800.0
+    assert api.plan([SIMULATED], output=tmp_path, live=False).needs.volume_seconds == 0.0
     assert isinstance(plan, api.QueuePlan) and isinstance(plan.scans[0], api.PlannedScan)
     assert isinstance(plan.scans[2].faults[0], api.ScanFault)
 

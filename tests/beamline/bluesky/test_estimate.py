@@ -34,8 +34,12 @@ def test_a_scan_is_planned_as_its_configuration(devices: tuple[Any, Any], tmp_pa
 
     (planned,) = api.plan([fly(devices[0])]).scans
     worked = dry_run(CONFIG, tmp_path)
-    assert planned.valid and planned.duration == worked.duration and planned.total_bytes == worked.total_bytes
-    assert (planned.source, planned.sample, planned.volume_seconds) == ("plan fly", "battery", 0.0)
+    assert (
+        planned.valid
+        and planned.needs.duration == worked.needs.duration
+        and planned.needs.total_bytes == worked.needs.total_bytes
+    )
+    assert (planned.source, planned.sample, planned.needs.volume_seconds) == ("plan fly", "battery", 0.0)
 
 
 def test_moves_and_waits_of_a_plan_count(devices: tuple[Any, Any]) -> None:
@@ -58,9 +62,9 @@ def test_moves_and_waits_of_a_plan_count(devices: tuple[Any, Any]) -> None:
     assert len(scans) == 3 and plan.valid and others.source == "plan night, other messages"
     limits = rotation.limits
     there_and_back = 2 * move_seconds(math.pi / 2, limits.max_speed, limits.acceleration)
-    assert others.parts == {"move": pytest.approx(3 * there_and_back), "wait": 180.0}
-    assert others.operator == (("answer the plan, or resume it", 1),)
-    assert plan.duration == pytest.approx(3 * scans[0].duration + others.duration)
+    assert others.needs.parts == {"move": pytest.approx(3 * there_and_back), "wait": 180.0}
+    assert others.needs.operator == (("answer the plan, or resume it", 1),)
+    assert plan.needs.duration == pytest.approx(3 * scans[0].needs.duration + others.needs.duration)
 
 
 def test_frames_of_the_camera_alone_count(tmp_path: Path) -> None:
@@ -84,10 +88,11 @@ def test_frames_of_the_camera_alone_count(tmp_path: Path) -> None:
 
         plan = api.plan([frames()])
     (planned,) = plan.scans
-    row = dry_run(CONFIG).total_bytes // dry_run(CONFIG).n_frames
-    assert (planned.n_frames, planned.total_bytes, planned.sample) == (195, 195 * row, "battery")
-    assert planned.parts["flat"] == pytest.approx(10 * 0.05, rel=0.02)
-    assert planned.parts["projection"] == pytest.approx(180 * 0.05 + 5 * 0.5, rel=0.02)
+    needs = dry_run(CONFIG).needs
+    row = needs.total_bytes // needs.n_frames
+    assert (planned.needs.n_frames, planned.needs.total_bytes, planned.sample) == (195, 195 * row, "battery")
+    assert planned.needs.parts["flat"] == pytest.approx(10 * 0.05, rel=0.02)
+    assert planned.needs.parts["projection"] == pytest.approx(180 * 0.05 + 5 * 0.5, rel=0.02)
     assert plan.free_bytes > 0 and list(tmp_path.iterdir()) == []
 
 
@@ -112,4 +117,4 @@ def test_a_plan_that_cannot_be_followed_has_a_fault(devices: tuple[Any, Any], mo
     assert "cannot be followed without running it (TypeError: 'NoneType' object" in said[0]
     assert said[1] == "the plan does not end within 100 messages"
     assert said[2] == "the plan moves rotation to 1000°, the limits of the stage are -5° ... 365°"
-    assert plan.scans[3].valid and plan.can_run == plan.scans[3:]
+    assert plan.scans[3].valid

@@ -36,9 +36,9 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
     assert [scan.source for scan in plan.scans] == [
         f"{tmp_path / 'day.csv'}:2", f"{tmp_path / 'day.csv'}:4", str(SIMULATED), str(SIMULATED),
     ]  # fmt: skip
-    assert {scan.n_frames for scan in plan.scans[:3]} == {120 + 30} and plan.scans[3].n_frames == 120 + 23
-    assert plan.valid and plan.duration == pytest.approx(sum(plan.parts.values()))
-    assert plan.total_bytes == sum(scan.total_bytes for scan in plan.scans)
+    assert {scan.needs.n_frames for scan in plan.scans[:3]} == {120 + 30} and plan.scans[3].needs.n_frames == 120 + 23
+    assert plan.valid and plan.needs.duration == pytest.approx(sum(plan.needs.parts.values()))
+    assert plan.needs.total_bytes == sum(scan.needs.total_bytes for scan in plan.scans)
     plan.refuse_impossible()
 
 
@@ -62,7 +62,7 @@ def test_a_wrong_row_has_a_fault_and_the_others_are_planned(
     plan = plan_queue([wrong, good], place=tmp_path)
     assert [scan.valid for scan in plan.scans] == [False, True] and not plan.valid
     assert message.format(wrong, wrong).removeprefix(f"{wrong}: ") in faults(plan.scans[0])[0]
-    assert plan.can_run == plan.scans[1:] and plan.duration == plan.scans[1].duration > 0
+    assert plan.needs.duration == plan.scans[1].needs.duration > 0
     with pytest.raises(ConfigError, match=r"^Nothing was started, because 1 scan of 2 cannot run:\n  "):
         plan.refuse_impossible()
 
@@ -112,16 +112,18 @@ def test_what_the_operator_does_and_the_dose(tmp_path: Path) -> None:
         [{"config": INSTRUMENT, **views}, {"config": INSTRUMENT, **by_hand, "recon.live": False}, SIMULATED],
         place=tmp_path,
     ).scans
-    assert simulated.operator == () and simulated.dose_gy is None
+    assert simulated.needs.operator == () and simulated.needs.dose_gy is None
     # closed for darks, opened for flats, closed at the end; out and back for the flats before and after the projections
     shutter, sample = ("open or close the shutter", 3), ("move the sample out of the beam or back", 4)
-    assert plain.operator == (shutter, sample)
-    assert hand.operator == (("put the filter Al into the beam", 1), shutter, sample)
-    assert plain.dose_gy == pytest.approx(2.0 * plain.parts["projection"])
-    assert plain.parts["warm_up"] == 5.0
+    assert plain.needs.operator == (shutter, sample)
+    assert hand.needs.operator == (("put the filter Al into the beam", 1), shutter, sample)
+    assert plain.needs.dose_gy == pytest.approx(2.0 * plain.needs.parts["projection"])
+    assert plain.needs.parts["warm_up"] == 5.0
     (first,) = plan_queue([{"config": INSTRUMENT, **views, "scan.flats.at": "end"}], place=tmp_path).scans
-    assert first.dose_gy == pytest.approx(2.0 * (first.parts["projection"] + 5.0))  # the sample is there from the start
-    assert (plain.volume_seconds, hand.volume_seconds) == (1800.0, 0.0)
+    assert first.needs.dose_gy == pytest.approx(
+        2.0 * (first.needs.parts["projection"] + 5.0)
+    )  # the sample is there from the start
+    assert (plain.needs.volume_seconds, hand.needs.volume_seconds) == (1800.0, 0.0)
 
 
 def test_a_series_of_energies_counts_with_all_its_scans(tmp_path: Path) -> None:
@@ -135,14 +137,14 @@ def test_a_series_of_energies_counts_with_all_its_scans(tmp_path: Path) -> None:
     )
     assert faults(*plan.scans) == []
     both, single = plan.scans
-    assert (both.n_frames, both.total_bytes) == (2 * single.n_frames, 2 * single.total_bytes)
-    assert both.duration == pytest.approx(2 * single.duration, rel=0.01)
-    assert both.dose_gy == pytest.approx(2 * (single.dose_gy or 0), rel=0.01)
-    assert ("set the monochromator", 2) in both.operator
+    assert (both.needs.n_frames, both.needs.total_bytes) == (2 * single.needs.n_frames, 2 * single.needs.total_bytes)
+    assert both.needs.duration == pytest.approx(2 * single.needs.duration, rel=0.01)
+    assert both.needs.dose_gy == pytest.approx(2 * (single.needs.dose_gy or 0), rel=0.01)
+    assert ("set the monochromator", 2) in both.needs.operator
 
 
 def test_a_rehearsal_is_planned_with_simulated_devices(tmp_path: Path) -> None:
     said = list[str]()
     plan = plan_queue([INSTRUMENT], ["scan.angles.views=90"], place=tmp_path, rehearse=True, no_live=said.append)
-    assert plan.scans[0].operator == () and plan.scans[0].sample == "battery_rehearsal" and said == []
-    assert plan.volume_seconds == 0.0
+    assert plan.scans[0].needs.operator == () and plan.scans[0].sample == "battery_rehearsal" and said == []
+    assert plan.needs.volume_seconds == 0.0
