@@ -11,7 +11,7 @@ from typing import Any
 
 from bluesky import Msg
 
-from beamline.bluesky.camera import CameraDetector
+from beamline.bluesky.camera import CameraDetector, ShownFrames
 from beamline.bluesky.devices import Rotation, TomoScan
 from beamline.config.load import camera_settings
 from beamline.core.errors import ConfigError
@@ -80,8 +80,9 @@ class _Messages:
         timing = config.devices.camera.timing_of(camera_settings(config, exposure, TriggerSource.SOFTWARE))
         n = getattr(asked, "number_of_exposures", 1)
         apart = max(timing.min_period, exposure + getattr(asked, "deadtime", 0.0))
-        kind, size = self.values.get(id(camera.kind), "projection"), row_bytes(timing.shape, config.storage.preview_bin)
-        self.needs.append(ScanNeeds({str(kind): n * apart}, n, n * size))
+        kind = ShownFrames(self.values.get(id(camera.kind), ShownFrames.PROJECTION))
+        size = row_bytes(timing.shape, config.storage.preview_bin)
+        self.needs.append(ScanNeeds({kind.value: n * apart}, n, n * size))
         self.sample, self.disk = config.sample.name, disk_of(camera.runs)
 
 

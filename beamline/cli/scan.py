@@ -41,7 +41,10 @@ class ScanRequest:
         click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
     )
     dry: bool = set_by(
-        "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space, and stop. No device is used."
+        "--dry-run",
+        is_flag=True,
+        help="Print the timeline, limits and free disk space, and stop. No device is used. "
+        "With several scans: print which of them can run, all faults, and what they need.",
     )
     overrides: tuple[str, ...] = set_by(set_option)
     rehearse: bool = set_by(

@@ -71,7 +71,7 @@ def test_frames_of_the_camera_alone_count(tmp_path: Path) -> None:
     from bluesky import plan_stubs, plans
     from ophyd_async.core import TriggerInfo
 
-    from beamline.bluesky.camera import CameraDetector
+    from beamline.bluesky.camera import CameraDetector, ShownFrames
     from beamline.bluesky.devices import Rotation
     from beamline.instrument.connect import connect
 
@@ -81,7 +81,7 @@ def test_frames_of_the_camera_alone_count(tmp_path: Path) -> None:
         def frames() -> Plan:
             yield from plan_stubs.mv(camera.kind, "flat")
             yield from plans.count([camera], 10)
-            yield from plan_stubs.mv(camera.kind, "projection")
+            yield from plan_stubs.mv(camera.kind, ShownFrames.PROJECTION)
             yield from plans.scan([camera], rotation, 0, 179, 180)
             yield from plan_stubs.prepare(camera, TriggerInfo(number_of_events=5, livetime=0.5))
             yield from plan_stubs.trigger(camera, wait=True)
