@@ -242,7 +242,7 @@ def plan_of(config: Config) -> ScanPlan:
     try:
         theta = _angles(scan.angles)
     except (ValueError, OSError) as error:
-        where = scan.angles.path if isinstance(scan.angles, FileAngles) else "scan.angles"
+        where = f"scan.angles.path: {scan.angles.path}" if isinstance(scan.angles, FileAngles) else "scan.angles"
         raise ConfigError(f"{where}: {error}. Nothing was started.") from None
     return ScanPlan(
         angles=np.repeat(theta, scan.frames_per_view),

@@ -99,6 +99,20 @@ def test_values_that_do_not_go_together_and_limits_are_found_at_once(tmp_path: P
     assert one.warnings == () or "energy" in one.warnings[0]
 
 
+def test_a_file_of_angles_that_is_wrong_has_the_line_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "angles.txt").write_text("0\n1\nx\n", "utf-8")
+    text = SIMULATED.read_text("utf-8")
+    (tmp_path / "a.yaml").write_text(
+        text.replace("{scheme: fixed, ", "{scheme: file, path: angles.txt} # ", 1), "utf-8"
+    )
+    (fault,) = plan_queue([tmp_path / "a.yaml"], place=tmp_path).scans[0].faults
+    angles = tmp_path / "angles.txt"
+    assert fault.message.startswith(
+        f"scan.angles.path: {angles}: line 3 holds 'x'; expected one angle in degrees a line"
+    )
+    assert (fault.file, fault.line) == (str(tmp_path / "a.yaml"), 19)
+
+
 def test_a_scene_that_is_wrong_is_a_fault_of_its_scans_only(tmp_path: Path) -> None:
     broken = {"config": SIMULATED, "simulation.scene": {"phantom": {"kind": "batery"}, "beam": {"photons_per_s": 1e5}}}
     scan, good = plan_queue([broken, SIMULATED], place=tmp_path).scans
