@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -82,6 +83,12 @@ def read(text: str, name: str) -> Tree:
     Raises:
         ConfigError: bad syntax, a key given twice, or a top level that is not a group of keys; with file and line.
     """
+    known = _read(text, name)
+    return Tree(deepcopy(known.data), known.origins)
+
+
+@lru_cache(maxsize=4)  # the rows of a table name the same configuration, and configurations the same scene
+def _read(text: str, name: str) -> Tree:
     data, origins = _parsed(text, name)
     if data is None:
         raise ConfigError(

@@ -61,6 +61,7 @@ def test_both_loaders_read_the_same_values_and_lines(monkeypatch: pytest.MonkeyP
     ]
     fast = [read(text, "my.yaml") for text in texts]
     monkeypatch.setattr(tree, "_FastLoader", tree._Loader)
+    tree._read.cache_clear()
     assert repr([read(text, "my.yaml") for text in texts]) == repr(fast)
 
 
@@ -76,7 +77,15 @@ def test_what_one_loader_takes_and_the_other_does_not_has_the_fault_of_the_stric
 
     both = said()
     monkeypatch.setattr(tree, "_FastLoader", tree._Loader)
+    tree._read.cache_clear()
     assert said() == both
+
+
+def test_what_is_read_again_is_as_it_was_read_first() -> None:
+    first = read("a: {b: [1]}\n", "my.yaml")
+    first.data["a"]["b"].append(2)
+    assert read("a: {b: [1]}\n", "my.yaml").data == {"a": {"b": [1]}}
+    assert read("a: {b: [1]}\n", "other.yaml").origin(("a",)) == "other.yaml:1"
 
 
 def test_dates_aliases_and_long_texts_of_a_person_are_read() -> None:
