@@ -259,7 +259,7 @@ class LazyGroup(click.Group):
                     raise
                 left = leave_traceback(error, Path())
                 message += f"; the traceback is in {left}" if left else "; --debug shows where"
-                message += ". Please report it. What was written before is as it was written."
+                message += ". Please report it. Files written before the error are unchanged."
             # A line end that no indent follows is one of a file's name.
             click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)
             ctx.exit(exit_code(error))
@@ -326,7 +326,7 @@ def run() -> NoReturn:
         code = INTERRUPTED
     exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
     if lost := lost_output():
-        click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
+        click.echo(f"beamline: the output on stdout is incomplete ({lost}).", err=True)
         command = _command(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
         if code == 0 and (command is None or not command.files):
             code = DataError.exit_code

@@ -97,7 +97,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "makes several volumes, in time: use beamline recon --volumes N",
+    "times": "reconstructs several volumes at successive times: use beamline recon --volumes N",
 }
 """For methods that make several volumes: the command that runs them."""
 
@@ -172,7 +172,7 @@ def refuse_contradictions(
             continue
         for other in (other for other in param.excludes if other in given):
             why = f"{shown.get(other, f'--{other}')}: {param.excludes[other]}"
-            raise click.UsageError(f"--{name} does not go with {why}. Nothing was computed.")
+            raise click.UsageError(f"--{name} cannot be combined with {why}. Nothing was computed.")
         if param.needs is not None and param.needs[0] not in given:
             raise click.UsageError(f"--{name} {param.needs[1]}")
 

@@ -141,7 +141,7 @@ recon_options = together(
     heading(DATA),
     option(
         "--follow",
-        excludes={SLABS_RESUMED: "these slabs belong to a finished scan"},
+        excludes={SLABS_RESUMED: "slabs can be resumed only for a finished scan"},
         of_one_call=True,
         is_flag=True,
         help="Reconstruct a scan while it is running. Methods that need all projections wait for the end of the scan.",
@@ -152,7 +152,8 @@ recon_options = together(
         former="--earlier",
         needs=(
             "follow",
-            "is for a run that is still being continued: add --follow, or give the joined.h5 of its parts as FILE.",
+            "is only for a run that `beamline scan --resume` is still continuing: add --follow. If the run has "
+            "ended, give the joined.h5 of its parts as FILE.",
         ),
         of_one_call=True,
         type=click.Path(path_type=Path),
@@ -177,7 +178,10 @@ recon_options = together(
     option(
         "--roi",
         "region",
-        excludes={"follow": "it needs a finished scan", "truth": "a ground truth is compared with the whole volume"},
+        excludes={
+            "follow": "it needs a finished scan",
+            "truth": ("a ground truth can be compared only with the whole volume"),
+        },
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
         help="Write only this box of voxels; the indices are those of the full volume. Only detector rows that see the "

@@ -86,8 +86,8 @@ class ScanRequest:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
             "output": "the run already has its folder",
-            "rehearse": "a rehearsal starts a new run; RUN has its devices",
-            "documents": "documents describe complete scans",
+            "rehearse": "a rehearsal always starts a new run, and --resume uses the devices stored in RUN",
+            "documents": "documents can describe only complete scans",
         },
         help="Continue the run in this folder: take the missing projections, or the missing flats and darks at the "
         "end, with the configuration stored in the folder.",
@@ -370,7 +370,7 @@ def _results(result: RunResult) -> str:
         "scan": result.path,
         "frames": str(result.n_frames),
         "flagged": result.flags and f"{counted(result.flags)}; see {folder}",
-        "retaken": result.retaken and f"{count(result.retaken, 'flagged projection')}; recon uses the new ones",
+        "retaken": result.retaken and f"{count(result.retaken, 'flagged projection')}; recon uses the new projections",
         "volume": None if recon is None else recon.get("output", folder / RECON),
         "report": None if recon is None else recon.get("report"),
     }

@@ -94,10 +94,12 @@ scan_options = together(
     option(
         "--frames",
         metavar="KINDS",
-        help="State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
-        "projections. Overrides the file. none=30:38+61:62 leaves frames out; given alone, the file decides about the "
-        "others. 0::2 or 1::2: use every second projection with its darks and flats, if two exposures or thresholds "
-        "alternate.",
+        help=(
+            "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
+            "projections. Overrides the file. none=30:38+61:62 leaves these frames out. If you give only none=, the "
+            "file states the kind of the other frames. 0::2 or 1::2: use every second projection with its darks and "
+            "flats, if two exposures or thresholds alternate."
+        ),
     ),
     option(
         "--append",
@@ -130,7 +132,7 @@ scan_options = together(
 light_options = together(
     option(
         "--photons-per-count",
-        excludes={"spectra": "for scans at several energies the dose is counted in frames"},
+        excludes={"spectra": "for scans at several energies the dose is stated as a number of frames"},
         type=POSITIVE,
         help="Number of X-ray photons at the sample for one count of the camera.",
     ),

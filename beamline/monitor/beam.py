@@ -146,7 +146,10 @@ def _of_integrals(flag: Flag) -> Flag:
     """The flag for a file without counts and flats, in which the intensity is not known."""
     off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
-        advice = f"No line integral of the frame is below {off:.3g}: the sample covers all of it, or air is not at 0."
+        advice = (
+            f"No line integral of the frame is below {off:.3g}: either the sample covers the whole frame, or the line "
+            "integral of air is not 0."
+        )
     else:
         advice = (
             f"Line integrals are wrong by {off:+.3g}, compared with 0 in air or with the projections before. "

@@ -90,7 +90,9 @@ def digest(
     Raises ValueError for an array that is not two-dimensional, empty or complex, or for a bin below 1.
     """
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
-        raise ValueError(f"A frame is a non-empty real [row, col] array, not {image.dtype} {image.shape}.")
+        raise ValueError(
+            f"A frame must be a non-empty [row, col] array of real numbers, not {image.dtype} {image.shape}."
+        )
     if preview_bin < 1:
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()

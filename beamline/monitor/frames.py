@@ -145,7 +145,8 @@ class TimingCheck(Logged):
         if lost > 0:
             after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
             advice = (
-                f"{count(lost, 'frame')} missing before this one: the trigger exposed no frame, or the frame was lost."
+                f"{count(lost, 'frame')} missing before this frame: either the trigger did not start an exposure, or "
+                "the frame was lost."
             )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:

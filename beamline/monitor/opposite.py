@@ -109,7 +109,7 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "they differ in a cone beam" if context.cone else "there are no flats"
+            why = "in a cone beam they differ even if the sample is at rest" if context.cone else "there are no flats"
             advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
@@ -209,8 +209,10 @@ class OppositeCheck(Logged):
         change = (
             f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
-            else f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: it shrank, bent or "
-            "lost something"
+            else (
+                f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: the sample shrank, "
+                "bent or lost something"
+            )
         )
         advice = (
             f"Compare the two frames: relative to {other}, {change}. If `motion` reported a jump, `beamline recon` "

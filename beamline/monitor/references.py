@@ -251,8 +251,8 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (
-                f"something was in the beam. Is the sample out? The intensity differs locally by {places.max():.0%} "
-                f"{how} (limit {limit:.0%})."
+                "something was in the beam. Was the sample out of the beam? The intensity differs locally by "
+                f"{places.max():.0%} {how} (limit {limit:.0%})."
             ))  # fmt: skip
 
 

@@ -157,9 +157,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
         yield BadFrames(flats, brighter, limit, (
-            "the sample was in the beam, or the beam changed its shape between flats and projections: the projections "
-            f"are locally brighter by {brighter:.2g} in line integral (limit {limit:.2g}), and elsewhere they do not "
-            "absorb more, but a sample can only absorb."
+            "the sample was in the beam, or the beam changed its shape between flats and projections: the "
+            f"projections are locally brighter than the flats by {brighter:.2g} in line integral (limit {limit:.2g}) "
+            "and nowhere else darker than them, but a sample can only absorb."
         ))  # fmt: skip
         return
     turning = depth - mean

@@ -118,7 +118,9 @@ def join(parts: Sequence[Path], joined: Path) -> int:
     """
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
-            raise DataError(f"{joined} could not be made, because {part} was not closed. The parts were not changed.")
+            raise DataError(
+                f"{joined} could not be made, because the file {part} was not closed. The parts were not changed."
+            )
     with atomic_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:

@@ -84,7 +84,13 @@ class BandsCheck(Logged):
     meaning: ClassVar[str] = "rows or columns suddenly became darker or brighter, while the others did not"
 
     alarm: float = setting(
-        0.1, "fraction of the intensity that a preview row or column may lose against the others", ge=0, lt=1
+        0.1,
+        (
+            "fraction of the intensity that a row or column of the preview may lose, compared with the other rows or "
+            "columns"
+        ),
+        ge=0,
+        lt=1,
     )
 
     start = BandsState

@@ -111,7 +111,8 @@ class NexusSource(ScanSource):
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
             raise DataError(
-                f"{self.path} refers to frames in {lost[0]}, which does not exist or differs ({len(lost)} such)."
+                f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape ({len(lost)} "
+                "such links)."
             )
 
     @property

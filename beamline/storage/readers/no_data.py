@@ -34,12 +34,12 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
         images[:, no_data[rows]] = 0
         return images
 
-    facts = {"pixels_without_data": f"{no_data.mean():.2%}, replaced with values of their neighbours"}
+    facts = {"pixels_without_data": f"{no_data.mean():.2%}, replaced with the values of neighbouring pixels"}
     not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
     source = Frames(base, pixels=pixels, not_used=not_used, attributes=lambda known: {**known, **facts})
     counter = not base.table.darks.size and counts_photons(source)
     if counter:
-        facts["darks"] = "0, because flats vary as counted photons do"
+        facts["darks"] = "0 (the flats vary like counted photons, so the detector has no dark signal)"
     return source, counter
 
 

@@ -204,7 +204,9 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
-        raise DataError(f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or differs.")
+        raise DataError(
+            f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or has another shape."
+        )
     frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")

@@ -103,7 +103,9 @@ class StacksSource(ScanSource):
             if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
-                    raise DataError(f"{self.path} refers to frames in {lost[0]}, which does not exist or differs.")
+                    raise DataError(
+                        f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape."
+                    )
         if not len(views.frames):
             none = DataError if self.finished else hdf5.NotReadyError
             raise none(f"{self.path} contains no projections: {views.name} has shape {views.frames.shape}.")

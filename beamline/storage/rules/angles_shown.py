@@ -165,12 +165,11 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "angle-spread",
-            f"Each angle is stated for {n} frames, but these differ: frames {first[0]} and {last[0]}, "
-            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as "
-            "much as neighbours do. The angles were read back more slowly than frames were taken, while "
-            f"the stage rotated. Give the angle of each of the {degrees.size} projections with --angles "
-            f"FILE (degrees, one per line), from {degrees[0]:.6g} in even steps if the stage rotated "
-            f"evenly.{first_of_each}",
+            f"Each angle is stated for {n} frames, but frames of one angle differ: frames {first[0]} and {last[0]}, "
+            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as much as "
+            "neighbours do. The angles were read back more slowly than frames were taken, while the stage rotated. "
+            f"Give the angle of each of the {degrees.size} projections with --angles FILE (degrees, one per line), "
+            f"from {degrees[0]:.6g} in even steps if the stage rotated evenly.{first_of_each}",
         )
 
 

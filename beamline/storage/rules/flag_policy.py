@@ -52,7 +52,10 @@ class FlagPolicy:
         for some, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
             (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
-            (self.masked, (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: none)")),
+            (
+                self.masked,
+                (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: weight 0)"),
+            ),
         ):
             if n := int(some.sum()):
                 parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")

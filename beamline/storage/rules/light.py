@@ -85,10 +85,10 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         "light",
-        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled "
-        "one by one, as programs do that save pictures, so that one grey value means a different "
-        f"attenuation in each projection: in each of {VIEWS} projections checked, the darkest pixel is "
-        f"{low:g} and the brightest {high:g}, but these are different pixels.",
+        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled one by one, "
+        "as programs do that save pictures, so that one grey value means a different attenuation in each projection: "
+        f"in each of {VIEWS} projections checked, the darkest pixel is {low:g} and the brightest {high:g}, but in "
+        "each projection these are different pixels.",
     )
 
 

@@ -108,8 +108,8 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "pixels",
-            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no measurable beam "
-            "passes: are they counts? If so, give --quantity counts, with darks and flats.",
+            f"The line integrals have a median of {np.nanmedian(views):.4g}. No measurable beam passes through so "
+            "much material: are they counts? If so, give --quantity counts, with darks and flats.",
         )
 
 

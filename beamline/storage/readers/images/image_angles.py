@@ -158,7 +158,8 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
             return (
-                "the number next to each angle does not count images; are the two numbers an integer and its decimals?"
+                "the number next to each angle does not count images; are the two numbers the integer part and the "
+                "decimals of one angle?"
             )
     return ""
 

@@ -130,9 +130,8 @@ class TiffSeriesSource(ScanSource):
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
             if not np.can_cast(image.dtype, self.dtype):
                 raise DataError(
-                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have "
-                    f"{self.dtype}, which cannot represent them all. Write all images of a scan in one "
-                    "pixel type."
+                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have {self.dtype}, "
+                    "which cannot represent all of their values. Write all images of a scan in one pixel type."
                 )
             out[i] = image[rows]
         return out
