@@ -41,8 +41,8 @@ def read_model(path: Path) -> Model:
         arrays = record.model
         if not arrays:
             raise DataError(
-                f"{path} holds no Gaussians: {record.parameters.get('method', 'its method')} has none, or the volume "
-                "was made in slabs. Expected a volume of r2 made at once. Nothing was written."
+                f"{path} contains no Gaussians: {record.parameters.get('method', 'its method')} has none, or the "
+                "volume was made in slabs. Expected a volume of r2 made at once. Nothing was written."
             )
         rows, cols = (int(n) for n in arrays["detector_shape"])
         sod, sdd = (float(d) for d in arrays["source_distances"])

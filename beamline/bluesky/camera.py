@@ -170,9 +170,9 @@ class _Frames(DetectorAcquireLogic):
                     return
                 if frame_taken.framestamp != i:
                     raise InstrumentError(
-                        f"Leave more time between the frames, and take them again. {camera.name}: frames "
-                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. "
-                        "Earlier frames are in the file."
+                        f"Leave more time between the frames, and repeat the exposures. {camera.name}: frames "
+                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. Earlier "
+                        "frames are in the file."
                     )
                 row = writer.rows
                 frame = Frame(np.array(frame_taken.counts), kind, row, row, i, angle, frame_taken.time, exposure)

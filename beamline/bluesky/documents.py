@@ -239,7 +239,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
             socket.create_connection((url.hostname, url.port), REACH).close()
             time.sleep(JOIN)
         except OSError as error:
-            warn(f"No program is listening at {address} ({error}): documents are dropped until one does.")
+            warn(f"No program is listening at {address} ({error}): documents are lost until a program listens there.")
         yield publisher
     finally:  # its own close would wait for ever for a proxy that no longer reads
         publisher._context.destroy(linger=round(1000 * REACH))

@@ -57,8 +57,8 @@ class StageMover(MotorSection):
     out_deg: float = setting(doc="Position of the sample while flats are taken.")
     mm_per_deg: float | None = setting(
         None,
-        "mm by which the sample moves towards higher columns of the frame, per unit of the axis; null: "
-        "unknown, or not across the beam.",
+        "mm by which the sample moves towards higher columns of the frame per unit of the axis of the mover; "
+        "null: unknown, or the sample does not move across the beam.",
         ge=-1e3,
         le=1e3,
     )
@@ -131,7 +131,7 @@ class FoundFilter(Section):
 def refuse_equal(places: Mapping[str, float | str]) -> None:
     """Raise ValueError if two positions have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("two positions have the same value; give each a different value")
+        raise ValueError("two positions have the same value; give each position a different value")
 
 
 class BeamMonitorSection(Section):

@@ -99,7 +99,7 @@ class SimulatedOrca(_Orca):
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
     library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
-    index: int = setting(0, "Which camera to use if DCAM finds several.", ge=0)
+    index: int = setting(0, "Number of the camera to use (counted from 0), if DCAM finds several cameras.", ge=0)
     link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 transfers 17.7 full frames per second, CoaXPress 120.")
     cool_s: float = setting(0.0, "Longest wait before a scan until the sensor is cold; 0: do not wait.", ge=0, le=1e6)
     usb_product: int | None = setting(

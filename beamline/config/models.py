@@ -33,7 +33,7 @@ class SampleSection(Section):
     description: str = ""
     diameter_mm: float | None = setting(
         None,
-        "Diameter of the circle about the rotation axis that contains the whole sample; null: not known.",
+        "Diameter of the smallest circle about the rotation axis that contains the whole sample; null: not known.",
         gt=0,
         le=1e3,
     )
@@ -116,7 +116,13 @@ class TargetSection(Section):
     """When a scan that makes decisions ends; the first target that is reached counts; null: no such target."""
 
     quality_db: float | None = setting(
-        None, "dB of PSNR that the volume may be worse than the volume of the whole plan.", gt=0, le=100
+        None,
+        (
+            "Accepted loss: number of dB by which the PSNR of the volume may be lower than the PSNR after the "
+            "whole plan."
+        ),
+        gt=0,
+        le=100,
     )
     seconds: Seconds | None = setting(None, "Time limit from the first frame to the last flats and darks.")
     dose: float | None = setting(
@@ -141,23 +147,24 @@ class ScanSection(Section):
     settle_s: float = setting(0.1, "Settling time after each move of a step scan.", ge=0, le=1e6)
     warm_up_s: float = setting(
         0.0,
-        "How long the scintillator is exposed before frames with beam, each time the shutter opens. It "
-        "is brighter when it is warm.",
+        "How long the scintillator is exposed to the beam before frames are taken, each time the shutter opens. "
+        "A warm scintillator is brighter.",
         ge=0,
         le=1e6,
     )
     filter: str | None = setting(
         None,
-        "Name of one of the places of devices.filter, to which it moves before the first frame; null: it "
-        "stays where it is.",
+        "Name of one of the places of devices.filter. The filter moves there before the first frame; null: the "
+        "filter stays where it is.",
     )
     energy: Kev | None = setting(
-        None, "keV to which devices.monochromator moves before the first frame; null: it stays where it is."
+        None,
+        "keV to which devices.monochromator moves before the first frame; null: the monochromator stays where it is.",
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "keV of an energy series: one scan at each, one after the other. Each begins a fraction of a "
-        "step later in angle.",
+        "keV of an energy series: one scan at each, one after the other. Each scan begins a fraction of an "
+        "angular step later than the scan before.",
         min_length=2,
         max_length=1000,
     )
@@ -169,7 +176,7 @@ class ScanSection(Section):
         le=100,
     )
     on_watchdog_loss: Literal["warn", "pause"] = setting(
-        "warn", "What a scan does without a watchdog, or if the watchdog ended and could not be replaced."
+        "warn", "What a scan does if the watchdog cannot be started, or if it has ended and cannot be replaced."
     )
     decide: Literal["off", "ask", "do"] = setting(
         "off",
@@ -225,8 +232,8 @@ class ReconSection(Section):
     )
     seconds: Seconds = setting(
         1800.0,
-        "Time limit after the last projection. null: the volume is made as for a finished scan, and "
-        "takes longer on a busy computer.",
+        "Time limit after the last projection. null: no time limit; the fit takes as many steps as for a "
+        "finished scan, and needs more time on a busy computer.",
     )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0

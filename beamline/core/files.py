@@ -301,7 +301,7 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be replaced ({error}); the existing file was not changed.") from error
     except OSError as error:
-        left = "what was there is untouched" if replace else "nothing is left of it"
+        left = "the existing file was not changed" if replace else "no incomplete file was left behind"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk

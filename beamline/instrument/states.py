@@ -123,7 +123,7 @@ _READ: Mapping[str, Callable[[Any], dict[str, Any]]] = {
     "camera": lambda camera: camera.describe(),
     "shutter": lambda shutter: {"open": shutter.is_open()},
     "sample mover": lambda mover: {"answers": True},
-    "filter": lambda filter_: {"place": filter_.place() or "none that has a name"},
+    "filter": lambda filter_: {"place": filter_.place() or "none of the named places"},
     "monochromator": lambda monochromator: {"energy_kev": monochromator.energy()},
     "beam monitor": lambda monitor: vars(monitor.reading()),
 }  # fmt: skip

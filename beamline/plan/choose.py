@@ -102,7 +102,7 @@ def choose(
     excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]
     if not allowed:
-        return Choice.ENOUGH, next(iter(excesses.values()), "no choice would improve the volume")
+        return Choice.ENOUGH, next(iter(excesses.values()), "none of the choices would improve the volume")
     best = max(allowed, key=lambda option: option.gain / option.seconds)
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
     taken = following if best.low / best.seconds <= following.high / following.seconds else best

@@ -79,12 +79,16 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
     after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
-    chosen = f" of the {by}" if by else ""
+    chosen = f" by the {by}" if by else ""
     chosen += (
         f": {why}".rstrip(".") if why and by != "operator" else ""
     )  # the reason of the operator is only that the operator chose it
     rest = f" {left} planned frames were not taken." if left else ""
-    return f"Ended after pass {after or last.get('number')} by the choice `enough`{chosen}.{rest}" if last else ""
+    return (
+        f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
+        if last
+        else ""
+    )
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:

@@ -194,7 +194,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 def _require(views: int) -> None:
     if views < 1:
-        raise ValueError(f"a plan needs at least 1 view(s), got {views}")
+        raise ValueError(f"a plan needs at least 1 projection, got {views}")
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
@@ -244,7 +244,10 @@ def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.p
     if passes < 1 or views % passes or (passes > 1 and views // passes < 2):
         legal = [p for p in range(1, views // 2 + 1) if views % p == 0] or [1]
         some = ", ".join(map(str, legal[:12])) + (" ..." if len(legal) > 12 else "")
-        raise ValueError(f"{views} views cannot be taken in {passes} equal passes of two or more; legal passes: {some}")
+        raise ValueError(
+            f"{views} projections cannot be divided into {passes} equal passes of two or more projections; "
+            f"possible numbers of passes: {some}"
+        )
     index = (pass_order(passes)[:, None] + np.arange(0, views, passes)[None, :]).ravel()
     return fixed(views, start, span)[index]
 
@@ -275,8 +278,8 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     columns = [*zip(*(word.split(",") for word in words if "," in word), strict=False)]
     if any(map(are_a_count, columns)) and all(len({*column}) > 1 for column in columns):
         raise ValueError(
-            f"it holds {[word for word in words if ',' in word][-1]!r}, which may be the number of a view and its "
-            "angle, or have decimals; expected one angle a line"
+            f"it contains {[word for word in words if ',' in word][-1]!r}, which may be the number of a "
+            "projection and its angle, or an angle with a decimal comma; expected one angle per line"
         )
     degrees = []
     for number, (word, plain) in enumerate(zip(words, with_points(words), strict=True), start=1):
@@ -287,10 +290,10 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) or (unknown and word.lower() == "nan")):
-            raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
+            raise ValueError(f"line {number} contains {word!r}; expected one angle in degrees per line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("it contains no angle; expected one angle in degrees a line")
+        raise ValueError("it contains no angle; expected one angle in degrees per line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 

@@ -293,7 +293,7 @@ def describe(
         )
     views = timeline.views
     rows, cols = camera.shape
-    stored = f" ({len(views.stored)} of them stored)" if views.stored else ""
+    stored = f" ({len(views.stored)} of them already taken)" if views.stored else ""
     several = f" of {plan.frames_per_view} frames each" if plan.frames_per_view > 1 else ""
     facts = [("views", f"{plan.n_views}{several}{stored}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
@@ -301,10 +301,16 @@ def describe(
         count = 2 * math.pi / stage.counts_per_turn
         facts += [
             ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(count)}{passes}"),
-            ("speed", f"{degrees(views.speed)}/s (the stage's most {degrees(stage.max_speed)}/s)"),
-            ("taxi", f"{degrees(views.taxi)} before the first and after the last trigger"),
+            ("speed", f"{degrees(views.speed)}/s (the stage's maximum is {degrees(stage.max_speed)}/s)"),
+            ("taxi", f"{degrees(views.taxi)} of run-up before the first trigger and after the last one"),
             ("blur", f"{timeline.blur_px:.3g} px at the detector's edge during an exposure"),
-            ("skew", f"{timeline.skew_px:.3g} px there between the first and the last row (rolling shutter)"),
+            (
+                "skew",
+                (
+                    f"{timeline.skew_px:.3g} px at the detector's edge between the first and the last row (rolling "
+                    "shutter)"
+                ),
+            ),
         ]
     else:
         facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
@@ -315,7 +321,10 @@ def describe(
     total = size(timeline.total_bytes)
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [
-        ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
+        (
+            "camera",
+            f"{rows} x {cols} px of {camera.bits} bits, shortest time between triggers {camera.min_period:.6g} s",
+        ),
         ("duration", f"{hms_text(timeline.duration)} (without shutter and sample moves)"),
         ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
     ]

@@ -72,7 +72,7 @@ _AIR = 0.1
 _SURE = 4.0  # standard deviations
 # Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
-_SCALED = ". A difference in pixel size between the projections looks the same"  # in width and height alike
+_SCALED = ". A pixel size that differs between the projections has the same effect"  # in width and height alike
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
@@ -187,7 +187,7 @@ def compare_with_flats(
     for finding in check_air_level(scan, level, air, scan.asked.accepted or said or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
-    return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
+    return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}
 
 
 def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
@@ -238,8 +238,8 @@ def _steady(
     first, last = np.unravel_index(int(change.argmax()), change.shape)
     size = float(max(change[first, last], 0)) if opposite.any() else np.nan
     what = (
-        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, show the same "
-        f"sample but differ by {abs(levels[first] - levels[last]):.2f} in line integral"
+        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, must be mirror "
+        f"images, but they differ by {abs(levels[first] - levels[last]):.2f} in line integral"
     )
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
@@ -308,9 +308,9 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
         return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
-        "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis "
-        f"seems to be tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} "
-        f"px over {rows} rows. Otherwise edges are doubled in the first and last slices."
+        "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis seems to be "
+        f"tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} px over {rows} "
+        "rows. Without this correction, edges are doubled in the first and last slices."
     )
     return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
 
@@ -332,8 +332,8 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
         else "If the beam is a cone, give --cone SOD:SDD in mm. Without it, densities and shapes are wrong."
     )
     sentence = (
-        f"{check} The projections contradict the stated geometry: rays that were measured from both sides "
-        f"agree for a fan of {shown:.3g} degrees across the detector{away}, but the stated fan has "
+        f"{check} The projections contradict the stated geometry: rays that were measured from both sides agree "
+        f"if the rays to the detector span {shown:.3g} degrees{away}, but with the stated distances they span "
         f"{told:.3g} degrees."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
@@ -431,11 +431,11 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
         if not off.max() <= worst:
             worst = float(off.max())
             sentence = (
-                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure "
-                "the same rays at two times, and in the later one the sample is "
+                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the "
+                "same rays at two times, and in the later one the sample is "
                 f"{', '.join(np.array(words)[off > 1])}{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. "
-                "Other such pairs show the same. One volume blurs what changes. Use --volumes N for "
-                "several volumes in time, --calibrate shifts if the sample moved as a whole, or --views "
-                "for a part of the scan."
+                "Other such pairs show the same. A single volume blurs everything that changes. Use --volumes N "
+                "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for "
+                "a part of the scan."
             )
     return ConsistencyCondition("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)

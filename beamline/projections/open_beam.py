@@ -164,7 +164,7 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
         low, high = _PHOTONS
         if not low <= light <= high:
             raise ConfigError(
-                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} means {light:.3g} "
+                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} would mean {light:.3g} "
                 f"photons per pixel in the open beam of {source.path}; expected {low:g} to {high:g}."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0

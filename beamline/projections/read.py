@@ -255,9 +255,9 @@ class ViewReader:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
         self.named.update(news.tolist())
         self.warn(
-            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} "
-            f"({frames_text(news)}) had no beam: the shutter was closed, the beam was lost, or the file "
-            f"was never written there. {'It is' if news.size == 1 else 'They are'} left out{gap}."
+            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} ({frames_text(news)}) had "
+            "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "
+            f"file. {'It is' if news.size == 1 else 'They are'} left out{gap}."
         )
 
     def no_view(self) -> NoViewError:

@@ -185,7 +185,7 @@ def choose_views(
         raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:
         raise ConfigError(
-            f"--views {selection.views} leaves {chosen.size} of the {frames.size} projections of "
+            f"--views {selection.views} selects only {chosen.size} of the {frames.size} projections of "
             f"{source.path}; a volume needs at least 2."
         )
     return chosen

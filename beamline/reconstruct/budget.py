@@ -46,8 +46,8 @@ def in_budget(
         chosen = _without_slow(method, kept)
     if (late := expected - (end - now())) > 0:
         warn(
-            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which is "
-            f"used now, ends about {duration_text(late)} late."
+            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which "
+            f"is used now, will end about {duration_text(late)} after this limit."
         )
     names = [each.name for each in kept]
     out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]

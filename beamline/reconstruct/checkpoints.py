@@ -111,12 +111,16 @@ class CheckpointOptions:
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
-                f"--resume {self.resume} has already {reached.step} steps, more than the {steps} requested. Use "
-                f"--steps {reached.step} or more, or start again without --resume."
+                f"--resume {self.resume} already contains {reached.step} steps, more than the {steps} steps that "
+                f"you requested. Use --steps {reached.step} or more, or start again without --resume."
             )
         if steps != kept.steps or steps == 0:
-            was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
-            plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
+            was, now = (f"{n} steps" if n else "a time limit" for n in (kept.steps, steps))
+            plans = (
+                f"that was planned for {was}, and this fit is planned for {now}"
+                if was != now
+                else "that was planned for a time limit, like this fit"
+            )
             warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
         return kept.state
 

@@ -66,9 +66,9 @@ class Estimate(Need):
 
     def _time(self) -> str:
         if self.seconds is None or self.least_seconds is None:
-            return f"not known: {self.method} has to be tried"
+            return f"not known, because the time of {self.method} cannot be predicted"
         most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
-        span = f"{most}; {least} where the data end it early" if self.least_seconds < self.seconds else most
+        span = f"{most}; {least} if the data let it stop early" if self.least_seconds < self.seconds else most
         return f"{span}; reading and correction not counted"
 
 

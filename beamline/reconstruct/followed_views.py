@@ -165,7 +165,7 @@ class AxisSearch:
 
 
 _NOISE_FLATS = 8  # at most, which show the noise of a frame
-_NO_GAIN = "No gain by further views is predicted"
+_NO_GAIN = "The improvement by further projections is not predicted"
 
 
 class PassLaws:
@@ -193,7 +193,7 @@ class PassLaws:
             return
         self._end = end
         if references_follow or axis_col is None:  # a scan that waits for the law takes no frame that might show it
-            missing = "darks or flats are not there" if references_follow else "the rotation axis is not known"
+            missing = "darks or flats have not been taken" if references_follow else "the rotation axis is not known"
             self._no_law(ends.size, 0, f"{missing} yet")
             return
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
@@ -206,7 +206,7 @@ class PassLaws:
         }
         rows = np.array([*images], np.int64)
         if not rows.size or correction is None:
-            self._no_law(ends.size, 0, "none of the views can be used")
+            self._no_law(ends.size, 0, "none of the projections can be used")
             return
         views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
         try:
@@ -214,7 +214,7 @@ class PassLaws:
             open_beam = correction.open_beam(_NOISE_FLATS)
             law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
-            self._no_law(ends.size, rows.size, str(error) or "the memory does not suffice")
+            self._no_law(ends.size, rows.size, str(error) or "there is not enough memory")
             return
         if (self._views.source.table.offset_views < end).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)

@@ -58,12 +58,14 @@ _OUTDATED = (
     "or new angles lie between earlier ones (neighbours in angle are used to find zingers)"
 )
 _NEXT_PART = (
-    "Correcting all projections again, each with the flats of its own part, because the next part of the run starts"
+    "Correcting all projections again, because the next part of the run starts: each projection is corrected "
+    "with the flats of its own part"
 )
 _SEVERAL_PARTS = "Correcting all projections again at the end of the run, because the run has several parts"
 _OFFSET = "Correcting all projections again, now together with the laterally offset projections"
 _SHADED = (
-    "Correcting all projections again without an object that is in the beam in all projections, but not in the flats"
+    "Correcting all projections again, because an object is in the beam in all projections, but not in the "
+    "flats: its rays are no longer used"
 )
 
 

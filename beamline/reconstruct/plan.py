@@ -128,8 +128,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         taller=method.knows_outside and taller_than_field(prepared.projections.data, geometry),
         weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
-    more = "the sample goes on beyond the field" if needs.radius is not None or needs.taller else ""
-    more = more or "some pixels have no data, so each ray needs a weight" * bool(needs.weights)
+    more = "The sample extends beyond the field of view" if needs.radius is not None or needs.taller else ""
+    more = more or "Some pixels have no data, so each ray needs a weight" * bool(needs.weights)
     if geometry.is_cone and more and needs.at_once > plan.allowed:
         raise DataError(
             f"{source.path}: not enough memory. {more}, and the {needs.method.name} volume needs "
@@ -168,8 +168,9 @@ def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry)
     volumes, least = options.method.volumes, options.method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
-            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes of {geometry.n_views} "
-            f"views: expected {least} views or more for each. Nothing was written."
+            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes from "
+            f"{geometry.n_views} projections are too many, because each volume needs at least {least} "
+            "projections. Nothing was written."
         )
     if options.uncertainty:
         refuse_views(options.method_for(geometry), geometry)
@@ -190,11 +191,14 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
         return _plan(options, needs, allowed, slabs, slabs)
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
-        raise DataError(f"{partial} is of {slabs[-1].own.stop} slices, this volume has {slices}.")
+        raise DataError(
+            f"{partial} contains a volume of {slabs[-1].own.stop} slices, but this reconstruction has {slices}. "
+            "Use the same options as then, or start again without --resume."
+        )
     if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
         raise DataError(
             f"The slabs of {partial} need {size(wanted)} of memory, but {size(allowed)} is allowed. Use --memory "
-            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+            f"{math.ceil(wanted / 1e6)}M if there is as much. No file was changed."
         )
     return _plan(options, needs, allowed, slabs, missing)
 
@@ -309,7 +313,7 @@ def _refuse_several_volumes(options: ReconOptions) -> None:
         of_one = ("region", "truth", "uncertainty", "cluster", "partial")
         if wrong := [name for name in of_one if getattr(options, name)]:
             raise ConfigError(
-                f"{' and '.join(wrong)}: this works only with methods that make one volume, but {options.method.name} "
+                f"{' and '.join(wrong)}: works only with methods that make one volume, but {options.method.name} "
                 "makes several. Leave it out, or choose another method. Nothing was computed."
             )
 

@@ -163,7 +163,7 @@ def _record(
 
 def _title(made: Reconstruction, context: ReportContext) -> str:
     if made.series is not None:
-        return f"{made.series.n} volumes in time of {context.facts.name}"
+        return f"{made.series.n} volumes at successive times of {context.facts.name}"
     return f"{label_of(made.method)} reconstruction of {context.facts.name}"
 
 
@@ -264,9 +264,9 @@ def partly_seen_warning(geometry: Geometry) -> str:
     if not some.size:
         return ""
     return (
-        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than the "
-        "others, because the projections are at different heights. The volume has streaks there, and FBP is not dense "
-        "enough."
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than "
+        "the others, because the projections are at different heights. The volume has streaks in these slices, "
+        "and FBP gives too low densities."
     )
 
 

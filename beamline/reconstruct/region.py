@@ -137,8 +137,8 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
     if not geometry.rows_show_slices:
         raise DataError(
-            "The views are shifted along the axis, rolled or tilted, but --roi needs slices that are aligned with "
-            "rows. Use --rows instead."
+            "The projections are shifted along the axis, rolled or tilted, but --roi needs slices that are "
+            "aligned with rows. Use --rows instead."
         )
     _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
@@ -232,7 +232,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
 
 
 def _uncut(height: int, across: int, why: str) -> Region:
-    reason = f"--roi auto makes the whole volume: {why}."
+    reason = f"--roi auto reconstructs the whole volume, because {why}."
     return Region((0, height), (0, across), (0, across), requested=False, reason=reason)
 
 

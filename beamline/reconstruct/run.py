@@ -115,9 +115,10 @@ def fit_within(
     remaining = limit - spent - measuring - after
     if remaining <= 0:
         warn(
-            f"{duration_text(limit)} is not enough for this scan: reading and correction took {duration_text(spent)}, "
-            f"and checks, report and writing need about {duration_text(measuring + after)}. Nothing is left for the "
-            f"{by_name(method.name).label} method, which makes only one step."
+            f"{duration_text(limit)} is not enough for this scan: reading and correction took "
+            f"{duration_text(spent)}, and checks, report and writing need about "
+            f"{duration_text(measuring + after)}. No time is left for the {by_name(method.name).label} method, "
+            "so it makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report

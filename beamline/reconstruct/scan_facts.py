@@ -197,7 +197,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
     missing, flags = int(attributes.get("missing_triggers", 0)), source.table.flags if flags is None else flags
     table = _table(source, sample or "not stated", columns)
-    table["flagged by the monitor"] = "no monitor looked at it" if flags is None else counted(flags.counts())
+    table["flagged by the monitor"] = "not checked by the monitor" if flags is None else counted(flags.counts())
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n, again = len(source.table), source.table.replaced
     if again.size:

@@ -115,7 +115,7 @@ class _SlabJob:
     def tell(self, done: int) -> None:
         """Report the number of finished slices."""
         slices = self.grid.shape[0]
-        self.say(f"{done} of {slices} slices are there.")
+        self.say(f"{done} of {slices} slices are done.")
         if (listen := self.control.on_progress) is not None:
             seconds, views = self.control.now() - self.begin, self.prepared.geometry.n_views
             listen(Progress(done, slices, seconds, nan, nan, 0, views, unit="slices"))
@@ -126,7 +126,7 @@ class _SlabJob:
             return None
         partial = open_partial(path)
         refuse_other(path, _made_from(self.prepared, self.options), partial.made_from, "reconstruction")
-        self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are there.")
+        self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are done.")
         return partial
 
     def begun(self, numbers: Sequence[int]) -> tuple[PartialVolume, list[int]]:

@@ -107,7 +107,7 @@ def quality_against_time(
             values = history[name] / np.max(history[name])
             axes.step(seconds, values, where="post", color=colour, lw=1.2, label=f"{label} / {history[name].max():.0f}")
         axes.set_ylim(0, 1.05)
-        finish(axes, "time (s)", "share of the largest", "Growth", grid=True)
+        finish(axes, "time (s)", "fraction of the largest value", "Growth", grid=True)
     return png(figure)
 
 

@@ -185,7 +185,7 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
-    window, title = (float(np.min(image)), float(np.max(image))), "Highest density where views show nothing"
+    window, title = (float(np.min(image)), float(np.max(image))), "Highest density where projections show nothing"
     return _map(image, grid, unit, title, kind.label(unit), window, "magma")
 
 
@@ -205,7 +205,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = one_panel(5.4, 6.4)
-    image, title = volume.data[at], f"Rays that no view shows, slice {at}"
+    image, title = volume.data[at], f"Rays that no projection has, slice {at}"
     draw_slice(axes, image, planes(grid, unit)[0], title, matter_window(image))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:

@@ -223,7 +223,9 @@ class Acquisition:
             replaces = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
-            self._sink(Warned(f"Frames {spans(rows)}: repeated, but again without a frame."))
+            self._sink(
+                Warned(f"Frames {spans(rows)}: the exposure was repeated, but the camera again delivered no frame.")
+            )
 
     def _offset(self, block: Block) -> Iterator[Frame]:
         """Take offset projections, at angles of the first projections. They replace nothing."""
@@ -298,9 +300,8 @@ class Acquisition:
             )
         if text := discrepancies(self._done):
             raise LedgerError(
-                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat "
-                "these projections, or reconstruct without them. A longer period_s gives the camera more "
-                "time.",
+                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat the "
+                "missing projections, or reconstruct without them. A longer period_s gives the camera more time.",
                 self.missing,
             )
 

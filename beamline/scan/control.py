@@ -173,8 +173,8 @@ class Asked:
                 return None
             if _taken(request):
                 raise ConfigError(
-                    f"the scan in {self.part} does not answer: its process was killed, or its disk hangs. "
-                    "Nothing was changed. If it was killed, check the instrument, and run `beamline "
+                    f"the scan in {self.part} does not answer: either its process was killed, or its disk hangs. "
+                    "Nothing was changed. If the process was killed, check the instrument, and run `beamline "
                     "recover` on its file."
                 )
         state = state_of(self.part)

@@ -72,8 +72,8 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
     if files and len(whole) < len(runs):
         warn(
-            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with "
-            f"frames are used. `beamline scan --resume {folder}` takes the rest."
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with frames are "
+            f"used. `beamline scan --resume {folder}` takes the missing scans."
         )
     if not files:
         raise DataError(

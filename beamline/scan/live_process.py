@@ -86,7 +86,7 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
         remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
-        remark = "Only darks and flats are taken now: reconstruct joined.h5 afterwards."
+        remark = "No live volume is made, because only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
@@ -257,10 +257,15 @@ class LiveReconstruction:
             when = "during the scan" if self._ready.is_set() else "before it was ready"
             if killed := process.code is not None and process.code < 0 and self._again > 0:
                 self._again -= 1
-                then = "It is started again, and uses the projections in the file."
+                then = (
+                    "A new live reconstruction is started; it begins with the projections that are already in the file."
+                )
             else:
                 self.ended = True
-                then = "The scan continues without it. To start another one: beamline recon FILE --follow -o OUT.h5"
+                then = (
+                    "The scan continues without a live reconstruction. To start another one: beamline recon "
+                    "FILE --follow -o OUT.h5"
+                )
             message = f"The live reconstruction ended {when} (code {process.code}). See {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
             if killed:

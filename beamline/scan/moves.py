@@ -75,9 +75,9 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
         return (before + after) / 2, ""
     return after, (
-        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, although it "
-        f"had arrived there: it was at {math.degrees(before):.4f}° before the exposure and "
-        f"{'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
+        f"its frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, "
+        f"although it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure "
+        f"and {'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
 
 

@@ -89,14 +89,15 @@ class ResumableRun:
         """The run in one line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
-            kinds = ["offset views"] if self.offset_missing else []
+            kinds = ["offset projections"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
-            all_views = "the projections that it was to take" if self.choices else f"{self.planned} views"
+            all_views = "the projections that were planned" if self.choices else f"{self.planned} projections"
             return (
-                f"Preparing: {self.run} has all {all_views}; its missing {' and '.join(kinds)} of the end are taken now"
+                f"Preparing: {self.run} has all {all_views}; the {' and '.join(kinds)} that are missing at its "
+                "end are taken now"
             )
         if self.choices:  # some projections were omitted by a decision, or are taken twice
-            return f"Preparing: {self.run} lacks {missing} of the projections that it was to take; they are taken now"
+            return f"Preparing: {missing} of the projections planned for {self.run} are missing and are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
@@ -226,7 +227,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
-    whole = f"{run} has all projections that it was to take, and its darks and flats"
+    whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
     what = f"{JOINED} does not have the frames of its {len(parts)} parts" if closed else "a file was not closed"

@@ -18,9 +18,9 @@ NAMED = 5  # projections that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 TRIES = 3  # exposures of a projection whose stage is not at its angle, after which the projection counts as missing
 ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its projection is taken again, up to {TRIES} times in "
-    "total. Possible causes are another program or person that moves the stage, its manual knob, a servo "
-    "that oscillates, or a controller that reports the end of a move too early"
+    "A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to "
+    f"{TRIES} times in total. Possible causes are another program or person that moves the stage, its manual "
+    "knob, a servo that oscillates, or a controller that reports the end of a move too early"
 )
 
 Exposed = tuple[CameraFrame, int, float, bool]
@@ -119,8 +119,8 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" {taken.lost} were exposed but never delivered by the camera: "
-                "`beamline check --connect` looks at its link."
+                f" {taken.lost} were exposed but never delivered by the camera: `beamline check --connect` tests "
+                "its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
@@ -137,12 +137,12 @@ def _of_block(taken: BlockTally) -> str:
         )
     if taken.shift:
         text += (
-            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra frames, "
-            "and it is not known whether at its start or at its end."
+            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra "
+            "frames, and it is not known whether they are at its start or at its end."
         )
     if text and taken.off > DOUBTFUL:
         text += (
-            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong "
-            "by as much of a step (warnings of `timing` name such frames)."
+            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong by the "
+            "same fraction of an angular step (the warnings of the check `timing` list such frames)."
         )
     return text.strip()

@@ -129,7 +129,7 @@ class _Keeper:
             if not left:
                 self._sink(
                     Warned(
-                        f"The watchdog ended as well (code {code}): if the scan is killed now, the shutter stays open."
+                        f"The new watchdog also ended (code {code}): if the scan is killed now, the shutter stays open."
                     )
                 )
                 if pause is not None:
@@ -253,8 +253,8 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
     if frozen:
         say(
-            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. The watchdog "
-            "kills it to free its port."
+            f"The process of the scan did nothing for {FROZEN:.0f} s and is taken to be dead. The watchdog kills "
+            "the process to free the port of the devices."
         )
         try:
             psutil.Process(scan).kill()  # the number still belongs to that process: the pipe is open

@@ -105,8 +105,8 @@ def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
         )
     if source.table.shifts is not None:
         raise DataError(
-            f"{source.path} states a shift for each projection, which the copy could not state. Reconstruct the "
-            "original file instead. Nothing was written."
+            f"{source.path} states a shift for each projection, but the copy cannot store these shifts. "
+            "Reconstruct the original file instead. Nothing was written."
         )
     if source.table.altered.any():
         raise DataError(f"{altered_sentence(source)} Nothing was written.")

@@ -52,8 +52,11 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         if finite.any():
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
     raw, there = record.raw_file, record.parameters.get("partial")
-    partial = f"Partial: {there} are there, the others are empty. recon --resume makes them."
-    early = "The reconstruction was stopped early; this is the volume that it had reached."
+    partial = (
+        f"The volume is partial: {there} are reconstructed, the others are empty. `beamline recon --resume` "
+        "reconstructs the others."
+    )
+    early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (
         (bad > 0, Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")),
         (low == high, Finding("error", "voxels", f"Every voxel is {low:g}.")),
@@ -119,7 +122,7 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.unlit(row)]
     if unlit:
         of = f"{views.size} views" if every else f"{looked_at.size} views looked at"
-        more = "" if every else " `validate --deep` looks at all."
+        more = "" if every else " `validate --deep` checks all projections."
         yield Finding(
             "warning",
             "unlit",
@@ -160,8 +163,8 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
             "error",
             "checksums",
             f"{len(source.damaged)} of {n} frames are damaged, because they differ from their stored checksums: "
-            f"{spans(sorted(source.damaged))}. Look for a good copy; `beamline recon` leaves them out."
-            + ("" if progress else " `validate --deep` compares all frames."),
+            f"{spans(sorted(source.damaged))}. Look for an intact copy of the file; `beamline recon` leaves "
+            "these frames out." + ("" if progress else " `validate --deep` compares all frames."),
         )
     elif progress and not source.checksummed:
         yield Finding(

@@ -47,7 +47,7 @@ ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
 _KEPT = 64  # answers kept for the next client
-_NO_VERB = "do what is no verb"
+_NO_VERB = "An unknown command"
 _ONLY_WATCHES = (
     "This address can only watch the scan. To control the scan, open the address that `beamline scan --page` "
     "or `beamline watch --control` prints for this purpose. Nothing was sent to the scan."
@@ -272,11 +272,13 @@ class _Server:
         name = _NO_VERB if verb is None else str(verb)  # never what was sent
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
-            self._log(f"not done: {name} from {client}, because the token for controlling the scan is missing")
+            self._log(
+                f"not executed: {name}, requested by {client}, because the token for controlling the scan is missing"
+            )
             return JSONResponse({"message": _ONLY_WATCHES}, 403)
         if folder is None or verb is None:
             return JSONResponse({"message": f"{name} is not possible: no scan is running in this folder."}, 404)
-        self._log(f"{name}, asked for from {client}")
+        self._log(f"{name}, requested by {client}")
         asked = ask(folder, verb)
         while (state := await run_in_threadpool(asked.state)) is None:
             await asyncio.sleep(POLL)

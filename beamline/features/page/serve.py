@@ -197,7 +197,7 @@ class RunBrowser:
     def _open(self, number: int) -> _Opened:
         runs = list(self._numbers)  # by number; a copy, since `table` adds to it in another thread
         if number >= len(runs):
-            raise DataError(f"There is no run {number} here.")
+            raise DataError(f"This page has no run {number}.")
         opened = number, (is_own := runs[number] in self._own)
         if opened not in self._opened:
             unused = [n for n, opened in self._opened.items() if not opened.requests]

@@ -91,7 +91,9 @@ class _Viewer:
 
         first, second = self._do(cuts)
         if first.values.shape != second.values.shape:  # one of them has scales
-            raise DataError("The two volumes have this slice at two resolutions; zoom in.")
+            raise DataError(
+                "The slices of the two volumes have different resolutions here, so no difference can be shown: zoom in."
+            )
         return tile_of_volume(replace(first, values=second.values - first.values, ready=min(first.ready, second.ready)))
 
     def histogram(self, request: Request) -> Response:
@@ -107,7 +109,7 @@ class _Viewer:
 
         def read_it(volumes: Sequence[ShownVolume]) -> _Result:
             if which >= len(volumes):
-                raise DataError(f"Volume {which} is not shown here.")
+                raise DataError(f"This page does not show volume {which}.")
             return read(volumes[which])
 
         return self._do(read_it)

@@ -126,8 +126,9 @@ def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
     head = numbered[0][1] if numbered else []
     if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
         raise ConfigError(
-            f"{table} is not a table of scans. Expected a first line with names, such as "
-            "config,sample.name,scan.exposure_s, each only once, then one line per scan. Nothing was started."
+            f"{table} is not a table of scans. Expected a first line with the names of the columns, such as "
+            "config,sample.name,scan.exposure_s, each only once, and then one line per scan. Nothing was "
+            "started."
         )
     for number, row in numbered[1:]:
         if not any(row):
@@ -169,7 +170,7 @@ class QueueNeeds:
         return [
             aligned([("scan", "frames", "size", "time"), *rows]),
             "",
-            f"{count(len(self.scans), 'scan')}: {total}, plus the time between them",
+            f"{count(len(self.scans), 'scan')}: {total}, plus the time between the scans",
         ]
 
     def data(self) -> Mapping[str, Any]:
@@ -183,8 +184,8 @@ class QueueNeeds:
         faults = [f"{name}: {text}" for name, worked in self.scans for text in worked.timeline.violations]
         if not faults and self.total_bytes * ROOM > self.free_bytes:
             faults.append(
-                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} plus a tenth, but the disk has "
-                f"{size(self.free_bytes)} free. Free some space, or choose another storage.folder"
+                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} plus a reserve of a tenth, but "
+                f"the disk has {size(self.free_bytes)} free. Free some space, or choose another storage.folder"
             )
         if faults:
             raise ConfigError(
@@ -236,11 +237,11 @@ def run_queue(
             asked = stop.by_person or isinstance(error, KeyboardInterrupt)
             status = QueueStatus.STOPPED if asked else QueueStatus.FAILED
             outcomes.append(ScanOutcome(name, status, run.folder, user_message(error), exit_code(error)))
-            ended = "somebody stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
+            ended = "the operator stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
         else:
             status = QueueStatus.ALARMS if faults else QueueStatus.COMPLETE
             outcomes.append(ScanOutcome(name, status, path, " ".join(faults), AlarmError.exit_code if faults else 0))
-            ended = "somebody stopped the queue" if stop.by_person else ""
+            ended = "the operator stopped the queue" if stop.by_person else ""
         if run.unsafe:
             ended = f"stage, camera or shutter did not respond at the end of {name}"
     return tuple(outcomes)

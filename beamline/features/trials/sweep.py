@@ -154,7 +154,7 @@ class SweptScan(TrialScan):
         if self._views is None or self._views[:2] != (source_words, wanted):
             with options.source.open() as source:
                 views = prepare_projections(source, wanted, Warnings(self._sink, self._clock))
-            views = hold_out(views, ONE_IN, advice="take a scan with more views")
+            views = hold_out(views, ONE_IN, advice="take a scan with more projections")
             if wanted.axis_col is None and source_words == self._first:
                 self._axis = views.axis_col
                 wanted = replace(wanted, axis_col=self._axis)
@@ -197,8 +197,8 @@ class SweptScan(TrialScan):
                 metrics = {HELD_OUT: share}
                 table = table.with_outcome(at, replace(table.outcomes[at], verdict=verdict, metrics=metrics))
         notes = [
-            f"{BASELINE} leaves mostly the blur of its filter in the residual. -m fista-tv distinguishes the values "
-            "better."
+            f"Use -m fista-tv to distinguish the values better: with {BASELINE} the residual is mostly the blur "
+            "of its filter."
         ] * direct
         notes += [] if same_views else [_OTHER_VIEWS]
         if (best := table.best) is None:
@@ -291,7 +291,7 @@ def planned_sweep(trials: Trials, command: str, sink: Sink, clock: Clock) -> Pla
     across = len({values[[*first][1]] for values, _ in trials}) if len(first) > 1 else min(COLUMNS, len(trials))
     table = TrialTable(
         "sweep", f"{' and '.join(first)} of a slice", tuple(Outcome(each, "not run") for each in swept), HELD_OUT,
-        machine(), facts, command, f"Which {' and '.join(first)} predicts views held out best?", asks_best=True,
+        machine(), facts, command, f"Which {' and '.join(first)} predicts held-out projections best?", asks_best=True,
     )  # fmt: skip
     scan = SweptScan(swept, sink, clock)
     return Planned(lambda run: scan, table, SliceSheet(across=across, closer=True))

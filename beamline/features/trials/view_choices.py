@@ -120,7 +120,7 @@ def window_average(views: ViewSet) -> list[ViewChoice]:
 STUDIES = {
     study.name: study
     for study in (
-        Study("fixed-views", "Fewer views", "What do fewer views, evenly spread, cost?", fixed_views),
+        Study("fixed-views", "Fewer views", "How much is lost with fewer, evenly spread projections?", fixed_views),
         Study(
             "sector",
             "A narrower sector",
@@ -174,7 +174,12 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     n = order.size // w if count is None else count
     if n < 2 or n > room:
         return ViewChoice(
-            label, None, reason=f"asks for {max(n, 2)} windows of {w}; the {order.size} views hold {max(room, 0)}"
+            label,
+            None,
+            reason=(
+                f"it needs {max(n, 2)} windows of {w} projections, but the {order.size} projections contain only "
+                f"{max(room, 0)} windows"
+            ),
         )
     starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
     groups = order[starts[:, None] + np.arange(w)]

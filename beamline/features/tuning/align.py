@@ -126,7 +126,7 @@ class Alignment:
             )
             tilt += turned if abs(self.lean) > STRAIGHT else "no correction"
         detail = (
-            "not known: the view is only noise"
+            "not known: the projection shows only noise"
             if math.isnan(self.detail)
             else (
                 f"{self.detail:.3g} px is the width of the finest detail in the projection at {degrees(self.angle)}; "
@@ -183,11 +183,11 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
     try:
         axis, tilt = align_pair(one, other)
     except AxisError as error:
-        raise QualityError(f"The two views show no axis: {error}") from error
+        raise QualityError(f"The two projections do not show the axis: {error}") from error
     if not axis.confident:
         raise QualityError(
-            f"The two projections do not match: the axis may be near column {axis.value:.1f}, or not. Use a sample "
-            "with more contrast that stays in the field of view, and check the flats."
+            f"The two projections do not match: the axis is perhaps near column {axis.value:.1f}, but this is "
+            "not certain. Use a sample with more contrast that stays in the field of view, and check the flats."
         )
     offset = axis.value - (dark.shape[1] - 1) / 2
     return Alignment(

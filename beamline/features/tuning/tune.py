@@ -87,7 +87,7 @@ class Tuning:
             ("saturated", f"{self.saturated:.2%} of the pixels of the flat, at the configured {self.configured:.4g} s"),
             (
                 "photons",
-                f"{self.photons:.4g} photons in a pixel of that flat; camera gain: {self.gain:.3g} counts per photon",
+                f"{self.photons:.4g} photons in a pixel of this flat; camera gain: {self.gain:.3g} counts per photon",
             ),
             (
                 "view",

@@ -75,9 +75,9 @@ class TiltAndLens:
     tilt: float | str | None = option(
         "--tilt",
         None,
-        "In-plane tilt of the rotation axis in degrees, positive if its column grows with the rows; "
-        "projections are rotated by it. auto: find it from all rows. Default: use projections as they "
-        "are, with a warning if they show a tilt.",
+        "In-plane tilt of the rotation axis in degrees, positive if the column of the axis grows from the first "
+        "row to the last; projections are rotated by this angle. auto: find it from all rows. Default: use "
+        "projections as they are, with a warning if they show a tilt.",
         parse=_tilt,
         metavar="DEGREES|auto",
     )

@@ -121,7 +121,7 @@ class Width:
             if self.arc not in ("auto", "none"):
                 raise ConfigError(
                     f"Omit --exposure-arc {self.arc}, because the projections are given by the vectors of "
-                    f"{table.path}, which do not allow for an arc."
+                    f"{table.path}, which cannot describe a rotation during the exposure."
                 )
         parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
