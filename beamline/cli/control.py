@@ -106,8 +106,8 @@ def decide(words: tuple[str, ...]) -> None:
     those without a frame), or enough (no further pass). Without RUN, the command goes to the only running scan in
     ./runs.
 
-    Exit code: 0 the scan takes your choice, 2 no scan runs there, it does not ask, it does not offer your choice, or
-    your choice came too late, 5 disk error.
+    Exit code: 0 the scan takes your choice, 2 no scan runs in the folder, the scan does not wait for a decision, it
+    does not offer your choice, or your choice came too late, 5 disk error.
     """
     *run, choice = words
     if len(run) > 1 or choice not in CHOICES:
@@ -181,8 +181,8 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
     \b
     beamline home my.yaml
 
-    THE STAGE TURNS, possibly by 360° and beyond its soft limits. The command asks before it does so. No other device
-    is connected. Ctrl-C stops the stage.
+    THE STAGE TURNS, possibly by 360° and beyond its soft limits. The command asks for confirmation first. It connects
+    to no other device. Ctrl-C stops the stage.
 
     Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
     """
@@ -227,8 +227,8 @@ def recover(file: Path, as_json: bool) -> None:
     beamline recover RUN/scan.h5    repair one file
 
     The command keeps all complete frames, and drops a frame that was being written. The repaired file has the group
-    /exchange and the status `failed`. The command does not change a file that is in order. It copies the frames, which
-    takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
+    /exchange and the status `failed`. The command does not change an intact file. To repair a file, it copies the
+    frames, which takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
     """
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan

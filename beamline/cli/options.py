@@ -115,10 +115,10 @@ class Declared(click.Option):
         setting: path of a setting in Python, such as `fit.loss`; the option belongs to the methods with this setting.
         argument: an argument of methods (see `Method.takes`); the option belongs to these methods.
         inverted: True for a flag that switches the setting off.
-        excludes: long names of options that cannot be combined with it, each with the reason.
+        excludes: long names of options that cannot be combined with this option, each with the reason.
         needs: another option that this one requires, and the end of the error message without it.
         of_one_call: True if the option belongs to one scan or one call; it is then not written into a recipe.
-        former: long name in the last version, which is still accepted but not shown in the help.
+        former: long name in the previous version, which is still accepted but not shown in the help.
     """
 
     def __init__(
@@ -241,7 +241,7 @@ def with_request(request: type) -> Decorator:
     """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
 
     Args:
-        request: a frozen dataclass whose fields are made by `set_by`; one field may be made by `others`.
+        request: a frozen dataclass whose fields are made by `set_by`; one field may be made by the function `others`.
     """
     fields_of = {each.name: each.metadata for each in fields(request)}
 

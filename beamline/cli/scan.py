@@ -100,7 +100,8 @@ class ScanRequest:
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
-        """With --no-live, which a resumed run keeps: prints what the run then does not do."""
+        """The configuration for a run with --no-live (a resumed run keeps this choice); prints what the run does not do
+        for this reason."""
         return partial(click.echo, err=True) if self.no_live else None
 
 

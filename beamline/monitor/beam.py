@@ -1,9 +1,9 @@
 """Check `beam`: slow changes of the beam intensity relative to the flats, and sudden ones.
 
-The slow change is measured in air, at the brightest part of a projection. It is reported when it starts, and as info
-each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change), which
-needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like a loss
-of beam. A change therefore counts only if the intensity of the whole projection changed with it.
+The slow change is measured in air, at the brightest part of a projection. The drift is reported when it starts, and as
+info each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change),
+which needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like
+a loss of beam. A change therefore counts only if the intensity of the whole projection changed with it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The registry of the monitor's checks, and the bits by which a file records which checks flagged a frame.
 
-Adding a check takes its file in this folder and its line in REGISTRY, or in CHECKS of a folder of checks. Its keys in
-the configuration, its bits and the legend in a scan file, and its name in `beamline info` follow.
+To add a check, add its file in this folder and a line in REGISTRY, or in CHECKS of a folder of checks. Its keys in the
+configuration, its bits and its legend in a scan file, and its name in `beamline info` then follow automatically.
 """
 
 from __future__ import annotations

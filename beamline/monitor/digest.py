@@ -1,9 +1,9 @@
 """FrameDigest: statistics of a frame for the monitor, the operator and the file, computed in one pass.
 
 Counts (uint16) are read once, line by line: each line is in the processor's cache while its range, sums and histogram
-are taken. Their sums are integers, so that mean and variance are exact. Other types need the range before the
-histogram, so they are read twice. Pixels that are not finite, hold the no-data value, or lie beyond what any detector
-counts (LARGEST), are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
+are taken. Their sums are integers, so that mean and variance are exact. For other types the range must be known before
+the histogram, so they are read twice. Invalid pixels (not finite, equal to the no-data value, or above LARGEST, which
+no detector counts) are counted and otherwise ignored: they have no effect on a mean or on a block of the preview.
 """
 
 from __future__ import annotations

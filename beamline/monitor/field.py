@@ -1,8 +1,8 @@
 """Checks `field`, `mass`, `pixels`: areas without beam, a sample larger than the field of view, total absorption, dead
 pixels.
 
-The total of a parallel projection is equal from every side, unless matter entered or left: the moment of order 0 of
-the consistency conditions of Helgason (1965) and Ludwig (1966).
+In a parallel beam the total absorption is the same in every projection, unless material entered or left the field of
+view. This is the moment of order 0 of the consistency conditions of Helgason (1965) and Ludwig (1966).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks of single frames: `saturation`, `stuck` (repeated images), `timing`, `dark` (drift of darks), `lost` (beam).
 
-Noise never repeats, so an equal checksum is a frame that was delivered again. Only the alarms of `lost` end a scan by
-default.
+Noise never repeats exactly, so two frames with the same checksum are the same frame, delivered twice. Only the alarms
+of `lost` end a scan by default.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ class StuckCheck(Logged):
 
 @dataclass(frozen=True)
 class TimingState:
-    """Trigger, framestamp and time of the projection before; -1 before the first. gaps: triggers without a frame."""
+    """Trigger, framestamp and time of the previous projection; -1 before the first. gaps: number of triggers without a
+    frame."""
 
     trigger: int = -1
     framestamp: int = -1
@@ -120,7 +121,7 @@ class TimingState:
 class TimingCheck(Logged):
     """Score: delay of the frame in periods (negative: early).
 
-    Triggers without a frame before it are an INFO: the frame after the gap is as good as any.
+    If triggers before the frame gave no frame, this is only an INFO, because the frame after the gap is good.
     """
 
     name: ClassVar[str] = "timing"

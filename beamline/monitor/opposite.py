@@ -1,8 +1,9 @@
 """Check `opposite`: compares a projection with the opposite one, or with a repetition, to find motion and change.
 
-Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
-degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
-shift since. The remainder is stated as the shift of the whole sample that would leave as much.
+Parallel rays measure the same from both sides: p(angle + 180°, u) = p(angle, -u), where u is the distance from the
+axis. The check keeps a projection every few degrees. It compares it with the projection 180° later, mirrored, or 360°
+later. The best fit gives the rotation axis, and the shift of the sample in between. The remaining difference is stated
+as the shift of the whole sample that would cause the same difference.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Rules for darks and flats: saturated, without beam, uneven, never written, with beam in darks, or with the sample.
 
-Bad references spoil a volume as surely as bad views. So the same rules judge them before the first projection is taken,
-in `validate` and before a reconstruction: each frame beside its group, the other groups and the views. A new check is a
-predicate and a row in RULES.
+Bad darks and flats spoil a volume as surely as bad projections. The same rules check them before the first projection
+is taken, in `validate`, and before a reconstruction. They compare each frame with its group, with the other groups and
+with the projections. To add a rule, write a predicate and a row in RULES.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Rules that find flats with the sample in the beam, by comparing the intensity of flats and projections.
 
-Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
+These rules belong to `beamline.monitor.references`. They compare the intensities of flats and projections on a coarse
+grid, as line integrals.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Views are brighter than flats in places, and less at the edges."""
+    """Rule: projections are brighter than flats at some places, and less so at the edges."""
     if (above := _views_above_flats(evidence)) is not None:
         most = int(np.argmax(above.brightest))
         top = float(above.brightest[most])
@@ -175,7 +176,7 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """A finding where views differ from flats and from one another by noise alone."""
+    """A finding if projections differ from flats and from one another only by noise."""
     if (depth := _depth_over_air(evidence)) is None:
         return
     mean = depth.mean(axis=0)

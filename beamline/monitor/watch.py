@@ -86,7 +86,7 @@ def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
 
 
 class CheckError(Exception):
-    """A check raised; its cause is the error. `name` is the check's."""
+    """A check raised an exception, which is the cause of this error. `name`: name of the check."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the check {name} failed")

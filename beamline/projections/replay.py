@@ -105,12 +105,12 @@ class ScanVerdict:
     """The result of the monitor for a whole scan.
 
     Attributes:
-        n_frames: that were checked.
-        kinds: its flags by check and level, the worst level first.
+        n_frames: number of frames that were checked.
+        kinds: the flags by check and level, the worst level first.
         alarmed: numbers of the frames with an alarm, without those that were taken again.
         retaken: numbers of the projections that were taken again.
         references: what is wrong with darks and flats, a text for each group.
-        altered: what in the file is not as it was written; "" if all is.
+        altered: a sentence on what in the file differs from its stored checksums; "" if nothing differs.
         aside: for how many projections each check was skipped, or which checks failed with an error.
     """
 

@@ -1,12 +1,8 @@
 """Parts: a resumed scan has several files. Finds which projections each contains, and joins them in one file.
 
 The joined file is an NXtomo of this program whose pixels are virtual (HDF5 virtual datasets, as in the /exchange
-projection). It contains no frame itself, so it can be made again at any time. The files with the frames are never
+view). It contains no frame itself, so it can be made again at any time. The files with the frames are never
 written again. It records name and number of frames of each part, so that a reader can check that it has all parts.
-
-The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
-holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
-records name and number of frames of each part, so that a reader can check that it has all parts.
 """
 
 from __future__ import annotations

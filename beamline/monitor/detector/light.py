@@ -85,7 +85,8 @@ class ZingersState:
 class ZingersCheck(Logged):
     """Score: zingers of the frame over its pixels. Their number is reported once, as a fact.
 
-    The default: at 1e-4 a slice 2000 pixels wide of as many views has 400 rays with one, each a streak if it stays.
+    The default: at 1e-4, a slice with 2000 columns and 2000 projections has 400 rays with a zinger. Each zinger makes a
+    streak if it is not removed.
     """
 
     name: ClassVar[str] = "zingers"
