@@ -106,8 +106,9 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
 
     In a parallel beam, with the sample inside the field of view, moments of the projections check angles, heights,
     turned frames, total absorption and the rotation axis. In other scans, projections of the same rays are compared.
-    The moments are not checked for a part of the rows: those of Diamond 24737 above its metal indicate a range of
-    angles 14 % too large, for an unknown reason. Projections that measured only a part of their pixels are left out.
+    The moments are not checked if only a part of the rows is used: in scan 24737 of Diamond, the rows above the metal
+    indicate a range of angles that is 14 % too large, for an unknown reason. Projections that measured only a part of
+    their pixels are left out.
     """
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)

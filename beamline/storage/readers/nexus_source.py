@@ -1,7 +1,8 @@
 """NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it; base of the reader of this
 program's own files (`nxtomo`).
 
-What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
+Files are recognised by their structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry
+is.
 """
 
 from __future__ import annotations

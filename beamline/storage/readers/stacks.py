@@ -1,7 +1,7 @@
 """StacksSource: a scan with one stack of projections and others of darks and flats, such as HDF5 datasets of any
 name.
 
-Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
+Such a layout does not state when darks and flats were taken: the frames are numbered with darks first, then flats, then
 projections.
 """
 
@@ -146,7 +146,7 @@ def open_stacks(
             projections.
 
     Raises:
-        DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
+        DataError: an array does not exist, or is not a stack of frames; the message lists the datasets of the file.
     """
     file = open_array_file(path)
     with hdf5.closed_on_error(file):
@@ -216,7 +216,8 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
 
 
 def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
-    """Radians of projections in the frame of their detector, from those of CIL's object; others as they are.
+    """Angles of projections in radians, relative to the detector. CIL states the angles of its object, which are
+    converted; other angles are returned unchanged.
 
     Args:
         angles: the values of `item` in radians.

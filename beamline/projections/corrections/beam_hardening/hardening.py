@@ -113,7 +113,7 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
     intensity.
 
     Args:
-        material: a known one, or a chemical formula.
+        material: name of a known material, or a chemical formula.
         beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
             weight, in any unit; the weight includes the detector's response. Filters must be known materials,
             because their density is needed.
