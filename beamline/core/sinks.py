@@ -167,8 +167,8 @@ def _table_of_options(ended: PassEnded) -> Iterator[str]:
     if ended.remark:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
-        answer = f"beamline decide CHOICE, Enter for {one_line(ended.recommended)}"
-        yield f"Answer within {ended.wait:.0f} s: {answer}. Without an answer the scan continues as planned."
+        yield f"Answer within {ended.wait:.0f} s: beamline decide CHOICE, or Enter for {one_line(ended.recommended)}."
+        yield "Without an answer, the scan continues as planned."
 
 
 def _gain(option: Mapping[str, Any]) -> tuple[str, str]:

@@ -47,7 +47,7 @@ ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
 _KEPT = 64  # answers kept for the next client
-_NO_VERB = "An unknown command"
+_NO_VERB = "an unknown command"
 _ONLY_WATCHES = (
     "This address can only watch the scan. To control the scan, open the address that `beamline scan --page` "
     "or `beamline watch --control` prints for this purpose. Nothing was sent to the scan."

@@ -201,7 +201,8 @@ PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}
         ({}, ""),
         (
             {"wait": 30.0},
-            "Within 30 s: beamline decide CHOICE, Enter for next; otherwise as planned.\n",
+            "Answer within 30 s: beamline decide CHOICE, or Enter for next.\n"
+            "Without an answer, the scan continues as planned.\n",
         ),
         ({"remark": "No volume yet: \x1b[2J"}, "No volume yet: \\x1b[2J\n"),
     ],

@@ -156,7 +156,7 @@ def test_references_of_the_end_alone_are_taken(
             lambda said: None,
         )
     assert len(prepared.projections.data) == VIEWS
-    with pytest.raises(ConfigError, match="all projections that it was to take"):
+    with pytest.raises(ConfigError, match="all projections, darks and flats that were planned"):
         go_on(run)
 
 

@@ -56,7 +56,7 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("frame,pos", "{i},{deg}"), "", "columns are frame, pos; .* FILE::COLUMN"),
         (table("frame,theta", "{i},{deg}"), "::omega", "columns are frame, theta"),
         (table("", "{i},{deg}"), "::2", "its 2 columns have no names"),
-        (table("", "{i},{deg}"), "", "number of a view and its angle.* FILE::COLUMN"),
+        (table("", "{i},{deg}"), "", "number of a projection and its angle.* FILE::COLUMN"),
         (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; give --angles-unit"),
         ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 holds '\(empty\)'"),
         ("0 deg\n2 deg", "", "line 1 holds '0 deg'"),
@@ -98,7 +98,7 @@ def test_text_is_degrees_and_arrays_are_radians(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "# nothing\n", "0 1\n2 3\n", "zero\n"])
 def test_what_is_no_list_of_angles_is_refused(content: str) -> None:
-    with pytest.raises(DataError, match="degrees a line"):
+    with pytest.raises(DataError, match="degrees per line"):
         parse_angles(content, "a.txt")
 
 
