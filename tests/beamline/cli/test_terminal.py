@@ -122,7 +122,7 @@ EVENTS = [
         "Taking 10 dark frames (static, exposure 0.05 s",
     ),
     ("block_done", BLOCK, None),
-    ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
+    ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 extra, without a trigger"),
     ("frame", FRAME, None),
     ("progress", FIT, None),
     ("flag", {**FLAG, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
