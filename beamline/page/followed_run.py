@@ -38,7 +38,7 @@ def published(name: str, about: str, default: Any, unit: str = "") -> Any:
 class RunValues:
     """The current values of a run for control systems. Unknown numbers are NaN or -1.
 
-    Values that tomoscan (APS) also has have the same names.
+    If tomoscan (APS) has the same value, the name is the same.
     """
 
     run: str = published("Run", "folder of the run", "")
@@ -119,7 +119,7 @@ class StampedValues:
     """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
 
     Attributes:
-        began: time of values that nothing has set yet, s since the Unix epoch.
+        began: time stamp of values that were never set, in s since the Unix epoch.
         unread: why the file can no longer be read, so that its values are old; "" if it can.
     """
 

@@ -91,8 +91,8 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 def tell_damaged(
     source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn
 ) -> NDArray[np.bool_]:
-    """Report which frames are left out: unreadable ones and, if the selection says so, those that differ from their
-    checksum. Each is named in a warning.
+    """Warn of the frames that are left out: unreadable frames and, if the selection requires it, frames that differ
+    from their checksum. The warning lists the frames.
     """
     lost = np.isin(frames, sorted(source.unreadable))
     if lost.any():

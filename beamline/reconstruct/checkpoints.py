@@ -28,7 +28,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
     """The origin of a fit or a slab: checksum of its data, geometry and settings.
 
     Args:
-        prepared: line integrals and geometry; views held out do not matter.
+        prepared: line integrals and geometry; held-out projections have no effect.
         settings: of the fit, or a method: a dataclass.
         others: seed, start and similar values, by name.
     """
@@ -72,8 +72,8 @@ class CheckpointOptions:
     """The checkpoint files of a fit: where to write, and which to resume from.
 
     Attributes:
-        path: to write; None: no checkpoint.
-        resume: to resume from; None: begin anew.
+        path: checkpoint to write; None: no checkpoint.
+        resume: checkpoint to resume from; None: start from the beginning.
     """
 
     path: Path | None = None
@@ -98,11 +98,11 @@ class CheckpointOptions:
 
         Args:
             origin: of the fit, see `origin_of`.
-            steps: planned number; 0 if a time is planned.
+            steps: planned number of steps; 0 if a time limit is planned.
             warn: takes a sentence if the plan differs, so that the volume differs from that of an uninterrupted fit.
 
         Raises:
-            ConfigError: the fit has more steps behind it than planned.
+            ConfigError: the fit has already made more steps than planned.
             DataError: the checkpoint was made from something else.
         """
         if self.resume is None:

@@ -131,8 +131,8 @@ class AxisSearch:
         self._next, self._turned, self._told = _FIRST_VIEWS, 0.0, False
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Search the axis in these views (rows of the file), if it is time. While the scan runs, only a clear optimum
-        counts.
+        """Search the axis in these projections (rows of the file), if a search is due. While the scan runs, only a
+        clear optimum is accepted.
 
         Raises:
             DataError: the scan has ended, and no axis is found.
@@ -169,9 +169,11 @@ _NO_GAIN = "The improvement by further projections is not predicted"
 
 
 class PassLaws:
-    """Measures the law of the error at the end of each pass, once all usable views until then are corrected.
+    """Measures at the end of each pass how the error of the volume depends on the number of projections (the law of the
+    error), once all usable projections until then are corrected.
 
-    A pass whose law is not measured yet when the next one ends is left out: only the newest law is of use.
+    If the next pass ends before the law of a pass is measured, this pass is left out, because only the newest law is
+    used.
     """
 
     def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
@@ -182,8 +184,9 @@ class PassLaws:
     def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
         """Measure and report the law at the end of the newest pass, unless this was done already.
 
-        It is measured on ordinary views. Where there are wide ones, the density beside the field is known, and the
-        offset of the law is 0. What prevents a law becomes a warning, and the reason in an event without its numbers.
+        The law is measured on ordinary projections. If there are also laterally offset projections, the density outside
+        the field of view is known, and the offset of the law is 0. If no law can be measured, a warning gives the
+        reason, and an event has the reason instead of the numbers.
         """
         ends = self._views.source.table.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:

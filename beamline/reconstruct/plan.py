@@ -1,4 +1,4 @@
-"""Plans a reconstruction: memory, disk and slabs, and errors if they do not suffice.
+"""Plans a reconstruction: memory, disk space and slabs, and raises an error if memory or disk space are not enough.
 
 A run follows the plan that its dry run states.
 """
@@ -110,13 +110,13 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
 
 
 def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepared: PreparedProjections) -> ReconPlan:
-    """The plan for the views after reading.
+    """The plan for the projections after they were read.
 
     Args:
-        plan: before they were.
+        plan: the plan from before they were read.
 
     Raises:
-        DataError: the volume does not fit, as its axis was found near an edge.
+        DataError: the volume does not fit into the memory, because its axis was found near an edge.
     """
     geometry = prepared.geometry
     method, shares = options.method, prepared.shares
@@ -148,7 +148,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
 
 
 def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
-    """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
+    """Raise DataError or ConfigError if the geometry of all projections does not allow the reconstruction, once the
+    axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.volumes > 1:
@@ -257,7 +258,8 @@ def prepare_within(
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
-    """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
+    """[view] time in s at which each of these projections was exposed; if the file states no times, they are evenly
+    spaced in the order of the file."""
     seconds = source.table.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
@@ -273,7 +275,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     """Check all that can be checked without reading a frame.
 
     Returns:
-        The truth [z, y, x] that the volume is to be compared with; None without one.
+        The ground truth [z, y, x] with which the volume is compared; None without a ground truth.
 
     Raises:
         ConfigError, DataError: a check failed; nothing was written.

@@ -70,7 +70,7 @@ def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
     """Subtract the part of the sample outside the volume from the projections, in place, so that the volume and FBP are
-    compared with the rest. Does nothing if nothing is known outside.
+    compared with the rest. Does nothing if nothing is known about the sample outside.
     """
     if made.outside is None:
         return prepared
@@ -152,7 +152,7 @@ def refuse_impossible(options: ReconOptions) -> None:
 
 
 def refuse_views(method: Method, geometry: Geometry) -> None:
-    """Raise ConfigError before any work if these views do not allow error bars."""
+    """Raise ConfigError before any work if error bars cannot be computed from these projections."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
             f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
@@ -193,7 +193,7 @@ def deviation_by_slabs(
     """The standard deviation of each voxel, stored on the output's disk, of a volume on disk; None if `control` stopped
     it.
 
-    The slab with most matter comes first, and the others follow its decisions.
+    The slab with the most material comes first, and the other slabs use its decisions.
     """
     grid = Grid.matching(prepared.geometry)
     parts = slabs_of(grid.shape[0], slabs[0].own.stop, max(method.halo, HALO))

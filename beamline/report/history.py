@@ -63,7 +63,8 @@ class ResidualCurve:
 
 
 def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve | None:
-    """The residual of the views held out, if there are any, else of the views used; None if neither was recorded."""
+    """The residual of the held-out projections, if there are any, otherwise of the projections used; None if neither
+    was recorded."""
     name = next((name for name in _WORDS if name in arrays and np.isfinite(arrays[name]).any()), None)
     if name is None:
         return None
@@ -75,7 +76,7 @@ def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve 
 
 
 def views_grew(made: Reconstruction) -> bool:
-    """Whether the number of views grew during the fit."""
+    """True if the number of projections grew during the fit."""
     return len({progress.n_views for progress in made.history}) > 1
 
 

@@ -41,7 +41,8 @@ class PictureRow:
 
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
-    """The rows as PNG, without axes and layout, which would take ten times as long: it is drawn during the fit."""
+    """The rows as PNG. Axes and layout are left out, because they would take ten times as long, and the picture is
+    drawn during the fit."""
     from PIL import Image, ImageDraw
 
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP

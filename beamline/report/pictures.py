@@ -148,7 +148,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     """Profile of each volume through the sharpest edge of the last one, and a histogram of its values.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
-    voxel. So single noisy voxels are no edges.
+    voxel. Therefore single noisy voxels do not count as edges.
     """
     from matplotlib.ticker import MaxNLocator, NullFormatter
 

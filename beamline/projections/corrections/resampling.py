@@ -67,7 +67,7 @@ class TiltAndLens:
     Attributes:
         tilt: degrees of the axis in the detector's plane; the axis's column grows by tan(tilt) per row. "auto": it
             is searched for. None: it is unknown, and projections are used as they are.
-        distortion: of the lens; None: none.
+        distortion: distortion of the lens; None: no correction.
     """
 
     name: ClassVar[str] = "tilt"
@@ -164,7 +164,7 @@ def with_tilt(
         progress: takes how many bands of rows were corrected, and how many there are at most.
 
     Raises:
-        ConfigError: a cone.
+        ConfigError: the scan has a cone beam.
         DataError: the projections do not determine the tilt.
     """
     from beamline.projections.tilt import MATTERS, tilt_text

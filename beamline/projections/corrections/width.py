@@ -108,8 +108,8 @@ class Width:
         """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:
-            ConfigError: a readout arc in a cone beam, or for projections that roll or tilt or may do so: each row
-                then has angles of its own.
+            ConfigError: a readout arc in a cone beam, or for projections that are or may be rolled or tilted, because
+                each detector row then has different angles.
         """
         from recon.base.ray_width import RayWidth
 
