@@ -1,7 +1,7 @@
 """Bluesky documents (event-model) of a scan. Its frames stay in this program's file; a stream datum announces new
 rows.
 
-One index is one row of the file, darks and flats included. A trigger without a frame is no index.
+Each index is one row of the file, including darks and flats. A trigger without a frame has no index.
 """
 
 from __future__ import annotations

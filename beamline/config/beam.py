@@ -87,7 +87,8 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter that has only names: simulated without an effect on the intensity, or changed by the operator."""
+    """A filter of which only the names of the positions are known: simulated without an effect on the intensity, or
+    changed by the operator."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Setting(min_length=1)]
@@ -222,7 +223,7 @@ class _Monochromator(Section):
 
 
 class SceneMonochromator(_Monochromator):
-    """Sets the energy of the simulated beam, which starts at that of the scene."""
+    """Sets the energy of the simulated beam; at first it is the energy of the scene."""
 
     kind: Literal["simulated"]
     settle_s: float = setting(1.0, "Time that each move takes.", ge=0, le=1e6)

@@ -88,7 +88,7 @@ class _Orca(Section):
     )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        """What the camera will say of its timing. ValueError for what it would refuse."""
+        """The timing that the camera will report. Raises ValueError for settings that it would refuse."""
         return orca_quest.timing(wanted, model=self.model)
 
 

@@ -105,7 +105,7 @@ Column = Annotated[float, Setting(ge=-1e7, le=1e7)]
 
 
 class Fields(Section):
-    """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
+    """Darks or flats: how many at each time, and their own exposure (null: the exposure of the scan)."""
 
     count: int = setting(10, ge=0, le=1_000_000)
     at: Place = Place.START

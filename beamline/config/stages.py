@@ -1,7 +1,7 @@
 """Configuration of the rotation stage: one section per kind of stage, with the keys that its settings declare.
 
-Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
-folder says.
+To add a stage, add its folder `drivers/stages/<kind>` with a module `stage` that contains the driver; DRIVERS in the
+folder names the driver.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Flag: what a check of the monitor says of a frame, which the event `flag` carries; finding: what a rule says of a
+"""Flag: result of a check of the monitor on one frame, which the event `flag` carries; finding: result of a rule on a
 scan."""
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     interlaced plans do. The lattice step, not each angle, is rounded: a trigger output counts a fixed distance.
 
     Raises:
-        ValueError: one sentence that says why the plan cannot be flown.
+        ValueError: the plan is not possible as a fly scan; one sentence states why.
     """
     if angles.size < 2:
         raise ValueError(
@@ -152,7 +152,7 @@ class PlanFacts:
 
 
 def violations(facts: PlanFacts) -> Iterator[str]:
-    """One sentence for each broken limit."""
+    """One sentence for each violated limit."""
     plan = facts.plan
     if plan.mode is Mode.FLY:
         yield from _timing(facts)

@@ -72,7 +72,7 @@ class Passes:
 
 
 def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
-    """A sentence on who ended a scan before its plan, and why; "" if nobody did.
+    """A sentence on who ended a scan before the end of its plan, and why; "" if nobody did.
 
     Args:
         decisions: values of the events `next_chosen`, oldest first.
@@ -97,9 +97,10 @@ def triggers_to_take(*blocks: Block) -> frozenset[int]:
 
 
 def passes_at_start(views: Block, size: int, choices: Iterable[str], offset: Iterable[Block] = ()) -> Passes:
-    """The passes of a scan at the end of its first one, or, after these choices, of the one that it resumes.
+    """The passes of a scan at the end of its first pass, or, after these choices, at the end of the pass that it
+    resumes.
 
-    Its passes are those of the whole plan, also where earlier files have some of their views.
+    The passes are those of the whole plan, even if earlier files contain some of their projections.
 
     Args:
         size: frames of a pass, as of `pass_blocks`.

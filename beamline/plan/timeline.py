@@ -1,9 +1,9 @@
 """Timeline: speeds, times and sizes of a plan with one stage and one camera, as values and as lines for the operator.
 
-Darks then flats come before the views; offset views, flats, then darks after them. A fly scan turns at step /
-period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
-to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return at
-full speed between them.
+Darks and then flats come before the projections; offset projections, flats and then darks come after them. In a fly
+scan the stage rotates at step / period, rounded to whole counts per second (the block of projections has this period).
+It starts far enough before the first pulse to reach this speed (`taxi_angle`), and stops as far behind the last pulse.
+All passes have the same direction, and the stage returns at full speed between them.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ class Acquisition:
         timeline: without violations.
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
-        sink: takes `BlockStarted`, `BlockDone` and warnings.
-        supervision: what may pause the scan, or end it before its first projection, and gets its states.
+        sink: gets the events `BlockStarted` and `BlockDone`, and warnings.
+        supervision: callbacks that may pause the scan, or end it before its first projection; they get its states.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Acquisition:
         Raises:
             LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
             ScanStopped: a stop was requested, and the scan has ended in order.
-            ReferencesError: no projection was taken, because supervision refused them.
+            ReferencesError: no projection was taken, because supervision found that darks or flats cannot be used.
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """

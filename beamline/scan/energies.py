@@ -1,6 +1,6 @@
 """Energies: a series of scans of one sample, one per energy, in one folder; the series can be continued later.
 
-Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
+Each scan has an ordinary run folder within the folder of the series, so that every program that reads runs can read it.
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ def run_energies(
         place: the folder in which the series gets its own; None: the configured one.
         stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
         commands: of the reconstruction of each scan.
-        series: the folder of a series that is continued: complete scans stay, one that ended early is continued.
+        series: the folder of a series to be continued: complete scans are kept, and a scan that ended early is
+            continued.
 
     Raises:
         ConfigError: a limit is exceeded at one of the energies; nothing has moved. What `run_scan` raises: the scans

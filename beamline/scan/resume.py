@@ -57,11 +57,12 @@ class ResumableRun:
         parts: its files so far, each with at least one frame.
         views: planned projections that are in these files, or that the scan decided to omit.
         planned: projections of the whole plan.
-        offset: triggers of the offset projections in these files; offset_missing: how many the plan still has.
-        choices: after each pass that ended in them, oldest first.
-        choice_due: the last pass ended, and nothing was chosen yet.
+        offset: triggers of the offset projections in these files; offset_missing: number of planned offset projections
+            that are missing.
+        choices: the choice after each pass that ended in these files, oldest first.
+        choice_due: True if the last pass has ended and no choice was made yet.
         seconds: duration of the files, from the first frame of each to its last one.
-        retaken: projections that they took again, in place of others.
+        retaken: projections in these files that were taken again and replace others.
         end_references: missing kinds of darks and flats after the projections, if no projection is missing; None if
             some are.
         last_frame_time: time of the last frame, s since the Unix epoch.
@@ -146,11 +147,11 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
     """A context that locks the run in this folder, so that no other process can resume it.
 
     Args:
-        given: a configuration that must be the run's.
+        given: a configuration that must equal that of the run.
 
     Raises:
-        ConfigError: it is not a run, another process is working on it, or its configuration differs. NothingMissing,
-            NoFrame, or NotJoined if only `recover_run` is needed.
+        ConfigError: the folder is not a run, another process is working on it, or its configuration differs.
+            NothingMissing, NoFrame, or NotJoined if only `recover_run` is needed.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
@@ -285,14 +286,14 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     The record of a run whose process was killed then gets the state of its newest file.
 
     Args:
-        say: takes a sentence on the disk space that each needs, before anything is written to it.
+        say: function that gets a sentence on the disk space that each file needs, before anything is written.
 
     Returns:
         The result for each file, and a sentence on each part that was left out.
 
     Raises:
         ConfigError: a process is taking, recovering or continuing the run.
-        DataError: no run, or a part that cannot be recovered; those before it are recovered.
+        DataError: the folder is not a run, or a part cannot be recovered; the parts before it are recovered.
     """
     with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on copies of its files
         files, left_out = _files(run)

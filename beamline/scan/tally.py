@@ -36,11 +36,13 @@ class BlockTally:
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, whose expected frame did not come.
-        lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
+        lost, ignored: numbers of missing frames that were exposed but not delivered, and that were not exposed, if
+        known.
         extra: frames that no trigger exposed.
         unconfirmed: of the extra ones, those exposed while the stage braked.
-        shift, off: the largest of the passes, see `Ledger`.
-        astray: by trigger, of the frames exposed while the stage was not at its angle, the row and where it was, rad.
+        shift, off: the largest values of all passes, see `Ledger`.
+        astray: for frames exposed while the stage was not at its planned angle: by trigger, the row and the actual
+            angle in rad.
     """
 
     block: Block
@@ -82,7 +84,8 @@ def missing_views(done: Iterable[BlockTally]) -> tuple[int, ...]:
 
 
 def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
-    """These views have a frame: they are not missing, if they were. Returns how many were."""
+    """Record that these projections now have a frame and are no longer missing; returns how many of them were
+    missing."""
     came = [(taken, i) for taken in first_taken(done) for i in {*taken.missing}.intersection(triggers)]
     for taken, trigger in came:
         taken.missing.remove(trigger)

@@ -1,8 +1,8 @@
 """Web application of the page: its files, the stream of events, image tiles, and commands for authorised users.
 
-A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
-host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the
-token for acting in a header. No data of a client reach the file system.
+Any other page that is open in the browser can send requests to this server. Therefore each request must name one of our
+hosts and carry the viewing token (a cookie). Actions are POST requests from our own origin, with the control token in a
+header. No data from a client reach the file system.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """Host names and tokens of a page: who may look, and who may act."""
+    """Host names and tokens of a page: who may watch, and who may control the scan."""
 
     hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
@@ -257,7 +257,8 @@ class _Server:
         return self._reader.do(kept)
 
     def model(self, request: Request) -> Response:
-        """The live picture: newest view, the volume seen from there, their difference in noise."""
+        """The live picture: the newest projection, the projection of the volume at the same angle, and their difference
+        in units of the noise."""
         run, picture = self._reader.what.run, b""
         if run is not None:
             with suppress(OSError):
@@ -265,7 +266,7 @@ class _Server:
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
     async def verb(self, request: Request) -> Response:
-        """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
+        """Send a command to the run immediately, even if all threads that answer other requests are busy."""
         folder, act = self._reader.what.folder, self._access.act
         client = request.client.host if request.client else "?"
         verb = next((verb for verb in (*Verb, *Choice) if verb == request.path_params["verb"]), None)

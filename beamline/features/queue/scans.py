@@ -89,15 +89,14 @@ def load_queue(
 ) -> tuple[Config, ...]:
     """The scans of these configurations and tables, in their order.
 
-    A table is a CSV file. Its first line names the column `config`, the file of a configuration (relative to the
-    table), and keys of configurations, whose values go before those of the file; an empty cell changes nothing.
+    A table is a CSV file. Its first line names the columns: `config` for the file of a configuration (relative to the
+    table), and keys of configurations, whose values replace those of the file. An empty cell changes nothing.
 
     Args:
-        overrides: of all scans, after those of a table.
-        rehearse, no_live: as of `load`.
+        overrides: overrides for all scans; they take precedence over those in a table. rehearse, no_live: as of `load`.
 
     Raises:
-        ConfigError: every scan that cannot be, with what is wrong. Nothing was started.
+        ConfigError: scans are impossible; the message lists each of them with its fault. Nothing was started.
     """
     scans, faults = [], []
     for file in files:
@@ -149,9 +148,9 @@ class QueueNeeds:
 
     Attributes:
         scans: by name.
-        duration: s for all, without changing samples.
-        total_bytes: of the files of all.
-        free_bytes: of the fullest disk.
+        duration: total time in s, without changing samples.
+        total_bytes: size of all files.
+        free_bytes: free space on the fullest disk.
     """
 
     scans: Sequence[tuple[str, DryRun]]
@@ -197,7 +196,7 @@ def queue_needs(queue: Sequence[Config], place: Path | None) -> QueueNeeds:
     """Compute the needs of a queue without devices; `place` as in `run_scan`.
 
     Raises:
-        ConfigError: of the first scan that cannot be worked out, with its name.
+        ConfigError: a scan cannot be planned; the message names the first such scan.
     """
     scans = []
     for config in queue:
@@ -216,12 +215,13 @@ def run_queue(
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
-    """Run the scans of a queue. After a failed one the next follows, unless `stop_on_failure`.
+    """Run the scans of a queue. If one fails, the next one still runs, unless `stop_on_failure`.
 
-    It ends where somebody stopped a scan (Ctrl-C, a signal, `beamline stop`), and where an instrument did not obey.
+    The queue ends if the operator stops a scan (Ctrl-C, a signal, `beamline stop`), or if a device does not respond.
 
     Args:
-        take: takes a scan, the n-th from 0 on, tells its events to the last argument, and raises what `run_scan` does.
+        take: function that runs a scan, given its number from 0 on; it sends its events to its last argument, and
+            raises the errors of `run_scan`.
     """
     outcomes: list[ScanOutcome] = []
     ended = ""

@@ -162,7 +162,7 @@ class SweptScan(TrialScan):
         return self._views[2]
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """The residual of the views held out, as this trial corrects them, and its square in each."""
+        """The residual of the held-out projections, as this trial corrects them, and its square in each projection."""
         used = self._used
         assert used is not None and used.held_out is not None and used.held_out_ids is not None and self._views
         projector, data = Projector(used.held_out.geometry, made.grid), used.held_out.data
@@ -176,10 +176,10 @@ class SweptScan(TrialScan):
         return {HELD_OUT: left.residual}, left.left.tolist()
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with scores in place of residuals by each trial's own views, with verdicts and remarks.
+        """The table with scores instead of the residuals in each trial's own projections, with verdicts and remarks.
 
         Raises:
-            DataError: no slice was made, or the views held out show nothing.
+            DataError: no slice was made, or the held-out projections show no sample.
         """
         if not table.compared:
             raise DataError(f"No slice was made. Reason for the first one: {table.outcomes[0].message}.")
@@ -213,9 +213,10 @@ class SweptScan(TrialScan):
 
 
 def middle_axis(selections: Sequence[Selection]) -> float | None:
-    """The axis used to correct all views if the axis itself is swept; None if it is not.
+    """The axis with which all projections are corrected if the axis itself is swept; None if it is not swept.
 
-    Corrections look at views on both sides of the axis: with each its own, some would correct and others not.
+    Some corrections compare projections on both sides of the axis. If each trial used its own axis, some trials would
+    apply such a correction and others would not.
     """
     axes = sorted(each.axis_col for each in selections if each.axis_col is not None)
     return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
@@ -235,17 +236,18 @@ def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProje
 
 
 def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tuple[TrialChoice, bool] | None:
-    """How well each slice's volume predicts views held out, as shares of these; and whether all options give the same
-    views. None if slices differ in pixels, or in their views held out.
+    """The residual of each slice's volume in the held-out projections, as a fraction of these projections, and True if
+    all options give the same projections. None if slices differ in their pixels or in the held-out projections.
 
-    A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
-    compared with them as every value corrects them, and the mean counts.
+    A correction also changes the held-out projections: if it smooths, its volume would be compared with smoother
+    projections. Therefore each volume is compared with the held-out projections as every value corrects them, and the
+    mean is the score.
 
     Args:
         direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
 
     Raises:
-        DataError: the views held out show nothing.
+        DataError: the held-out projections show no sample.
     """
     common = reduce(np.intersect1d, (each.ids for each in slices.values()))
     if len({each.model.shape[1:] for each in slices.values()}) > 1 or not common.size:
@@ -265,7 +267,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
 
 
 def shares_of(choice: TrialChoice) -> list[float]:
-    """[candidate] the residual of all views held out, as in `recon.judgement`."""
+    """[candidate] the residual in all held-out projections, as in `recon.judgement`."""
     return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
 
 

@@ -217,7 +217,8 @@ def _mark(table: TrialTable, outcome: Outcome) -> tuple[str, str]:
 
 
 def quality_plot(table: TrialTable) -> bytes:
-    """Quality against time, memory and dose as PNG: a colour a method, and a line along the front of time."""
+    """Quality against time, memory and dose as PNG: one colour per method, and a line along the Pareto front of
+    time."""
     shown = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
     floor = max(outcome.quality(table.by) for outcome in shown) - _SHOWN_DB
     figure = new_figure((WIDTH, 4.2))
