@@ -109,8 +109,11 @@ recon_options = together(
         "--max-residual",
         type=NOT_NEGATIVE,
         metavar="X",
-        help="Largest acceptable residual, as a share of the measured projections: above it the command ends with exit "
-        "code 6. The held-out projections count, if there are any. Default: no limit.",
+        help=(
+            "Largest acceptable residual, as a fraction of the measured projections. If the residual is larger, the "
+            "command ends with exit code 6. If there are held-out projections, their residual is used. Default: no "
+            "limit."
+        ),
     ),
     heading(METHOD),
     seed_option,
@@ -210,7 +213,7 @@ recon_options = together(
         of_one_call=True,
         is_flag=True,
         hidden=True,
-        help="Stop when stdin closes, that is, with the process that started this one.",
+        help="Stop when stdin closes, that is, when the process that started this one ends.",
     ),
     heading(OUTPUT),
     json_option,

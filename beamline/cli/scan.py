@@ -61,7 +61,7 @@ class ScanRequest:
         "--documents",
         metavar="FILE|tcp://HOST:PORT",
         type=click.Path(dir_okay=False),
-        help="Write bluesky documents: append them to FILE, one document a line, or send them to the 0MQ "
+        help="Write bluesky documents: append them to FILE, one document per line, or send them to the 0MQ "
         "proxy at HOST:PORT. "
         'Needs: pip install "splatline[bluesky]".',
     )

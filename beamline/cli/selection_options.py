@@ -46,15 +46,20 @@ scan_options = together(
         "--angles",
         of_one_call=True,
         type=_PATH,
-        help="File with the angles in degrees: a text file with one angle a line, a table with a column for them, "
-        ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). Default: "
-        "the angles in the scan file.",
+        help=(
+            "File with the angles in degrees: a text file with one angle per line, a table with a column for them, "
+            ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). "
+            "Default: the angles in the scan file."
+        ),
     ),
     option(
         "--angle-rows",
         of_one_call=True,
         metavar="A:B",
-        help="Lines of --angles that belong to the projections, from A up to, not including, B. Default: all.",
+        help=(
+            "Lines of --angles that belong to the projections: from line A up to, but not including, line B. "
+            "Default: all."
+        ),
     ),
     option(
         "--darks",

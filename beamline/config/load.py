@@ -46,7 +46,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
-NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so it follows its plan."
+NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
 """For the operator of such a run, where it would decide otherwise."""
 
 

@@ -217,7 +217,7 @@ class StorageSection(Section):
     preview_bin: int = setting(4, gt=0, le=10_000)
     flush_every: int = setting(
         16,
-        "Largest number of frames that are flushed together while others wait to be written; otherwise "
+        "If frames wait to be written, at most this number of frames is flushed to the file together; otherwise "
         "each frame is flushed at once.",
         gt=0,
         le=1_000_000,
@@ -225,10 +225,17 @@ class StorageSection(Section):
 
 
 class ReconSection(Section):
-    live: bool = setting(True, "Make a volume during the scan; with a method that needs the whole scan, after it.")
+    live: bool = setting(
+        True,
+        (
+            "Reconstruct a volume during the scan. If the method needs the whole scan, the volume is reconstructed "
+            "after the scan."
+        ),
+    )
     method: MethodName = setting(
         DEFAULT,
-        "r2 makes a volume that grows during the scan; the others need the whole scan. auto: as in `beamline recon`.",
+        "r2 makes a volume that grows during the scan; all other methods need the whole scan. auto: the method "
+        "is chosen as by `beamline recon`.",
     )
     seconds: Seconds = setting(
         1800.0,
@@ -316,7 +323,9 @@ class Config(Section):
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
         texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
-            raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+            raise ValueError(
+                f"scan.energies lists {twice[0]} keV twice (compared to seven digits); give each energy once"
+            )
         return self
 
     @model_validator(mode="after")

@@ -165,7 +165,7 @@ class MassCheck(Logged):
     )
 
     warn: float = setting(0.03, "relative change of the total absorption", ge=0)
-    frames: int = setting(3, "projections in a row that must exceed the limit", ge=1)
+    frames: int = setting(3, "number of consecutive projections that must exceed the limit", ge=1)
 
     start = MassState
 

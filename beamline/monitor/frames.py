@@ -82,7 +82,7 @@ class StuckCheck(Logged):
     name: ClassVar[str] = "stuck"
     bit: ClassVar[int] = 2
     unit: ClassVar[str] = "repetitions"
-    meaning: ClassVar[str] = "the image is identical to the one before: the camera delivered a frame twice"
+    meaning: ClassVar[str] = "the image is identical to the previous image: the camera delivered a frame twice"
 
     start = StuckState
 
@@ -185,7 +185,7 @@ class DarkCheck(Logged):
     unit: ClassVar[str] = "counts of drift"
     meaning: ClassVar[str] = "a dark differs from the first one"
 
-    drift: float = setting(5.0, "counts by which a dark may differ from the first one", ge=0)
+    drift: float = setting(5.0, "counts by which a dark may differ from the first dark", ge=0)
 
     start = DarkState
 

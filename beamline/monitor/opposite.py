@@ -98,7 +98,9 @@ class OppositeCheck(Logged):
     meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
     warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
-    changed: float = setting(1.0, "pixels by which parts may differ, as an equivalent shift of the whole sample", ge=0)
+    changed: float = setting(
+        1.0, "pixels by which the whole sample would have to shift to cause the same difference in parts of it", ge=0
+    )
     axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
 
     start = OppositeState

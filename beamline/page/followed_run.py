@@ -76,7 +76,7 @@ class RunValues:
         "OptionDoses", "dose of each of Options, as a share of the plan's dose", (), "%"
     )
     option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
-    recommended: str = published("Recommended", "the one of Options that the program chooses or would choose", "")
+    recommended: str = published("Recommended", "the choice in Options that the program makes or would make", "")
     wait: float = published(
         "AnswerWithin",
         "time left for the operator to decide what is next; 0: the scan does not wait for a decision",

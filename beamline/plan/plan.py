@@ -223,9 +223,8 @@ def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.ran
 def pass_order(passes: int) -> NDArray[np.intp]:
     """The order in which the gaps of the first pass are filled: a permutation of 0 ... passes - 1.
 
-    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, leaving
-    out values of `passes` or more.
-    Therefore each pass falls near the middle of the largest remaining gap, for any number of passes.
+    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, leaving out values of
+    `passes` or more. Therefore each pass falls near the middle of the largest remaining gap, for any number of passes.
     """
     _require(passes)
     bits = (passes - 1).bit_length()

@@ -149,7 +149,7 @@ def _refuse_beyond(region: Region, width: int, whose: str) -> None:
     """Raise ConfigError for voxels beyond a volume that is `width` voxels wide."""
     for name, (first, end) in (("y", region.y), ("x", region.x)):
         if end > width:
-            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in {whose} 0:{width}.")
+            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie within {whose} range 0:{width}.")
 
 
 def _widest(source: ScanSource, selection: Selection) -> int:

@@ -285,9 +285,9 @@ class Measurement:
             return None
         return (
             "Stopped before the first projection, because the darks or flats cannot be used. "
-            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks "
-            "and flats are in the file. Fix this, check a few frames and the exposure with `beamline "
-            "tune`, and start the scan again. To scan anyway, set references.on_fault: log."
+            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks and flats "
+            "are in the file. Fix the fault, check a few frames and the exposure with `beamline tune`, and "
+            "start the scan again. To scan anyway, set references.on_fault: log."
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:

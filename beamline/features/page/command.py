@@ -33,7 +33,7 @@ port_option = click.option(
     default=PORT,
     show_default=True,
     type=WholeRange(0, 65535),
-    help="Port of the page. If it is in use, the next free one.",
+    help="Port of the page. If the port is in use, the next free port is used.",
 )
 bind_option = click.option(
     "--bind",

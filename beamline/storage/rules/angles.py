@@ -127,9 +127,9 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
         return (
-            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} "
-            "in radians. These look like degrees that are labelled as radians. If so, give them with "
-            "--angles FILE (degrees, one per line)."
+            f"The stated angles of {angles.size} projections span {np.ptp(distinct) / 360:.1f} turns "
+            f"({np.ptp(angles):.5g} rad). These angles look like degrees that are labelled as radians. If so, "
+            "give them with --angles FILE (degrees, one per line)."
         )
     if between >= 360:
         return (

@@ -151,7 +151,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         )
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise DataError(
-            f"{path} was changed: facts that volumes of this program have are missing "
+            f"{path} was changed by another program: metadata that every volume of this program has are missing "
             f"({type(error).__name__}: {error})."
         ) from error
 
