@@ -309,7 +309,7 @@ OF_MOTION = (
     FaultElsewhere(
         'step scan: moved after it had arrived (another program, the panel, a hunting servo, a "done" that comes '
         "too early)",
-        "its frame was exposed while the stage was not at its",
+        "its frame was exposed while the stage was not at the planned angle",
         ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
     ),
     FaultElsewhere(
