@@ -251,7 +251,7 @@ def _steady(
         "filter changed, or projections of another scan are among them. Use --views to choose "
         "projections that belong together, or --air to state which columns are air."
     )
-    return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
+    return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "in line integral", sentence)
 
 
 def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
@@ -287,7 +287,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
             f"up to {most:+.1%} in total absorption, but {because}. Something else stood in the beam, or "
             "the intensity is wrong. --views leaves projections out."
         )
-        return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the mass", sentence)
+        return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the total absorption", sentence)
     sentence = (
         f"The total absorption changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%} during the "
         f"scan (lowest in frame {frames[shown.mass.argmin()]}, highest in frame "
@@ -295,7 +295,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         "projections belong to another scan, exposure or flat field? Use --views to choose projections "
         "that belong together (every:2 if two intensities alternate), or --volumes if the sample changes."
     )
-    return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the mass", sentence)
+    return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the total absorption", sentence)
 
 
 def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
@@ -306,14 +306,14 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
         mean += weight * data[view]
     roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
-        return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
+        return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of tilt", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
         "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis seems to be "
         f"tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} px over {rows} "
         "rows. Without this correction, edges are doubled in the first and last slices."
     )
-    return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
+    return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of tilt", sentence)
 
 
 def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
@@ -439,4 +439,6 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for "
                 "a part of the scan."
             )
-    return ConsistencyCondition("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
+    return ConsistencyCondition(
+        "views of the same rays", worst, 1.0, "times the smallest change that is reported", sentence
+    )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _FIELDS = {f.name: f.type for f in fields(Progress) if f.name != "unit"}  # figures
-_WORDS = {"held_out": "views held out", "residual": "views used"}
+_WORDS = {"held_out": "held-out projections", "residual": "projections used"}
 
 
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
@@ -47,7 +47,7 @@ class ResidualCurve:
     """The residual that measures the quality of a fit, against time.
 
     Attributes:
-        views: the views of the residual: "views held out" or "views used".
+        views: the projections of the residual: "held-out projections" or "projections used".
         seconds, residuals: [measurement].
     """
 

@@ -78,7 +78,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     ticks = MaxNLocator(7, steps=[1, 1.5, 2, 3, 4.5, 6, 9, 10]).tick_values(angles[0], angles[-1])
     ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
     axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
-    finish(axes, "column (px)", "angle (°)", f"Sinogram of row {row}, {len(order)} views")
+    finish(axes, "column (px)", "angle (°)", f"Sinogram of row {row}, {len(order)} projections")
     add_bar(figure, image, "line integral")
     return png(figure)
 

@@ -122,12 +122,12 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     looked_at = views if every else spread(views, VIEWS)
     unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.unlit(row)]
     if unlit:
-        of = f"{views.size} views" if every else f"{looked_at.size} views looked at"
+        of = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
         more = "" if every else " `validate --deep` checks all projections."
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {of} ({frames_text(unlit)}) without beam: the shutter was closed, the beam was lost, or "
+            f"{len(unlit)} of {of} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was lost, or "
             f"these frames were never written. `beamline recon` does not use such projections.{more}",
         )
 
