@@ -91,8 +91,9 @@ def choose(
 
     Args:
         offered: the possible choices, with known improvements.
-        remaining: the improvement by the rest of the plan, see `remaining_gain`. seconds, dose: time and dose of the
-        scan so far, including what follows the passes in any case: offset projections, darks and flats.
+        remaining: the improvement by the rest of the plan, see `remaining_gain`.
+        seconds, dose: time and dose of the scan so far, including what follows the passes in any case: offset
+            projections, darks and flats.
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (

@@ -26,8 +26,8 @@ class KindStatistics:
     """Statistics of the pixel values of one kind of frame.
 
     Attributes:
-        frames: number of frames that were examined, out of `of` frames. minimum, maximum, mean, deviation: of all their
-        finite pixels.
+        frames: number of frames that were examined, out of `of` frames.
+        minimum, maximum, mean, deviation: of all their finite pixels.
         percentiles: percentiles at PERCENT, exact to one count, or, for real numbers, to 1/65536 of their range.
         saturated: fraction of the pixels that have the largest value of their type; 0 for real numbers.
         not_finite: fraction of the pixels that are not finite.

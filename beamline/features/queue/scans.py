@@ -93,7 +93,8 @@ def load_queue(
     table), and keys of configurations, whose values replace those of the file. An empty cell changes nothing.
 
     Args:
-        overrides: overrides for all scans; they take precedence over those in a table. rehearse, no_live: as of `load`.
+        overrides: overrides for all scans; they take precedence over those in a table.
+        rehearse, no_live: as of `load`.
 
     Raises:
         ConfigError: scans are impossible; the message lists each of them with its fault. Nothing was started.

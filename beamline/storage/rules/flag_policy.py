@@ -30,9 +30,10 @@ class FlagPolicy:
     """How the flagged projections of a scan are treated.
 
     Attributes:
-        flags: the flags of all frames that are used here. views, left_out, halved, masked: bool [frame of the file]:
-        the projections; projections with an alarm, which are left out; projections with a warning, which have half the
-        weight; projections flagged in a region, whose rays have less weight there.
+        flags: the flags of all frames that are used here.
+        views, left_out, halved, masked: bool [frame of the file]: the projections; projections with an alarm, which are
+            left out; projections with a warning, which have half the weight; projections flagged in a region, whose
+            rays have less weight there.
         jumps: int64, ascending, the first rows after each jump of the sample that the monitor reported.
         parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
     """
