@@ -263,8 +263,10 @@ _BEFORE = (
         "--rows",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector rows to use, from FIRST up to, not including, END, counted from 0. The volume has one slice per "
-        "row. Default: all.",
+        help=(
+            "Detector rows to use: from FIRST up to, but not including, END, counted from 0. The volume has one "
+            "slice per row. Default: all."
+        ),
     ),
     option(
         "--cols",

@@ -151,7 +151,9 @@ class BeamMonitorSection(Section):
         None, "In `unit`: the scan pauses below this value; null: it never pauses.", gt=0
     )
     resume_above: float | None = setting(
-        None, "In `unit`: the beam counts as back from this value on; null: a tenth above pause_below.", gt=0
+        None,
+        "In `unit`: the scan continues when readings have reached this value again; null: a tenth above pause_below.",
+        gt=0,
     )
     settle_s: float = setting(5.0, "How long the beam must be back before the scan continues.", ge=0)
 

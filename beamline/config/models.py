@@ -126,7 +126,10 @@ class TargetSection(Section):
     )
     seconds: Seconds | None = setting(None, "Time limit from the first frame to the last flats and darks.")
     dose: float | None = setting(
-        None, "Limit for the share of the plan's exposures with beam on the sample.", gt=0, le=1
+        None,
+        "Largest dose of the scan (exposures with beam on the sample), as a fraction of the dose of the whole plan.",
+        gt=0,
+        le=1,
     )
 
 

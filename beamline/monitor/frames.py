@@ -157,7 +157,8 @@ class TimingCheck(Logged):
             return CheckResult(after)
         advice = (
             f"Check the stage and the trigger line: the frame came {abs(score):.0%} of a period too "
-            f"{'late' if score > 0 else 'early'}. The stage does not turn evenly, or the trigger line picks up noise."
+            f"{'late' if score > 0 else 'early'}. Either the stage does not turn evenly, or the trigger line "
+            "picks up noise."
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 

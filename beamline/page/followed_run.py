@@ -73,7 +73,7 @@ class RunValues:
     option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
     option_times: tuple[float, ...] = published("OptionTimes", "time that each of Options needs", (), "s")
     option_doses: tuple[float, ...] = published(
-        "OptionDoses", "dose of each of Options, as a share of the plan's dose", (), "%"
+        "OptionDoses", "dose of each of Options, as a fraction of the dose of the whole plan", (), "%"
     )
     option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
     recommended: str = published("Recommended", "the choice in Options that the program makes or would make", "")

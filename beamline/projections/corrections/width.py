@@ -148,7 +148,7 @@ class Width:
         seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
         turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
         statements = [
-            *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
+            *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
             *([f"a projection is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
                 "the edge of the field of view)"] if motion.arc else []),
             *([f"the last detector row is exposed {turned[1]:.2g} degrees later than the first"]

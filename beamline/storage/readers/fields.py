@@ -81,7 +81,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
     if value.dtype.kind not in "uifb":
-        return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
+        return "it is text; expected a number, with a known unit after it or in its attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 

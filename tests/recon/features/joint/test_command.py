@@ -117,7 +117,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: P
     np.testing.assert_array_equal(kept.series.data, held.series.data)
     np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
     assert not kept.ended_early
-    with pytest.raises(api.DataError, match="12 views"):
+    with pytest.raises(api.DataError, match="12 projections"):
         api.reconstruct(scan, replace(method, volumes=4), selection=wanted, say=None)
     part: dict[str, Any] = {"rows": (0, 1), "views": "fixed:12"}
     for output, more in (("other.tif", dict[str, Any]()), ("other.h5", part)):
