@@ -213,7 +213,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
 
     Args:
         address: tcp://HOST:PORT, where the proxy takes documents.
-        warn: takes a sentence if nobody listens there.
+        warn: function that gets a sentence if no program listens there.
 
     Raises:
         ConfigError: another address, or bluesky or pyzmq are not installed.

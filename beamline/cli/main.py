@@ -106,7 +106,7 @@ def own_commands() -> dict[str, CommandEntry]:
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands. Other packages are searched only for names that this package lacks."""
+    """All commands. Other packages are searched only for names that this package does not have."""
     return Registry("command", own_commands(), _entry_of)
 
 

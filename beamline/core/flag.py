@@ -31,7 +31,7 @@ class Flag:
         score: the measured figure, in the check's unit.
         limit: the figure that it exceeds.
         advice: what it means and what to do.
-        region: where in the frame; None: everywhere, or nowhere in particular.
+        region: the flagged region of the frame; None: the whole frame, or no particular region.
         first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
             of its kind, without another between. Where a finding takes still more views, `frame` itself is earlier
             than the one at which it is found.

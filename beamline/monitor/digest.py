@@ -27,20 +27,20 @@ ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row i
 
 @dataclass(frozen=True, eq=False)
 class FrameDigest:
-    """Statistics of the valid pixels of one frame. Where no pixel is valid, the numbers are NaN.
+    """Statistics of the valid pixels of one frame. If no pixel is valid, the numbers are NaN.
 
     Attributes:
         minimum, maximum, mean: in the frame's own unit (counts for a raw frame).
         variance: population variance (divisor n), unit squared.
         sum_abs: sum of absolute values.
-        invalid_fraction: pixels that are not finite, beyond LARGEST or hold the no-data value, over all pixels.
-        saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
+        invalid_fraction: fraction of the pixels that are not finite, beyond LARGEST or equal to the no-data value.
+        saturated_fraction: fraction of the pixels at or above the saturation value; 0 if no such value was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
-            (0 for a constant frame, at most 8). For counts, of every k-th row where there are more than 2**20 pixels.
+            (0 for a constant frame, at most 8). For counts with more than 2**20 pixels, only every k-th row is used.
         checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
-        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
-            none). Blocks at the lower and right edge are smaller where bin does not divide the shape.
-        peaks: float32, largest valid pixel of each of these blocks (NaN where there is none).
+        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of the valid pixels in each block (NaN if a block has
+            none). Blocks at the lower and right edge are smaller if bin does not divide the shape.
+        peaks: float32, largest valid pixel in each of these blocks (NaN if a block has none).
     """
 
     minimum: float

@@ -28,12 +28,12 @@ class FrameStatistics:
     """Statistics of a dark, a flat or a projection.
 
     Attributes:
-        row: in the file.
-        exposure: s, NaN where unknown.
+        row: row of the frame in the file.
+        exposure: exposure time in s, NaN if unknown.
         saturated: fraction of the pixels at or above the saturation value.
-        blocks: float32, means of blocks of pixels; a part of the preview where that is large.
-        block: pixels a side of a block.
-        rounding: noise that the pixels' type may hide; 0 of real numbers.
+        blocks: float32, means of blocks of pixels; if the preview is large, only a part of it.
+        block: side of a block in pixels.
+        rounding: noise that rounding to the type of the pixels may hide; 0 for real numbers.
         invalid: fraction of the pixels that are not finite.
         cells: float32, means of larger blocks that cover the frame; None: not needed.
     """

@@ -45,7 +45,7 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A view that is kept until the one half a turn later arrives."""
+    """A projection that is kept until the projection 180° later arrives."""
 
     view: CellView
     after: CellView | None = None  # the next one, later the nearest in angle so far, which gives the velocity

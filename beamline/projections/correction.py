@@ -310,7 +310,7 @@ class ScanCorrection:
         return then != now or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """True if `feed` took an object that stands in the beam of all these projections of a finished scan for
+        """True if `feed` treated an object in the beam of all these projections of a finished scan as part of the
         sample.
         """
         shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self.source, views).shadow

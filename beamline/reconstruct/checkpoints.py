@@ -94,12 +94,13 @@ class CheckpointOptions:
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
-        """The state to resume from; None if the fit starts anew.
+        """The state to resume from; None if the fit starts from the beginning.
 
         Args:
             origin: of the fit, see `origin_of`.
             steps: planned number of steps; 0 if a time limit is planned.
-            warn: takes a sentence if the plan differs, so that the volume differs from that of an uninterrupted fit.
+            warn: function that gets a sentence if the plan differs, because the volume then differs from that of an
+                uninterrupted fit.
 
         Raises:
             ConfigError: the fit has already made more steps than planned.

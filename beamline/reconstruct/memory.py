@@ -227,5 +227,5 @@ def cluster(spec: str) -> AbstractContextManager[Any]:
 
 
 def local_workers(spec: str | None) -> int:
-    """Number of workers to start on this machine; 0 where a scheduler has its own, or there is no cluster."""
+    """Number of workers to start on this machine; 0 if a scheduler has its own workers, or if there is no cluster."""
     return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0

@@ -185,7 +185,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     box is the whole volume, and the sentence states the reason.
 
     Raises:
-        ConfigError: a cone. DataError: no view shows matter.
+        ConfigError: the scan has a cone beam. DataError: no projection shows a sample.
     """
     part = selection.of(source)
     if part.cone is not None:

@@ -35,7 +35,7 @@ class Report:
 
     Attributes:
         summary: one or two sentences, the result first.
-        metrics: by method, then by name of the metric (see METRICS); a method may lack some.
+        metrics: by method, then by name of the metric (see METRICS); a method need not have all of them.
         frames: number of frames in the file and number of planned frames, e.g. "90/90".
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
         recipe: the options that also apply to other scans; empty: no options are shown.

@@ -62,7 +62,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
 
     Args:
-        warn: takes a sentence on energies whose scan is incomplete or does not exist.
+        warn: function that gets a sentence on energies whose scan is incomplete or does not exist.
 
     Raises:
         DataError: no energy has a scan.

@@ -32,7 +32,7 @@ class BlockTally:
     """A block with its frames and missing triggers; filled while the block is recorded.
 
     Attributes:
-        again: the block repeats projections, so losing them is no failure.
+        again: True if the block repeats projections; losing them is then not a failure.
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, whose expected frame did not come.

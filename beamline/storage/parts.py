@@ -172,7 +172,7 @@ def to_join(run: Path) -> str:
 
 
 def require_joined(file: h5py.File) -> None:
-    """Raise DataError if a joined file refers to frames of changed parts, or lacks a part.
+    """Raise DataError if a joined file refers to frames of changed parts, or if a part is missing.
 
     A file with frames of its own, such as a repacked copy, always passes.
     """

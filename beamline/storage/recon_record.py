@@ -62,7 +62,7 @@ class ReconRecord:
     Attributes:
         volume: `volume.data` float32 [z, y, x]; of an open file, a dataset that is sliced along z. Of a file just
             written, it is read at the first use.
-        length_unit: "mm" where the pixel size is known, else "px".
+        length_unit: "mm" if the pixel size is known, otherwise "px".
         raw_file: name of the scan it was made from.
         time: s since the Unix epoch when it was made.
         parameters: every setting used, by name; numbers, strings and arrays.

@@ -89,7 +89,7 @@ class Recovered:
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
     """Put a closed file with the committed frames in the place of one whose process was killed, or that was cut off;
-    add the /exchange view where a closed one lacks it.
+    add the /exchange view to a closed file that does not have it.
 
     Args:
         say: function that gets a sentence on the disk space that the copy needs.

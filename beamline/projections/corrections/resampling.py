@@ -161,7 +161,7 @@ def with_tilt(
 
     Args:
         frames: projections that may be used.
-        progress: takes how many bands of rows were corrected, and how many there are at most.
+        progress: function that gets the number of bands of rows that were corrected, and their largest number.
 
     Raises:
         ConfigError: the scan has a cone beam.

@@ -221,7 +221,7 @@ def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
 
     Args:
         angles: the values of `item` in radians.
-        unit: of them, where the caller says another one than the file.
+        unit: unit of the angles, if the caller states another unit than the file.
     """
     config = item.parent if isinstance(item, h5py.Dataset) else None
     if config is None or datasets.dataset(config, "detector/direction_x") is None:

@@ -147,7 +147,8 @@ FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read:
 
 
 def images_among(names: Sequence[str]) -> list[str]:
-    """The images among files, of the first kind that there is: other kinds next to it are no frames of the scan."""
+    """The images among files, of the first kind that there is: files of other kinds next to them are not frames of the
+    scan."""
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])
