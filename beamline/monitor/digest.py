@@ -1,9 +1,9 @@
 """FrameDigest: statistics of a frame for the monitor, the operator and the file, computed in one pass.
 
 Counts (uint16) are read once, line by line: each line is in the processor's cache while its range, sums and histogram
-are taken. Their sums are integers, so that mean and variance are exact. For other types the range must be known before
-the histogram, so they are read twice. Invalid pixels (not finite, equal to the no-data value, or above LARGEST, which
-no detector counts) are counted and otherwise ignored: they have no effect on a mean or on a block of the preview.
+are taken. Their sums are integers, so that mean and variance are exact. Other types need the range before the
+histogram, so they are read twice. Pixels that are not finite, hold the no-data value, or lie beyond what any detector
+counts (LARGEST), are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row i
 
 @dataclass(frozen=True, eq=False)
 class FrameDigest:
-    """Statistics of the valid pixels of one frame. If no pixel is valid, the numbers are NaN.
+    """Statistics of the valid pixels of one frame. Where no pixel is valid, the numbers are NaN.
 
     Attributes:
         minimum, maximum, mean: in the frame's own unit (counts for a raw frame).
         variance: population variance (divisor n), unit squared.
         sum_abs: sum of absolute values.
-        invalid_fraction: fraction of the pixels that are not finite, beyond LARGEST or equal to the no-data value.
-        saturated_fraction: fraction of the pixels at or above the saturation value; 0 if no such value was given.
+        invalid_fraction: pixels that are not finite, beyond LARGEST or hold the no-data value, over all pixels.
+        saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
-            (0 for a constant frame, at most 8). For counts with more than 2**20 pixels, only every k-th row is used.
+            (0 for a constant frame, at most 8). For counts, of every k-th row where there are more than 2**20 pixels.
         checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
-        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of the valid pixels in each block (NaN if a block has
-            none). Blocks at the lower and right edge are smaller if bin does not divide the shape.
-        peaks: float32, largest valid pixel in each of these blocks (NaN if a block has none).
+        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
+            none). Blocks at the lower and right edge are smaller where bin does not divide the shape.
+        peaks: float32, largest valid pixel of each of these blocks (NaN where there is none).
     """
 
     minimum: float
@@ -90,9 +90,7 @@ def digest(
     Raises ValueError for an array that is not two-dimensional, empty or complex, or for a bin below 1.
     """
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
-        raise ValueError(
-            f"A frame must be a non-empty [row, col] array of real numbers, not {image.dtype} {image.shape}."
-        )
+        raise ValueError(f"A frame is a non-empty real [row, col] array, not {image.dtype} {image.shape}.")
     if preview_bin < 1:
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()

@@ -1,10 +1,10 @@
 """Track: the path of a small absorber through the field of view, found by the sum over all projections that show it.
 
-The mean of its two neighbours is subtracted from each projection. Noise remains, and any object that moves by at least
-its own size from one projection to the next. The remainder is summed along a line in (projection, column) and divided
-by the standard deviation of the sum: an absorber then grows as the root of the number of projections, and noise does
-not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is largest, which may be
-inside the field of view. Slower objects show in means of 2, 4, 8 ... projections; each of these is called an *octave*.
+Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
+along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
+of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is
+largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave*
+each.
 
 A track does not belong to the sample if no point that turns with the stage within its radius explains it: the
 difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
