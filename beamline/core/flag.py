@@ -1,4 +1,4 @@
-"""Flag: result of a check of the monitor on one frame, which the event `flag` carries; finding: result of a rule on a
+"""Flag: what a check of the monitor says of a frame, which the event `flag` carries; finding: what a rule says of a
 scan."""
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Flag:
         score: the measured figure, in the check's unit.
         limit: the figure that it exceeds.
         advice: what it means and what to do.
-        region: the flagged region of the frame; None: the whole frame, or no particular region.
+        region: where in the frame; None: everywhere, or nowhere in particular.
         first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
             of its kind, without another between. Where a finding takes still more views, `frame` itself is earlier
             than the one at which it is found.

@@ -1,8 +1,8 @@
 """View: a projection as the checks use it, as line integrals on a coarse grid, the same for large and small frames.
 
-It is computed once per frame for all checks. The grid has 128 to 255 columns of square cells, whatever the size of the
-frame. Therefore a check needs no more time for 2304 x 4096 pixels than for 128 x 512, and a limit in cells is always
-the same fraction of the field of view.
+Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
+takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
+of the field.
 
 Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel of
 a preview block if it is far brighter than the means of all blocks around it, beyond noise. It must also exceed that
