@@ -1,4 +1,4 @@
-"""The instrument and what surrounds it: configuration, scans, files, monitoring, reconstruction, reports, commands."""
+"""beamline: configuration of the instrument, scans, files, monitoring, reconstruction, reports and commands."""
 
 import sys
 

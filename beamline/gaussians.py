@@ -18,12 +18,12 @@ from recon.splatting.gaussians import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Gaussians and the views that they were fitted to.
+    """Gaussians and the projections to which they were fitted.
 
     Attributes:
         gaussians: lengths in `length_unit`.
-        geometry: of these views, in the same unit.
-        record: of the volume that they became; its voxels are not read.
+        geometry: geometry of these projections, in the same unit.
+        record: record of the volume made from the Gaussians; its voxels are not read.
     """
 
     gaussians: Gaussians
@@ -35,14 +35,14 @@ def read_model(path: Path) -> Model:
     """The model in a reconstruction file.
 
     Raises:
-        DataError: the file holds none, or cannot be read.
+        DataError: the file contains no Gaussians, or cannot be read.
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         arrays = record.model
         if not arrays:
             raise DataError(
-                f"{path} holds no Gaussians: {record.parameters.get('method', 'its method')} has none, or the volume "
-                "was made in slabs. Expected a volume of r2 made at once. Nothing was written."
+                f"{path} contains no Gaussians: {record.parameters.get('method', 'its method')} has none, or the "
+                "volume was made in slabs. Expected a volume of r2 made at once. Nothing was written."
             )
         rows, cols = (int(n) for n in arrays["detector_shape"])
         sod, sdd = (float(d) for d in arrays["source_distances"])

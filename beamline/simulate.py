@@ -1,4 +1,4 @@
-"""Files beside simulated scans: labels of anomalies as JSON, to test monitors, and volumes that scenes name."""
+"""Files next to simulated scans: labels of anomalies as JSON, to test monitors, and volumes that scenes name."""
 
 from __future__ import annotations
 

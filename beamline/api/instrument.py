@@ -37,8 +37,8 @@ class Instrument:
 
     Attributes:
         config: the configuration of the devices.
-        last: result of the newest scan, also of one that raised an error; None before the first scan, and if the
-            newest took no frame.
+        last: result of the newest scan, even if the scan raised an error; None before the first scan, and if the newest
+            scan took no frame.
     """
 
     def __init__(self, config: Config, connected: devices.ConnectedDevices, say: Say | None = to_stderr) -> None:
@@ -92,7 +92,7 @@ class Instrument:
             DeviceError: a device failed.
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
-            ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: it was ended at once.
+            ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: the scan was aborted.
 
         In all these cases the frames taken so far are in the file: see `last`. A scan that ends because its
         projections were enough (`scan.decide`) does not raise an error.
@@ -169,7 +169,7 @@ def connect(
             None: no messages.
 
     Raises:
-        ConfigError: every fault with file, line, key and allowed values.
+        ConfigError: the configuration is wrong; the message lists every fault with file, line, key and allowed values.
         DeviceError: a device does not answer; those opened before it are closed again.
     """
     refuse_wrong_arguments(connect, locals())

@@ -63,19 +63,21 @@ def reconstruct(
     Args:
         path: a scan file, or the folder of a run.
         method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
-            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`.
+            `recon.TimeSeries(volumes=4)` reconstructs four volumes at successive times, which are in `series` of the
+            result.
         rows: detector rows to use, such as slice(500, 756); the volume has one slice per row.
         views: projections to use: all, fixed:90, first:60, every:2, ... as for the option --views.
         binning: number of pixels averaged along each side.
         selection: other options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
             `beamline.projections.corrections`; the arguments above take precedence.
         output: file of the volume, as for the option -o (.h5, .tif, .npy, ...), with a report next to it; None: no
-            file is written. A scan that does not fit into the memory needs one.
+            file is written. A scan that does not fit into the memory needs an output file.
         say: function that gets a sentence on what happens; None: no messages.
 
     Raises:
         ConfigError: an impossible method or selection.
-        DataError: no scan, data that give no volume, or an output that exists or cannot be written.
+        DataError: the path is not a scan, no volume can be made from its data, or the output exists or cannot be
+            written.
 
     In case of an error nothing is written.
     """
@@ -132,19 +134,18 @@ _POLL = 0.25  # real s
 def monitor(
     path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
 ) -> ScanVerdict:
-    """The findings of the monitor's checks on every frame of a scan of any format, as `beamline monitor` prints
-    them.
+    """Check every frame of a scan of any format with the monitor, and return the findings that `beamline monitor`
+    prints.
 
     Args:
         path: a scan file, or the folder of a run.
-        config: configuration file whose sections `monitor` and `references` give the limits; None: those of a new
-            scan.
+        config: configuration file whose sections `monitor` and `references` give the limits; None: the default limits.
         set: values that replace those of `config`.
         follow: wait for the end of a scan that is still running.
 
     Raises:
         ConfigError: `config` is wrong.
-        DataError: no scan, or one whose process was killed.
+        DataError: the path is not a scan, or the process of the scan was killed.
     """
     refuse_wrong_arguments(monitor, locals())
     checks, limits = CHECKS, None
@@ -157,19 +158,20 @@ def monitor(
 
 
 def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
-    """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until it ends.
+    """Iterate over the frames of a scan as they are stored, each with its kind, angle and time. If the scan is still
+    running, the iteration waits for new frames until the scan ends.
 
     Frames are counts: `frame.counts` uint16 [row, col].
 
-    Read a fast scan from another program: a slow reader then does not slow the scan down. In the scan's own program,
-    reading and writing wait for each other, so a slow reader slows the scan down.
+    If the scan is fast, call this in another process than the scan. In the process of the scan, reading and writing
+    wait for each other, so a slow reader slows the scan down.
 
     Args:
-        path: a scan file, or the folder of a run (its newest part). It may not exist yet.
+        path: a scan file, or the folder of a run (its newest part). The file need not exist yet.
         follow: False: only the frames that are already in the file.
 
     Raises:
-        DataError: no scan, no scan begins within 120 s, or its process was killed.
+        DataError: the path is not a scan, no scan begins within 120 s, or the process of the scan was killed.
     """
     refuse_wrong_arguments(stream, locals())
     path = Path(path)
@@ -180,13 +182,14 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
 
 def volumes(run: str | Path) -> Iterator[Volume]:
-    """The live volume of a run after each update, and finally the finished volume; ends with the run.
+    """Iterate over the volumes of a run: the live volume after each update, and finally the finished volume. The
+    iteration ends with the run.
 
     Args:
-        run: its folder. A run that has ended gives its last volume.
+        run: folder of the run. If the run has already ended, only its last volume is returned.
 
     Raises:
-        DataError: no folder of a run.
+        DataError: the path is not the folder of a run.
     """
     refuse_wrong_arguments(volumes, locals())
     folder, shown = Path(run), None

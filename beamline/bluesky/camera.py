@@ -1,8 +1,8 @@
 """The camera as a detector of ophyd-async (StandardDetector), for `count`, step scans and fly scans of other plans.
 
-Its frames go into an NXtomo file of ours, one from stage to unstage. A frame that the detector triggers itself has the
-angle at which the stage stands. One by a pulse on a cable has none (NaN): only a whole scan of ours (`TomoScan`) knows
-which pulse exposed which frame.
+From stage to unstage its frames go into one NXtomo file of this program. If the detector triggers a frame itself, the
+frame has the present angle of the stage. If a pulse on a cable exposes a frame, its angle is unknown (NaN): only a
+complete scan of this program (`TomoScan`) knows which pulse exposed which frame.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LOOK_EVERY = 0.2  # s, at a request to stop
 
 
 class ShownFrames(StrictEnum):
-    """What the frames show. Shutter and sample are moved accordingly."""
+    """The kind of the frames. Shutter and sample are moved accordingly."""
 
     PROJECTION = "projection"
     FLAT = "flat"
@@ -103,7 +103,7 @@ class _Frames(DetectorAcquireLogic):
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
 
     async def wait_for_idle(self) -> None:
-        """Until the last frame. Raises what ended them early."""
+        """Wait until the last frame. Raises the error that ended the frames early, if any."""
         if self._task is not None:
             await self._task
 
@@ -170,9 +170,9 @@ class _Frames(DetectorAcquireLogic):
                     return
                 if frame_taken.framestamp != i:
                     raise InstrumentError(
-                        f"Leave more time between the frames, and take them again. {camera.name}: frames "
-                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. "
-                        "Earlier frames are in the file."
+                        f"Leave more time between the frames, and repeat the exposures. {camera.name}: frames "
+                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. Earlier "
+                        "frames are in the file."
                     )
                 row = writer.rows
                 frame = Frame(np.array(frame_taken.counts), kind, row, row, i, angle, frame_taken.time, exposure)
@@ -257,7 +257,8 @@ class CameraDetector(StandardDetector):
         super().__init__(name)
 
     def stage(self) -> Any:
-        """Begin. bluesky tells no device how its plan ends: so it is heard from the RunEngine in whose task this is."""
+        """Begin. bluesky does not tell a device how its plan ends, so the camera listens to the RunEngine that runs
+        this task."""
         self._triggered, task = None, asyncio.current_task()
         engine = inspect.getcoroutinelocals(task.get_coro()).get("self") if task else None  # type: ignore[arg-type]
         if isinstance(engine, RunEngine):
@@ -274,7 +275,7 @@ class CameraDetector(StandardDetector):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """End the frames and the file, and hear the RunEngine no more."""
+        """End the frames and the file, and stop listening to the RunEngine."""
         await super().unstage()
         self._frames.ended_by()
 
@@ -284,8 +285,8 @@ class CameraDetector(StandardDetector):
         return self._triggered
 
     async def pause(self) -> None:
-        """The plan, which pauses, repeats what it asked for since its last checkpoint: a frame that is exposed now is
-        still written, and no event refers to it."""
+        """After a pause, the plan repeats everything since its last checkpoint. A frame that is exposed now is still
+        written, but no event refers to it."""
         if self._triggered is not None:
             await asyncio.wait([self._triggered.task])  # the first one makes the file
             if self._frames.provider is not None:

@@ -1,7 +1,8 @@
 """Devices for a RunEngine (ophyd-async): a whole scan as one flyer, and the rotation stage.
 
-The scan is ours from trigger to file, in a thread: the RunEngine starts it, is told its rows as they are written, and
-waits for its end. So lost frames, a device that fails, and a missing beam are found by the scan, and fail `complete`.
+This program runs the scan from trigger to file, in a thread. The RunEngine starts the scan, is told the rows as they
+are written, and waits for its end. Therefore the scan itself detects lost frames, failed devices and a missing beam,
+and `complete` then fails.
 """
 
 from __future__ import annotations
@@ -174,8 +175,8 @@ class Rotation(Device):
         await asyncio.to_thread(self._move, math.radians(value), ended)
 
     async def stop(self, success: bool = True) -> None:
-        """Stop the stage. success: it was meant, as at each pause of a plan, which moves again afterwards: the move
-        ends without an error."""
+        """Stop the stage. success: True if the stop was intended, for example at a pause of a plan that moves again
+        afterwards; the move then ends without an error."""
         if success:
             self._ended.set()
         await asyncio.to_thread(self._stage.stop)

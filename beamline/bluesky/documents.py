@@ -1,7 +1,7 @@
 """Bluesky documents (event-model) of a scan. Its frames stay in this program's file; a stream datum announces new
 rows.
 
-One index is one row of the file, darks and flats included. A trigger without a frame is no index.
+Each index is one row of the file, including darks and flats. A trigger without a frame has no index.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
 
     Args:
         address: tcp://HOST:PORT, where the proxy takes documents.
-        warn: takes a sentence if nobody listens there.
+        warn: function that gets a sentence if no program listens there.
 
     Raises:
         ConfigError: another address, or bluesky or pyzmq are not installed.
@@ -239,7 +239,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
             socket.create_connection((url.hostname, url.port), REACH).close()
             time.sleep(JOIN)
         except OSError as error:
-            warn(f"No program is listening at {address} ({error}): documents are dropped until one does.")
+            warn(f"No program is listening at {address} ({error}): documents are lost until a program listens there.")
         yield publisher
     finally:  # its own close would wait for ever for a proxy that no longer reads
         publisher._context.destroy(linger=round(1000 * REACH))

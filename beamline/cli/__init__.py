@@ -1,1 +1,1 @@
-"""Commands, one file each; their options, their output in a terminal or as JSON, and exit codes."""
+"""The commands, one file for each: their options, their output in a terminal or as JSON, and their exit codes."""

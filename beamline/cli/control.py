@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
 CHOICES = tuple(Choice)
 _LOOKS = 50  # a tenth of a second apart, because the log of events may be written a moment after the state
-_EXIT_CODES = "Exit code: 0 the scan has carried it out, 2 no scan runs there or it does not answer, 5 disk error."
+_EXIT_CODES = (
+    "Exit code: 0 the scan has carried out the command, 2 no scan runs in the folder or the scan does not answer, 5 "
+    "disk error."
+)
 
 
 def _command(verb: str, help_text: str) -> click.Command:
@@ -79,10 +82,13 @@ def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
             return
         time.sleep(0.1)
     instead = (
-        f"it took {newer[-1].get('choice')}: {newer[-1].get('reason')}" if newer else "it has made no other choice"
+        f"the scan chose {newer[-1].get('choice')} instead: {newer[-1].get('reason')}"
+        if newer
+        else "the scan has made no other choice"
     )
     raise ConfigError(
-        f"the scan in {run} does not take {choice}, because it was not offered or came too late; {instead}."
+        f"the scan in {run} does not measure {choice} next, because it did not offer this choice or your choice came "
+        f"too late; {instead}."
     )
 
 
@@ -100,13 +106,14 @@ def decide(words: tuple[str, ...]) -> None:
     those without a frame), or enough (no further pass). Without RUN, the command goes to the only running scan in
     ./runs.
 
-    Exit code: 0 the scan takes your choice, 2 no scan runs there, it does not ask, it does not offer your choice, or
-    your choice came too late, 5 disk error.
+    Exit code: 0 the scan takes your choice, 2 no scan runs in the folder, the scan does not wait for a decision, it
+    does not offer your choice, or your choice came too late, 5 disk error.
     """
     *run, choice = words
     if len(run) > 1 or choice not in CHOICES:
         raise click.UsageError(
-            f"{' '.join(words)!r}: expected {' | '.join(CHOICES)}, before it the folder of a run if needed."
+            f"{' '.join(words)!r}: expected {' | '.join(CHOICES)}. If several scans run, write the folder of the run "
+            "before the choice."
         )
     _send(Path(run[0]) if run else None, choice)
 
@@ -160,7 +167,13 @@ def _only(runs: Path) -> Path:
 @click.command()
 @config_argument
 @click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
-@click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Time limit of the search in seconds.")
+@click.option(
+    "--timeout",
+    type=POSITIVE,
+    default=300.0,
+    show_default=True,
+    help=("Time limit in seconds for the search of the reference mark."),
+)
 @set_option
 def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
     """Turn the stage in CONFIG to its reference mark, so that its angles are right.
@@ -168,8 +181,8 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
     \b
     beamline home my.yaml
 
-    THE STAGE TURNS, possibly by 360° and beyond its soft limits. The command asks before it does so. No other device
-    is connected. Ctrl-C stops the stage.
+    THE STAGE TURNS, possibly by 360° and beyond its soft limits. The command asks for confirmation first. It connects
+    to no other device. Ctrl-C stops the stage.
 
     Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
     """
@@ -214,8 +227,8 @@ def recover(file: Path, as_json: bool) -> None:
     beamline recover RUN/scan.h5    repair one file
 
     The command keeps all complete frames, and drops a frame that was being written. The repaired file has the group
-    /exchange and the status `failed`. The command does not change a file that is in order. It copies the frames, which
-    takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
+    /exchange and the status `failed`. The command does not change an intact file. To repair a file, it copies the
+    frames, which takes time and disk space. If the command is interrupted or fails, FILE stays as it was.
     """
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan
@@ -251,7 +264,11 @@ def config() -> None:
 
 
 @config.command(short_help="Print a configuration to edit.")
-@click.option("--instrument", is_flag=True, help="For a real instrument. Default: for simulated devices.")
+@click.option(
+    "--instrument",
+    is_flag=True,
+    help=("Print a configuration for a real instrument. Default: a configuration with simulated devices."),
+)
 @click.argument("file", metavar="", required=False)
 def init(instrument: bool, file: str | None) -> None:
     """Print a complete configuration with comments, to edit.

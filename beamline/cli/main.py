@@ -40,7 +40,7 @@ class CommandEntry:
     Attributes:
         module: the module with the command. Its function has the name of the command, with "_" for "-".
         files: True if the results are files or movements, so that the printed output is only a summary.
-        command: the command itself, if it is of another package (which is loaded then).
+        command: the command itself, if it comes from another package (which is then loaded).
     """
 
     module: str
@@ -106,7 +106,7 @@ def own_commands() -> dict[str, CommandEntry]:
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands. Other packages are searched only for names that this package lacks."""
+    """All commands. Other packages are searched only for names that this package does not have."""
     return Registry("command", own_commands(), _entry_of)
 
 
@@ -164,12 +164,12 @@ class _Printable:
 
 
 def guard_streams() -> None:
-    """Replace `sys.stdout` and `sys.stderr` by streams that outlive a closed terminal and print no control characters;
-    both, and stdin, are open from now on.
+    """Replace `sys.stdout` and `sys.stderr` by streams that survive a closed terminal and print no control characters.
+    If stdin, stdout or stderr was closed, it is opened.
 
-    The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
-    What a library of others prints to stdout, also at the end of the process, goes to stderr, and nowhere with
-    `--json`: a line of it is no JSON.
+    If one of them stayed closed (`>&-`), the next file to be opened would get its number, and printed text would go
+    into a scan file. Anything that another library prints to stdout, also at the end of the process, goes to stderr.
+    With `--json` it is dropped, because it is not JSON.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
@@ -219,7 +219,7 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Resolve a command as click does; the error for an unknown name suggests the nearest one.
 
-        Two words are one name where another package adds it, such as `study structure`.
+        If another package adds a command of two words, such as `study structure`, both words are its name.
         """
         if args[:1] == ["doctor"]:  # its name in version 1.0
             click.echo("`beamline doctor` is now `beamline check CONFIG --connect`.", err=True)
@@ -259,7 +259,7 @@ class LazyGroup(click.Group):
                     raise
                 left = leave_traceback(error, Path())
                 message += f"; the traceback is in {left}" if left else "; --debug shows where"
-                message += ". Please report it. What was written before is as it was written."
+                message += ". Please report it. Files written before the error are unchanged."
             # A line end that no indent follows is one of a file's name.
             click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)
             ctx.exit(exit_code(error))
@@ -308,8 +308,9 @@ def main(debug: bool) -> None:
 def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
-    HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5. A
-    closed terminal, or a disk that takes no output, does not end a command: the rest of its output is lost.
+    HDF5 crashes at exit if a file could not be closed, for example on a full disk: the exit code would be -11 instead
+    of 5. If the terminal is closed or the disk accepts no output, the command continues, and the rest of its output is
+    lost.
     """
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
@@ -326,7 +327,7 @@ def run() -> NoReturn:
         code = INTERRUPTED
     exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
     if lost := lost_output():
-        click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
+        click.echo(f"beamline: the output on stdout is incomplete ({lost}).", err=True)
         command = _command(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
         if code == 0 and (command is None or not command.files):
             code = DataError.exit_code

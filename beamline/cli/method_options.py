@@ -65,7 +65,8 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
     for path in settings:
         if not set(methods) & set(owners := taking(path)):
             raise click.UsageError(
-                f"--{options[path]} belongs to {', '.join(owners)}; no row uses one of these methods."
+                f"--{options[path]} works only with {', '.join(owners)}, and no row of the table uses one of these "
+                "methods."
             )
     return {method: {path: value for path, value in settings.items() if method in taking(path)} for method in methods}
 
@@ -93,16 +94,16 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
             return  # before the other methods are asked, because they load torch
     owners = {name: takers(param) for name, param in asked.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
-        what = f"it does not go with --method {method}." if stated else _instead(name, owners)
-        raise click.UsageError(f"--{name} belongs to {', '.join(owners[name])}; {what}")
+        what = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
+        raise click.UsageError(f"--{name} works only with {', '.join(owners[name])}; {what}")
 
 
 def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
     """What to do about an option if no method was chosen. Another given option may belong only to other methods."""
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
-        return "add --method with one of these."
-    return f"--{others[-1]} belongs to {', '.join(owners[others[-1]])}. Give only one of the two options."
+        return "add --method with one of these methods."
+    return f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. Give only one of the two options."
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
@@ -150,15 +151,15 @@ def slabs_resumed(path: Path | None) -> Path | None:
 SLABS_RESUMED = "resume of slabs"
 """Name for `--resume` with a partial volume, because other rules apply to it than to a checkpoint."""
 _OF_ONE_VOLUME = {
-    "roi": "a box belongs to one volume",
-    "truth": "a ground truth is compared with one volume",
-    "uncertainty": "error bars belong to one volume",
+    "roi": "a box can be cut only from a single volume",
+    "truth": "a ground truth can be compared only with a single volume",
+    "uncertainty": "error bars are computed only for a single volume",
     **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes cannot be reconstructed in slabs"),
 }
 """Options that cannot be combined with several volumes (in time, or of materials)."""
 
 _FINISHED = {"follow": "it needs a finished scan"}
-_PLANNED = {"quality": "--quality sets it"}
+_PLANNED = {"quality": "--quality already sets it"}
 _BY_SECONDS = {"follow": "it needs a finished scan; use --seconds"}
 NOT_WITH_SLABS = {"follow": "a running scan cannot be reconstructed in slabs, because everything must stay in memory"}
 NOT_WITH_ERROR_BARS = dict.fromkeys(
@@ -221,8 +222,11 @@ _ALLOW_NEGATIVE = option(
     setting="allow_negative",
     excludes=_FINISHED,
     is_flag=True,
-    help="Do not set negative voxels to zero (nor in --finish). Use it if the air level is below zero, because setting "
-    "voxels to zero then also removes weakly absorbing material.",
+    help=(
+        "Do not set negative voxels to zero, neither in the method nor in the voxel refinement (--finish). Use this "
+        "option if the air level is below zero, because setting voxels to zero then also removes weakly absorbing "
+        "material."
+    ),
 )
 _IN_TIME = together(
     option(
@@ -240,8 +244,10 @@ _IN_TIME = together(
         setting="moves",
         needs=("volumes", "applies to a time series: add --volumes N."),
         default=None,
-        help="With --volumes: the material moves, or only its density changes. Default: chosen with held-out "
-        "projections.",
+        help=(
+            "With --volumes: state whether the material moves or only its density changes. Default: chosen with "
+            "held-out projections."
+        ),
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -365,8 +371,10 @@ method_options = together(
         setting="fit.rays.rectified",
         inverted=True,
         is_flag=True,
-        help="Project the Gaussians as 3D Gaussian splatting does, with the same length for all rays in a Gaussian. "
-        "This has a bias that the default avoids; use it only for comparison.",
+        help=(
+            "Project the Gaussians as 3D Gaussian splatting does: all rays have the same path length through a "
+            "Gaussian. This has a bias that the default avoids; use it only for comparison."
+        ),
     ),
     option(
         "--set",

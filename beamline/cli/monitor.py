@@ -115,7 +115,7 @@ def _in_lines(file: Path, watched: _Watched) -> list[str]:
     summed = watched.verdict
     end = f"{one_line(str(file), SENTENCE)}: {summed.n_frames} frames, flagged: {counted(summed.flags)}"
     if again := summed.retaken:
-        end += f"; not counted, because it was taken again: {frames_text(again)}"
+        end += f"; not counted, because the scan took these projections again: {frames_text(again)}"
     altered = [summed.altered] if summed.altered else []
     left_out = [f"Not checked: {'; '.join(summed.aside)}."] if summed.aside else []
     return [*table(summed.kinds), *summed.references, *altered, *left_out, *watched.ended, end]
@@ -181,7 +181,8 @@ def table(kinds: Iterable[Kind]) -> list[str]:
             where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
         lines += [
             f"{kind.level:<6}{kind.check:<12}{count(len(kind.frames), 'frame')}: {spans(kind.frames)}",
-            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {units[kind.check]}, in frame {worst.frame}{where}",
+            f"{'':<18}worst score {worst.score:.4g} (limit {worst.limit:.4g} {units[kind.check]}), in frame "
+            f"{worst.frame}{where}",
             f"{'':<18}{worst.advice}",
         ]
     return lines

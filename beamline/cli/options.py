@@ -97,7 +97,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "makes several volumes, in time: use beamline recon --volumes N",
+    "times": "reconstructs several volumes at successive times: use beamline recon --volumes N",
 }
 """For methods that make several volumes: the command that runs them."""
 
@@ -115,10 +115,10 @@ class Declared(click.Option):
         setting: path of a setting in Python, such as `fit.loss`; the option belongs to the methods with this setting.
         argument: an argument of methods (see `Method.takes`); the option belongs to these methods.
         inverted: True for a flag that switches the setting off.
-        excludes: long names of options that cannot be combined with it, each with the reason.
+        excludes: long names of options that cannot be combined with this option, each with the reason.
         needs: another option that this one requires, and the end of the error message without it.
         of_one_call: True if the option belongs to one scan or one call; it is then not written into a recipe.
-        former: long name in the last version, which is still accepted but not shown in the help.
+        former: long name in the previous version, which is still accepted but not shown in the help.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ def refuse_contradictions(
             continue
         for other in (other for other in param.excludes if other in given):
             why = f"{shown.get(other, f'--{other}')}: {param.excludes[other]}"
-            raise click.UsageError(f"--{name} does not go with {why}. Nothing was computed.")
+            raise click.UsageError(f"--{name} cannot be combined with {why}. Nothing was computed.")
         if param.needs is not None and param.needs[0] not in given:
             raise click.UsageError(f"--{name} {param.needs[1]}")
 
@@ -241,7 +241,7 @@ def with_request(request: type) -> Decorator:
     """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
 
     Args:
-        request: a frozen dataclass whose fields are made by `set_by`; one field may be made by `others`.
+        request: a frozen dataclass whose fields are made by `set_by`; one field may be made by the function `others`.
     """
     fields_of = {each.name: each.metadata for each in fields(request)}
 

@@ -62,7 +62,8 @@ def recon(**values: Any) -> None:
     the second one discards it. Finished slabs of a large volume stay in OUTPUT.partial.h5, even if the process is
     killed; --resume continues from this file.
 
-    If the sample changes during the scan, --volumes N reconstructs N volumes in time, which `beamline view` plays.
+    If the sample changes during the scan, --volumes N reconstructs N volumes at successive times, and `beamline view`
+    plays them as a film.
     """
     there = not values["follow"] and values["write_config"] is None  # a recipe can be written without a scan
     options = options_of(click.get_current_context(), there=there)
@@ -83,7 +84,8 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
 
     Args:
         default: the method if the user names none; empty: the usual method for the given options.
-        there: True if the scan must exist. This is checked before the libraries for the computation are loaded.
+        there: True if the scan must exist. Its existence is checked before the libraries for the computation are
+            loaded.
 
     Raises:
         UsageError: options exclude each other, a file is named twice, or the method cannot do what is asked.

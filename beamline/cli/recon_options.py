@@ -109,8 +109,11 @@ recon_options = together(
         "--max-residual",
         type=NOT_NEGATIVE,
         metavar="X",
-        help="Largest acceptable residual, as a share of the measured projections: above it the command ends with exit "
-        "code 6. The held-out projections count, if there are any. Default: no limit.",
+        help=(
+            "Largest acceptable residual, as a fraction of the measured projections. If the residual is larger, the "
+            "command ends with exit code 6. If there are held-out projections, their residual is used. Default: no "
+            "limit."
+        ),
     ),
     heading(METHOD),
     seed_option,
@@ -141,7 +144,7 @@ recon_options = together(
     heading(DATA),
     option(
         "--follow",
-        excludes={SLABS_RESUMED: "these slabs belong to a finished scan"},
+        excludes={SLABS_RESUMED: "slabs can be resumed only for a finished scan"},
         of_one_call=True,
         is_flag=True,
         help="Reconstruct a scan while it is running. Methods that need all projections wait for the end of the scan.",
@@ -152,7 +155,8 @@ recon_options = together(
         former="--earlier",
         needs=(
             "follow",
-            "is for a run that is still being continued: add --follow, or give the joined.h5 of its parts as FILE.",
+            "is only for a run that `beamline scan --resume` is still continuing: add --follow. If the run has "
+            "ended, give the joined.h5 of its parts as FILE.",
         ),
         of_one_call=True,
         type=click.Path(path_type=Path),
@@ -177,7 +181,10 @@ recon_options = together(
     option(
         "--roi",
         "region",
-        excludes={"follow": "it needs a finished scan", "truth": "a ground truth is compared with the whole volume"},
+        excludes={
+            "follow": "it needs a finished scan",
+            "truth": ("a ground truth can be compared only with the whole volume"),
+        },
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
         help="Write only this box of voxels; the indices are those of the full volume. Only detector rows that see the "
@@ -206,7 +213,7 @@ recon_options = together(
         of_one_call=True,
         is_flag=True,
         hidden=True,
-        help="Stop when stdin closes, that is, with the process that started this one.",
+        help="Stop when stdin closes, that is, when the process that started this one ends.",
     ),
     heading(OUTPUT),
     json_option,

@@ -63,7 +63,7 @@ class ScanRequest:
         "--documents",
         metavar="FILE|tcp://HOST:PORT",
         type=click.Path(dir_okay=False),
-        help="Write bluesky documents: append them to FILE, one document a line, or send them to the 0MQ "
+        help="Write bluesky documents: append them to FILE, one document per line, or send them to the 0MQ "
         "proxy at HOST:PORT. "
         'Needs: pip install "splatline[bluesky]".',
     )
@@ -88,8 +88,8 @@ class ScanRequest:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
             "output": "the run already has its folder",
-            "rehearse": "a rehearsal starts a new run; RUN has its devices",
-            "documents": "documents describe complete scans",
+            "rehearse": "a rehearsal always starts a new run, and --resume uses the devices stored in RUN",
+            "documents": "documents can describe only complete scans",
         },
         help="Continue the run in this folder: take the missing projections, or the missing flats and darks at the "
         "end, with the configuration stored in the folder.",
@@ -102,7 +102,8 @@ class ScanRequest:
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
-        """With --no-live, which a resumed run keeps: prints what the run then does not do."""
+        """The configuration for a run with --no-live (a resumed run keeps this choice); prints what the run does not do
+        for this reason."""
         return partial(click.echo, err=True) if self.no_live else None
 
 
@@ -372,7 +373,7 @@ def _results(result: RunResult) -> str:
         "scan": result.path,
         "frames": str(result.n_frames),
         "flagged": result.flags and f"{counted(result.flags)}; see {folder}",
-        "retaken": result.retaken and f"{count(result.retaken, 'flagged projection')}; recon uses the new ones",
+        "retaken": result.retaken and f"{count(result.retaken, 'flagged projection')}; recon uses the new projections",
         "volume": None if recon is None else recon.get("output", folder / RECON),
         "report": None if recon is None else recon.get("report"),
     }

@@ -46,15 +46,20 @@ scan_options = together(
         "--angles",
         of_one_call=True,
         type=_PATH,
-        help="File with the angles in degrees: a text file with one angle a line, a table with a column for them, "
-        ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). Default: "
-        "the angles in the scan file.",
+        help=(
+            "File with the angles in degrees: a text file with one angle per line, a table with a column for them, "
+            ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). "
+            "Default: the angles in the scan file."
+        ),
     ),
     option(
         "--angle-rows",
         of_one_call=True,
         metavar="A:B",
-        help="Lines of --angles that belong to the projections, from A up to, not including, B. Default: all.",
+        help=(
+            "Lines of --angles that belong to the projections: from line A up to, but not including, line B. "
+            "Default: all."
+        ),
     ),
     option(
         "--darks",
@@ -94,10 +99,12 @@ scan_options = together(
     option(
         "--frames",
         metavar="KINDS",
-        help="State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
-        "projections. Overrides the file. none=30:38+61:62 leaves frames out; given alone, the file decides about the "
-        "others. 0::2 or 1::2: use every second projection with its darks and flats, if two exposures or thresholds "
-        "alternate.",
+        help=(
+            "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
+            "projections. Overrides the file. none=30:38+61:62 leaves these frames out. If you give only none=, the "
+            "file states the kind of the other frames. 0::2 or 1::2: use every second projection with its darks and "
+            "flats, if two exposures or thresholds alternate."
+        ),
     ),
     option(
         "--append",
@@ -130,7 +137,7 @@ scan_options = together(
 light_options = together(
     option(
         "--photons-per-count",
-        excludes={"spectra": "for scans at several energies the dose is counted in frames"},
+        excludes={"spectra": "for scans at several energies the dose is stated as a number of frames"},
         type=POSITIVE,
         help="Number of X-ray photons at the sample for one count of the camera.",
     ),
@@ -256,8 +263,10 @@ _BEFORE = (
         "--rows",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector rows to use, from FIRST up to, not including, END, counted from 0. The volume has one slice per "
-        "row. Default: all.",
+        help=(
+            "Detector rows to use: from FIRST up to, but not including, END, counted from 0. The volume has one "
+            "slice per row. Default: all."
+        ),
     ),
     option(
         "--cols",

@@ -1,7 +1,7 @@
 """Standby process: loads what a live reconstruction needs before its scan starts, then waits for the command.
 
-`python -m beamline.cli.standby` then waits for a line of JSON on its stdin, a file for its stderr and the words of a
-command, and is that command from there on. It ends with its stdin.
+`python -m beamline.cli.standby` waits for a line of JSON on its stdin, with a file for its stderr and the words of a
+command. From then on it runs as this command. It ends when its stdin closes.
 """
 
 from __future__ import annotations

@@ -287,13 +287,13 @@ def results(record: ReconRecord) -> str:
 def _ended(settings: Mapping[str, Any]) -> str:
     """How iterations that end by themselves ended; empty for other methods."""
     words = {
-        "still": "the volume stands still after {} iterations",
-        "stopped": "stopped after {} iterations, before the volume stood still",
-        "bound": "after {} iterations, before the volume stood still (--iterations allows more)",
+        "still": "converged: the volume no longer changed after {} iterations",
+        "stopped": "stopped after {} iterations, before the volume had converged",
+        "bound": "ended after {} iterations, before the volume had converged (a larger --iterations allows more)",
     }
     how, done = settings.get("ended"), settings.get("ended_after")
     left = settings.get("last_change")
-    change = "" if how == "still" or left is None else f"; the last four changed the volume by {left:.2%}"
+    change = "" if how == "still" or left is None else f"; the last four iterations changed the volume by {left:.2%}"
     return words[how].format(done) + change if how in words else ""
 
 

@@ -57,8 +57,8 @@ class StageMover(MotorSection):
     out_deg: float = setting(doc="Position of the sample while flats are taken.")
     mm_per_deg: float | None = setting(
         None,
-        "mm by which the sample moves towards higher columns of the frame, per unit of the axis; null: "
-        "unknown, or not across the beam.",
+        "mm by which the sample moves towards higher columns of the frame per unit of the axis of the mover; "
+        "null: unknown, or the sample does not move across the beam.",
         ge=-1e3,
         le=1e3,
     )
@@ -87,7 +87,8 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter that has only names: simulated without an effect on the intensity, or changed by the operator."""
+    """A filter of which only the names of the positions are known: simulated without an effect on the intensity, or
+    changed by the operator."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Setting(min_length=1)]
@@ -131,7 +132,7 @@ class FoundFilter(Section):
 def refuse_equal(places: Mapping[str, float | str]) -> None:
     """Raise ValueError if two positions have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("two positions have the same value; give each a different value")
+        raise ValueError("two positions have the same value; give each position a different value")
 
 
 class BeamMonitorSection(Section):
@@ -150,7 +151,9 @@ class BeamMonitorSection(Section):
         None, "In `unit`: the scan pauses below this value; null: it never pauses.", gt=0
     )
     resume_above: float | None = setting(
-        None, "In `unit`: the beam counts as back from this value on; null: a tenth above pause_below.", gt=0
+        None,
+        "In `unit`: the scan continues when readings have reached this value again; null: a tenth above pause_below.",
+        gt=0,
     )
     settle_s: float = setting(5.0, "How long the beam must be back before the scan continues.", ge=0)
 
@@ -222,7 +225,7 @@ class _Monochromator(Section):
 
 
 class SceneMonochromator(_Monochromator):
-    """Sets the energy of the simulated beam, which starts at that of the scene."""
+    """Sets the energy of the simulated beam; at first it is the energy of the scene."""
 
     kind: Literal["simulated"]
     settle_s: float = setting(1.0, "Time that each move takes.", ge=0, le=1e6)

@@ -73,8 +73,8 @@ class _Orca(Section):
     kind: str
     model: Literal["C15550-20UP", "C15550-22UP"] = setting(
         "C15550-20UP",
-        "ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast. Plans and simulations "
-        "use its timing.",
+        "Model of the camera: ORCA-Quest, or ORCA-Quest 2, whose mode ultra_quiet is five times as fast. Plans "
+        "and simulations use the timing of this model.",
     )
     roi: Roi | None = setting(None, "null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1
@@ -88,7 +88,7 @@ class _Orca(Section):
     )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        """What the camera will say of its timing. ValueError for what it would refuse."""
+        """The timing that the camera will report. Raises ValueError for settings that it would refuse."""
         return orca_quest.timing(wanted, model=self.model)
 
 
@@ -99,9 +99,14 @@ class SimulatedOrca(_Orca):
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
     library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
-    index: int = setting(0, "Which camera to use if DCAM finds several.", ge=0)
+    index: int = setting(0, "Number of the camera to use (counted from 0), if DCAM finds several cameras.", ge=0)
     link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 transfers 17.7 full frames per second, CoaXPress 120.")
-    cool_s: float = setting(0.0, "Longest wait before a scan until the sensor is cold; 0: do not wait.", ge=0, le=1e6)
+    cool_s: float = setting(
+        0.0,
+        "Longest time in which a scan waits for the sensor to cool down before it starts; 0: do not wait.",
+        ge=0,
+        le=1e6,
+    )
     usb_product: int | None = setting(
         None,
         "USB product id, for `check --connect`; null: any product of the vendor (who also makes other devices).",

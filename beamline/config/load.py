@@ -47,7 +47,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
-NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so it follows its plan."
+NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
 """For the operator of such a run, where it would decide otherwise."""
 
 
@@ -78,8 +78,8 @@ def load(
     Args:
         environment: default: os.environ.
         rehearse: use the simulated counterpart of each device of a real instrument; see `rehearsal`.
-        no_live: given for a run without a live reconstruction, whatever the file states; takes a sentence on what the
-            run then does not do.
+        no_live: given for a run without a live reconstruction, whatever the file states; function that gets a sentence
+            on what the run does not do for this reason.
 
     Raises:
         ConfigError: every fault with file, line, key, what was found and what is allowed. Nothing has been started.
@@ -164,8 +164,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 def at_energies(config: Config) -> tuple[Config, ...]:
     """The configuration of a scan at each of `scan.energies`; a configuration without them itself.
 
-    The n-th of N scans begins n / N of a step later, or has another seed, so that all projections together see more
-    angles.
+    The n-th of N scans begins n / N of an angular step later, or has another random seed, so that all scans together
+    contain more angles.
     """
     scan, energies = config.scan, config.scan.energies
     if energies is None:
@@ -236,7 +236,7 @@ def plan_of(config: Config) -> ScanPlan:
     """The scan that a configuration asks for.
 
     Raises:
-        ConfigError: an angle file that cannot be read, or passes that do not divide the projections.
+        ConfigError: an angle file cannot be read, or the projections cannot be divided into the passes.
     """
     scan = config.scan
     try:

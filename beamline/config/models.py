@@ -33,7 +33,7 @@ class SampleSection(Section):
     description: str = ""
     diameter_mm: float | None = setting(
         None,
-        "Diameter of the circle about the rotation axis that contains the whole sample; null: not known.",
+        "Diameter of the smallest circle about the rotation axis that contains the whole sample; null: not known.",
         gt=0,
         le=1e3,
     )
@@ -105,7 +105,7 @@ Column = Annotated[float, Setting(ge=-1e7, le=1e7)]
 
 
 class Fields(Section):
-    """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
+    """Darks or flats: how many at each time, and their own exposure (null: the exposure of the scan)."""
 
     count: int = setting(10, ge=0, le=1_000_000)
     at: Place = Place.START
@@ -116,11 +116,20 @@ class TargetSection(Section):
     """When a scan that makes decisions ends; the first target that is reached counts; null: no such target."""
 
     quality_db: float | None = setting(
-        None, "dB of PSNR that the volume may be worse than the volume of the whole plan.", gt=0, le=100
+        None,
+        (
+            "Accepted loss: number of dB by which the PSNR of the volume may be lower than the PSNR after the "
+            "whole plan."
+        ),
+        gt=0,
+        le=100,
     )
     seconds: Seconds | None = setting(None, "Time limit from the first frame to the last flats and darks.")
     dose: float | None = setting(
-        None, "Limit for the share of the plan's exposures with beam on the sample.", gt=0, le=1
+        None,
+        "Largest dose of the scan (exposures with beam on the sample), as a fraction of the dose of the whole plan.",
+        gt=0,
+        le=1,
     )
 
 
@@ -141,23 +150,24 @@ class ScanSection(Section):
     settle_s: float = setting(0.1, "Settling time after each move of a step scan.", ge=0, le=1e6)
     warm_up_s: float = setting(
         0.0,
-        "How long the scintillator is exposed before frames with beam, each time the shutter opens. It "
-        "is brighter when it is warm.",
+        "How long the scintillator is exposed to the beam before frames are taken, each time the shutter opens. "
+        "A warm scintillator is brighter.",
         ge=0,
         le=1e6,
     )
     filter: str | None = setting(
         None,
-        "Name of one of the places of devices.filter, to which it moves before the first frame; null: it "
-        "stays where it is.",
+        "Name of one of the places of devices.filter. The filter moves there before the first frame; null: the "
+        "filter stays where it is.",
     )
     energy: Kev | None = setting(
-        None, "keV to which devices.monochromator moves before the first frame; null: it stays where it is."
+        None,
+        "keV to which devices.monochromator moves before the first frame; null: the monochromator stays where it is.",
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "keV of an energy series: one scan at each, one after the other. Each begins a fraction of a "
-        "step later in angle.",
+        "keV of an energy series: one scan at each, one after the other. Each scan begins a fraction of an "
+        "angular step later than the scan before.",
         min_length=2,
         max_length=1000,
     )
@@ -169,7 +179,7 @@ class ScanSection(Section):
         le=100,
     )
     on_watchdog_loss: Literal["warn", "pause"] = setting(
-        "warn", "What a scan does without a watchdog, or if the watchdog ended and could not be replaced."
+        "warn", "What a scan does if the watchdog cannot be started, or if it has ended and cannot be replaced."
     )
     decide: Literal["off", "ask", "do"] = setting(
         "off",
@@ -217,7 +227,7 @@ class StorageSection(Section):
     preview_bin: int = setting(4, gt=0, le=10_000)
     flush_every: int = setting(
         16,
-        "Largest number of frames that are flushed together while others wait to be written; otherwise "
+        "If frames wait to be written, at most this number of frames is flushed to the file together; otherwise "
         "each frame is flushed at once.",
         gt=0,
         le=1_000_000,
@@ -225,15 +235,22 @@ class StorageSection(Section):
 
 
 class ReconSection(Section):
-    live: bool = setting(True, "Make a volume during the scan; with a method that needs the whole scan, after it.")
+    live: bool = setting(
+        True,
+        (
+            "Reconstruct a volume during the scan. If the method needs the whole scan, the volume is reconstructed "
+            "after the scan."
+        ),
+    )
     method: MethodName = setting(
         DEFAULT,
-        "r2 makes a volume that grows during the scan; the others need the whole scan. auto: as in `beamline recon`.",
+        "r2 makes a volume that grows during the scan; all other methods need the whole scan. auto: the method "
+        "is chosen as by `beamline recon`.",
     )
     seconds: Seconds = setting(
         1800.0,
-        "Time limit after the last projection. null: the volume is made as for a finished scan, and "
-        "takes longer on a busy computer.",
+        "Time limit after the last projection. null: no time limit; the fit takes as many steps as for a "
+        "finished scan, and needs more time on a busy computer.",
     )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
@@ -316,7 +333,9 @@ class Config(Section):
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
         texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
-            raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+            raise ValueError(
+                f"scan.energies lists {twice[0]} keV twice (compared to seven digits); give each energy once"
+            )
         return self
 
     @model_validator(mode="after")

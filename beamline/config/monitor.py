@@ -32,8 +32,8 @@ class MonitorBase(Section):
     )
     retake: Annotated[bool | tuple[str, ...], Setting(problem=_no_checks)] = setting(
         False,
-        "true: projections with an alarm or without a frame are taken again, once, after the last "
-        "projection. Names of checks: projections with a warning of these checks are also taken again.",
+        "true: after the last projection, projections with an alarm or without a frame are taken again, once. A "
+        "list of checks: projections with a warning of these checks are also taken again.",
     )
     retake_share: float = setting(0.25, "Largest share of the projections that is taken again.", gt=0, le=1)
 

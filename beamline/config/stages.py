@@ -1,7 +1,7 @@
 """Configuration of the rotation stage: one section per kind of stage, with the keys that its settings declare.
 
-Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
-folder says.
+To add a stage, add its folder `drivers/stages/<kind>` with a module `stage` that contains the driver; DRIVERS in the
+folder names the driver.
 """
 
 from __future__ import annotations
@@ -52,8 +52,10 @@ class StageSection(Section):
 
     kind: str
     port: Port = setting(
-        doc="Address of the controller. sim:// and the kind is its simulated counterpart, if there is one; "
-        "it uses all other settings given here."
+        doc=(
+            "Address of the controller. For a simulated controller write sim:// and the kind, if the kind has one; "
+            "the simulated controller uses all other settings given here."
+        )
     )
 
     @model_validator(mode="after")
@@ -109,5 +111,7 @@ STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind) for kin
 if TYPE_CHECKING:
     StageConfig = StageSection
 else:
-    _NONE = section_of("NoStageConfig", StageSection, {"kind": (Literal["a stage that is installed"], ...)})
+    _NONE = section_of(
+        "NoStageConfig", StageSection, {"kind": (Literal["the name of an installed kind of stage"], ...)}
+    )
     StageConfig = Union[tuple(STAGE_SECTIONS.values()) or _NONE]  # noqa: UP007 - a union of as many as there are

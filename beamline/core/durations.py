@@ -14,8 +14,8 @@ def seconds_left(done: float, total: float, spent: float) -> float | None:
     """Seconds left at the speed so far; None while nothing is done.
 
     Args:
-        done, total: in any unit in which the work is even, such as s of a prediction.
-        spent: s for what is done.
+        done, total: amount of work in any unit in which the work proceeds evenly, such as predicted seconds.
+        spent: time in s for the work that is done.
     """
     return max(total - done, 0.0) * spent / done if done > 0 and spent > 0 else None
 

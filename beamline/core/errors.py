@@ -141,7 +141,7 @@ def user_message(error: BaseException) -> str:
     if not isinstance(error, BeamlineError | DeviceError) and (problem := installation_problem(error)):
         return problem
     if is_defect(error):
-        what = " ".join(str(error).split()) or "nothing more is known"
+        what = " ".join(str(error).split()) or "Python states no reason"
         return f"a defect in this program: {type(error).__name__}: {what}"
     return str(error) or repr(error)
 

@@ -34,7 +34,8 @@ def event_of(values: Mapping[str, Any]) -> Event:
 def event_in(line: str | bytes) -> dict[str, Any] | None:
     """The values of an event in a line of a log; None if the line is no event.
 
-    Only its kind and its time are looked at: fields may lack, be unknown, or have other types, as of another version.
+    Only its kind and its time are checked: other fields may be missing, unknown, or of another type, because another
+    version wrote them.
     """
     with suppress(UnicodeDecodeError):
         text = line.decode() if isinstance(line, bytes) else line

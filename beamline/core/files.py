@@ -121,7 +121,7 @@ def kind_of_data(path: Path) -> str | None:
 
 
 def is_link(path: Path) -> bool:
-    """Whether the path is a symbolic link, or a junction of Windows."""
+    """True if the path is a symbolic link, or a junction of Windows."""
     try:
         status = path.lstat()
     except OSError:
@@ -132,8 +132,8 @@ def is_link(path: Path) -> bool:
 def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     """The path of a regular file at a relative path below a folder, for a library that opens it by its name.
 
-    For what other people wrote: the folder itself may be a link, nothing below it. OSError as `require_regular`, and
-    where there is no file.
+    Use it for files that other people wrote: the folder itself may be a link, but nothing below it. Raises OSError as
+    `require_regular`, and if there is no file.
     """
     parts, place = PurePosixPath(name).parts, folder
     for part in parts:
@@ -146,7 +146,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
 
 
 def is_below(folder: Path, name: str) -> bool:
-    """Whether `require_below` accepts the file: it is no link, no pipe, and not another user's."""
+    """True if `require_below` accepts the file: it is neither a link nor a pipe, and belongs to no other user."""
     try:
         return require_below(folder, name).is_file()
     except OSError:
@@ -169,7 +169,7 @@ def text_in(path: Path, largest: int = TEXT) -> str:
     """The content of a text file of at most `largest` bytes. Raises OSError as `require_regular`, and for text that is
     not UTF-8.
 
-    A byte-order mark, which some editors write, tells UTF-16, and is no part of the text.
+    A byte-order mark, which some editors write, identifies UTF-16 and is not part of the text.
     """
     require_regular(path, largest)
     try:
@@ -210,7 +210,7 @@ _BESIDE = 44  # bytes that names of temporary files, and of what is written besi
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
-    Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
+    Results never replace anything, not even a broken link, and their folder must exist.
     """
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
     if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
@@ -247,7 +247,7 @@ def refuse_not_utf8(path: Path | str) -> None:
 def replaceable(path: Path) -> Path:
     """The file to replace or create for `path`: the target, if that is a link.
 
-    DataError where the target is not there.
+    DataError if the target does not exist.
     """
     if link := broken_link(path):
         raise DataError(
@@ -275,8 +275,9 @@ def bring_to_disk(path: Path) -> None:
 
 @contextmanager
 def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A context with a temporary name beside `path`, for a file or a folder. At its end that is flushed to the disk and
-    renamed to `path`; an error removes it. Leftovers of a killed program for the same `path` are removed first.
+    """A context with a temporary name beside `path`, for a file or a folder. At the end of the context the file is
+    flushed to the disk and renamed to `path`; after an error it is removed. Leftovers of a killed program for the same
+    `path` are removed first.
 
     Args:
         path: the file to write. Without `replace` it must not exist.
@@ -284,7 +285,7 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             and its target is replaced.
 
     Raises:
-        DataError: `path` exists, the disk refuses, or the system does not allow to replace it.
+        DataError: `path` exists, the disk fails, or the system does not allow replacing the file.
     """
     if replace:
         path = replaceable(path)
@@ -302,7 +303,7 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be replaced ({error}); the existing file was not changed.") from error
     except OSError as error:
-        left = "what was there is untouched" if replace else "nothing is left of it"
+        left = "the existing file was not changed" if replace else "no incomplete file was left behind"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk

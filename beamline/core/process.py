@@ -24,7 +24,7 @@ from beamline.core.stop import StopScope
 _POLL = 0.2  # real s between two questions whether the process should stop
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
-ORPHANED = "this process ends, because the process that started it has died; no result was written"
+ORPHANED = "this process ends, because the process that had started this one has died; no result was written"
 _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 

@@ -130,8 +130,9 @@ def doubt_span(span_deg: float) -> str:
     for turn in (math.pi / 2, math.pi, 2 * math.pi, 4 * math.pi):
         if abs(abs(span_deg) / turn - 1) < _SAME:
             return (
-                f"scan.angles: the span of {span_deg:g} degrees would be {math.degrees(turn):.0f} degrees if it was in "
-                f"radians. Did you mean {math.copysign(math.degrees(turn), span_deg):.0f}?"
+                f"scan.angles: the range of {span_deg:g} degrees looks like a value in radians, which would be "
+                f"{math.degrees(turn):.0f} degrees. Did you mean "
+                f"{math.copysign(math.degrees(turn), span_deg):.0f}?"
             )
     return ""
 

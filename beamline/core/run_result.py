@@ -13,17 +13,18 @@ class RunResult:
     """A scan that has ended; `beamline.api` calls it ScanResult.
 
     Attributes:
-        path: the scan file; its folder holds everything else. The file that joins the parts of a resumed run.
+        path: the scan file; for a resumed run, the file that joins its parts. Its folder contains everything else.
         n_frames: rows of the file.
-        missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
+        missing: planned rows without a frame. If there are any, the scan raises an error; the event `scan_done` lists
+            them.
         flags: frames that the monitor flagged: their number by check, then by level.
         alarmed_frames: frames with an alarm, without those that were taken again.
-        alarmed_views: views among them.
-        retaken: views that were taken again, because they had one or gave no frame.
-        reference_faults: what is wrong with darks and flats, a sentence or more a group.
+        alarmed_views: projections among the frames with an alarm.
+        retaken: projections that were taken again, because they had an alarm or gave no frame.
+        reference_faults: faults of darks and flats, one or more sentences for each group.
         seconds: real time of the whole run.
         bytes: size of the file that was written.
-        recon: data of the live reconstruction's `done` event; None without one, or where it failed.
+        recon: data of the `done` event of the live reconstruction; None if there was none, or if it failed.
         status: `complete`, `stopped` or `failed`.
         sample: its name.
     """
@@ -64,7 +65,7 @@ class RunResult:
 
     @property
     def clean(self) -> bool:
-        """Whether the scan is complete and no frame, dark or flat has a fault."""
+        """True if the scan is complete and no projection, dark or flat has a fault."""
         return self.status == "complete" and not (self.missing or self.alarmed_frames or self.reference_faults)
 
     def file_values(self) -> dict[str, Any]:

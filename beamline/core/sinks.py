@@ -79,7 +79,7 @@ def _of_reconstruction(event: Event) -> str | None:
             views = count(event.n_views, "projection")
             return f"{event.method} {again}: {views}, rotation axis at column {event.axis_col:.2f}"
         case TrialsStarted(file, trials=trials, by=by):
-            return f"{count(trials, 'trial')} of {file}; quality is measured by {by}"
+            return f"Starting {count(trials, 'trial')} of {file}; the quality of each is measured by {by}"
         case TrialDone():
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
@@ -167,8 +167,8 @@ def _table_of_options(ended: PassEnded) -> Iterator[str]:
     if ended.remark:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
-        answer = f"beamline decide CHOICE, Enter for {one_line(ended.recommended)}"
-        yield f"Within {ended.wait:.0f} s: {answer}; otherwise as planned."
+        yield f"Answer within {ended.wait:.0f} s: beamline decide CHOICE, or Enter for {one_line(ended.recommended)}."
+        yield "Without an answer, the scan continues as planned."
 
 
 def _gain(option: Mapping[str, Any]) -> tuple[str, str]:
@@ -194,7 +194,7 @@ def _decision(chosen: NextChosen) -> str:
 
 def _missing(block: BlockDone) -> str | None:
     parts = [f"{len(block.missing)} missing ({spans(block.missing)})"] if block.missing else []
-    parts += [f"{block.extra} without a trigger"] if block.extra else []
+    parts += [f"{block.extra} extra, without a trigger"] if block.extra else []
     return f"Of {block.n} {block.kind} frames: {', '.join(parts)}" if parts else None
 
 
@@ -246,7 +246,7 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
                 raise  # Ctrl-C
             works = False
             why = f"{type(error).__name__}: {error}"
-            others(Warned(f"An output failed and is not used any more: {why}", time=event.time))
+            others(Warned(f"An output for progress or logs failed and is no longer used: {why}", time=event.time))
 
     return send
 

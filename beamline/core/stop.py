@@ -1,7 +1,7 @@
 """Requests to end work early: StopRequest of a scan, stop scope of a reconstruction, and the signals that ask for it.
 
-The first signal asks for a stop with the data so far, the second ends at once. Python lets only the main thread catch
-signals. Other threads catch nothing; there the request to stop must come from its owner.
+The first signal asks for a stop with the data so far, the second ends at once. In Python only the main thread can catch
+signals. In other threads, the owner of the request must request the stop.
 """
 
 from __future__ import annotations

@@ -97,8 +97,8 @@ def with_points(numbers: Sequence[str]) -> list[str]:
     if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
         beside = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         raise ValueError(
-            f"{one_line(commas[0], 40)} has a comma{beside}, which may or may not be a decimal comma: write one number "
-            "a line, with a decimal point"
+            f"{one_line(commas[0], 40)} has a comma{beside}, and it is not clear whether this is a decimal "
+            "comma: write one number per line, with a decimal point"
         )
     return [text.replace(",", ".") for text in numbers]
 

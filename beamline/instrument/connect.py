@@ -1,7 +1,7 @@
 """Connects all devices of an instrument, as the configuration states them.
 
-Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
-that names a simulator.
+Each kind of device is connected by a separate module. If the instrument is simulated, the module `simulated` makes all
+devices; it is the only module that imports a simulator.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
 
     Args:
         seconds: at most.
-        check_stop: called once a second; its exception ends the wait.
+        check_stop: function that is called once a second; an exception from it ends the wait.
 
     Raises:
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
@@ -156,10 +156,10 @@ class ConnectedDevices:
     Attributes:
         clock: for every wait of the run.
         simulated: facts of the simulator; None at a real instrument.
-        close: frees ports and camera; a second time does nothing.
+        close: frees ports and camera; a second call does nothing.
         beam_monitor: None if none is configured.
-        frame_memory: of the camera's frames; None for a simulated camera.
-        watch_moves: takes what is called again and again while one of the devices moves; its exception ends that move.
+        frame_memory: memory for the frames of the camera; None for a simulated camera.
+        watch_moves: sets a function that is called repeatedly while a device moves; an exception from it ends the move.
     """
 
     devices: Devices
@@ -226,8 +226,8 @@ def connect(
 
 
 def clock_after(config: Config, time: float) -> Clock | None:
-    """The simulated clock, started at `time` (s since the Unix epoch), as each process has its own; None: there is
-    none.
+    """The simulated clock of this process, started at `time` (s since the Unix epoch), because each process has its own
+    clock; None: the clock is not simulated.
     """
     if config.simulation is None:
         return None

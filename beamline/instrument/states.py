@@ -21,7 +21,7 @@ from drivers.base.protocols import ConnectedShutter
 
 @dataclass(frozen=True)
 class DeviceState:
-    """What a device says of itself, or why it cannot be used.
+    """Identity and status of a device, or why it cannot be used.
 
     Attributes:
         name: of the device.
@@ -35,10 +35,10 @@ class DeviceState:
 
 
 def device_states(config: Config, clock: Clock, usb: Any = None) -> Iterator[DeviceState]:
-    """Connect the devices one after the other, ask each who it is and how it stands, and let all go again.
+    """Connect the devices one after the other, read the identity and status of each, and disconnect all of them.
 
-    Nothing moves, and nothing is waited for, such as a cold sensor. A device that does not answer keeps no other one
-    from being asked. What an operator moves by hand is left out.
+    Nothing moves, and the function waits for nothing, such as a cold sensor. If a device does not answer, the others
+    are still read. Devices that the operator moves by hand are left out.
 
     Args:
         usb: a pyusb backend; None: the installed libusb.
@@ -123,7 +123,7 @@ _READ: Mapping[str, Callable[[Any], dict[str, Any]]] = {
     "camera": lambda camera: camera.describe(),
     "shutter": lambda shutter: {"open": shutter.is_open()},
     "sample mover": lambda mover: {"answers": True},
-    "filter": lambda filter_: {"place": filter_.place() or "none that has a name"},
+    "filter": lambda filter_: {"place": filter_.place() or "none of the named places"},
     "monochromator": lambda monochromator: {"energy_kev": monochromator.energy()},
     "beam monitor": lambda monitor: vars(monitor.reading()),
 }  # fmt: skip

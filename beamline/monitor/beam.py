@@ -1,9 +1,9 @@
 """Check `beam`: slow changes of the beam intensity relative to the flats, and sudden ones.
 
-The slow change is measured in air, at the brightest part of a projection. It is reported when it starts, and as info
-each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change), which
-needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like a loss
-of beam. A change therefore counts only if the intensity of the whole projection changed with it.
+The slow change is measured in air, at the brightest part of a projection. The drift is reported when it starts, and as
+info each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change),
+which needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like
+a loss of beam. A change therefore counts only if the intensity of the whole projection changed with it.
 """
 
 from __future__ import annotations
@@ -146,7 +146,10 @@ def _of_integrals(flag: Flag) -> Flag:
     """The flag for a file without counts and flats, in which the intensity is not known."""
     off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
-        advice = f"No line integral of the frame is below {off:.3g}: the sample covers all of it, or air is not at 0."
+        advice = (
+            f"No line integral of the frame is below {off:.3g}: either the sample covers the whole frame, or the line "
+            "integral of air is not 0."
+        )
     else:
         advice = (
             f"Line integrals are wrong by {off:+.3g}, compared with 0 in air or with the projections before. "

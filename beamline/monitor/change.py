@@ -1,11 +1,11 @@
 """Change: the difference between a projection and earlier ones that the rotation of the sample does not explain.
 
-Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
-by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
-stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
-velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The first pass
-weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964). So a
-floater, a zinger or a band hardly affects the fit.
+The last four projections predict each cell of the next one: depth + velocity. The difference from this prediction is
+fitted by least squares with four causes: a different intensity everywhere (gain), a displaced sample (across, down),
+and a step of the stage that differs from the steps before (turn). For the columns of the fit: d depth = -gain - across
+d/dx - down d/dy + turn velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's
+noise. The first pass weights cells by their distance from the median change, the second by their residuals in the first
+pass (Huber 1964). Therefore a floater, a zinger or a band hardly affects the fit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not k
 
 @dataclass(frozen=True, eq=False)
 class SampleChange:
-    """The change of a view from the one before."""
+    """The change of a projection relative to the projection before."""
 
     gain: float  # relative change of the light, of all cells alike
     # across, down: displacement of the sample in pixels of the frame, to the right and downwards

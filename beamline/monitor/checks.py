@@ -1,7 +1,7 @@
 """The registry of the monitor's checks, and the bits by which a file records which checks flagged a frame.
 
-Adding a check takes its file in this folder and its line in REGISTRY, or in CHECKS of a folder of checks. Its keys in
-the configuration, its bits and the legend in a scan file, and its name in `beamline info` follow.
+To add a check, add its file in this folder and a line in REGISTRY, or in CHECKS of a folder of checks. Its keys in the
+configuration, its bits and its legend in a scan file, and its name in `beamline info` then follow automatically.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
         nonlocal found
         check = kind()
         if check.name != name:
-            raise ValueError(f"its class has the name {check.name!r}; expected the entry point's name")
+            raise ValueError(f"the name of its class is {check.name!r}; expected the name of the entry point")
         _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
         found = _distinct(*found, check)
         return check

@@ -25,15 +25,15 @@ ZINGER = 12.0  # times the median change: more is not noise
 
 @dataclass(frozen=True, eq=False)
 class FrameStatistics:
-    """Statistics of a dark, a flat or a view.
+    """Statistics of a dark, a flat or a projection.
 
     Attributes:
-        row: in the file.
-        exposure: s, NaN where unknown.
+        row: row of the frame in the file.
+        exposure: exposure time in s, NaN if unknown.
         saturated: fraction of the pixels at or above the saturation value.
-        blocks: float32, means of blocks of pixels; a part of the preview where that is large.
-        block: pixels a side of a block.
-        rounding: noise that the pixels' type may hide; 0 of real numbers.
+        blocks: float32, means of blocks of pixels; if the preview is large, only a part of it.
+        block: side of a block in pixels.
+        rounding: noise that rounding to the type of the pixels may hide; 0 for real numbers.
         invalid: fraction of the pixels that are not finite.
         cells: float32, means of larger blocks that cover the frame; None: not needed.
     """
@@ -50,32 +50,32 @@ class FrameStatistics:
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> FrameStatistics:
-        """The frame of a running scan, by its digest."""
+        """The statistics of a frame of a running scan, from its digest."""
         return cls(row, kind, exposure, digest.saturated_fraction, np.array(subsampled(digest.preview)), block)
 
     @property
     def seconds(self) -> float:
-        """The exposure, or 1 where it is not known."""
+        """The exposure in s, or 1 if it is not known."""
         return self.exposure if self.exposure > 0 else 1.0
 
     @property
     def rounded_exposure(self) -> float:
-        """An exposure rounded as cameras state it; 0 where it is not known."""
+        """The exposure, rounded as cameras state it; 0 if it is not known."""
         return round(self.exposure, 6) if self.exposure > 0 else 0.0
 
     @property
     def pixels(self) -> int:
-        """About their number: blocks go beyond the edge."""
+        """Approximate number of pixels, because blocks may extend beyond the edge of the frame."""
         return self.blocks.size * self.block**2
 
     @property
     def blank(self) -> bool:
-        """Whether no pixel holds a number."""
+        """True if no pixel has a valid value."""
         return bool(np.isnan(self.blocks).all())
 
     @property
     def constant(self) -> bool:
-        """Whether all blocks hold one number."""
+        """True if all blocks have the same value."""
         known = self.blocks[np.isfinite(self.blocks)]
         return not (known.size and np.ptp(known) > 0)
 
@@ -90,8 +90,7 @@ Group = Sequence[FrameStatistics]
 
 class BadFrames(NamedTuple):
     """Frames of a group that cannot be used: the score, the violated limit, and a sentence with both and with advice.
-
-    Without frames the sentence is about all of them.
+    If no frames are named, the sentence concerns the whole group.
     """
 
     frames: Group

@@ -1,8 +1,8 @@
 """Checks `field`, `mass`, `pixels`: areas without beam, a sample larger than the field of view, total absorption, dead
 pixels.
 
-The total of a parallel projection is equal from every side, unless matter entered or left: the moment of order 0 of
-the consistency conditions of Helgason (1965) and Ludwig (1966).
+In a parallel beam the total absorption is the same in every projection, unless material entered or left the field of
+view. This is the moment of order 0 of the consistency conditions of Helgason (1965) and Ludwig (1966).
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ class FieldOfViewCheck(Logged):
     def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid, entered: bool) -> Flag:
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
-        beside = " It was inside before, so it is off the rotation axis: centre it." * (entered and len(cut) == 1)
+        beside = " It was inside in earlier projections, so it is off the rotation axis: centre the sample." * (
+            entered and len(cut) == 1
+        )
         advice = (
             f"{beyond_the_field(cut)}{beside} This has three effects: the check `mass` is switched off, slow floaters "
             "are not detected, and reconstructions are too bright at the rim."
@@ -163,7 +165,7 @@ class MassCheck(Logged):
     )
 
     warn: float = setting(0.03, "relative change of the total absorption", ge=0)
-    frames: int = setting(3, "projections in a row that must exceed the limit", ge=1)
+    frames: int = setting(3, "number of consecutive projections that must exceed the limit", ge=1)
 
     start = MassState
 

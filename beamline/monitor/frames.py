@@ -1,7 +1,7 @@
 """Checks of single frames: `saturation`, `stuck` (repeated images), `timing`, `dark` (drift of darks), `lost` (beam).
 
-Noise never repeats, so an equal checksum is a frame that was delivered again. Only the alarms of `lost` end a scan by
-default.
+Noise never repeats exactly, so two frames with the same checksum are the same frame, delivered twice. Only the alarms
+of `lost` end a scan by default.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class StuckCheck(Logged):
     name: ClassVar[str] = "stuck"
     bit: ClassVar[int] = 2
     unit: ClassVar[str] = "repetitions"
-    meaning: ClassVar[str] = "the image is identical to the one before: the camera delivered a frame twice"
+    meaning: ClassVar[str] = "the image is identical to the previous image: the camera delivered a frame twice"
 
     start = StuckState
 
@@ -108,7 +108,8 @@ class StuckCheck(Logged):
 
 @dataclass(frozen=True)
 class TimingState:
-    """Trigger, framestamp and time of the projection before; -1 before the first. gaps: triggers without a frame."""
+    """Trigger, framestamp and time of the previous projection; -1 before the first. gaps: number of triggers without a
+    frame."""
 
     trigger: int = -1
     framestamp: int = -1
@@ -120,7 +121,7 @@ class TimingState:
 class TimingCheck(Logged):
     """Score: delay of the frame in periods (negative: early).
 
-    Triggers without a frame before it are an INFO: the frame after the gap is as good as any.
+    If triggers before the frame gave no frame, this is only an INFO, because the frame after the gap is good.
     """
 
     name: ClassVar[str] = "timing"
@@ -145,7 +146,8 @@ class TimingCheck(Logged):
         if lost > 0:
             after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
             advice = (
-                f"{count(lost, 'frame')} missing before this one: the trigger exposed no frame, or the frame was lost."
+                f"{count(lost, 'frame')} missing before this frame: either the trigger did not start an exposure, or "
+                "the frame was lost."
             )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
@@ -155,7 +157,8 @@ class TimingCheck(Logged):
             return CheckResult(after)
         advice = (
             f"Check the stage and the trigger line: the frame came {abs(score):.0%} of a period too "
-            f"{'late' if score > 0 else 'early'}. The stage does not turn evenly, or the trigger line picks up noise."
+            f"{'late' if score > 0 else 'early'}. Either the stage does not turn evenly, or the trigger line "
+            "picks up noise."
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 
@@ -183,7 +186,7 @@ class DarkCheck(Logged):
     unit: ClassVar[str] = "counts of drift"
     meaning: ClassVar[str] = "a dark differs from the first one"
 
-    drift: float = setting(5.0, "counts by which a dark may differ from the first one", ge=0)
+    drift: float = setting(5.0, "counts by which a dark may differ from the first dark", ge=0)
 
     start = DarkState
 

@@ -133,7 +133,9 @@ class MotionCheck(Logged):
     )
 
     alarm: float = setting(0.5, "pixels by which the sample may shift between two projections", ge=0)
-    steps: float = setting(3.0, "angular steps by which the stage may turn too far at once", ge=0)
+    steps: float = setting(
+        3.0, "angular steps by which the rotation between two projections may differ from one step", ge=0
+    )
     shake: float = setting(0.25, "pixels (standard deviation) by which the sample may shake", ge=0)
 
     start = MotionState

@@ -1,8 +1,9 @@
 """Check `opposite`: compares a projection with the opposite one, or with a repetition, to find motion and change.
 
-Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
-degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
-shift since. The remainder is stated as the shift of the whole sample that would leave as much.
+Parallel rays measure the same from both sides: p(angle + 180°, u) = p(angle, -u), where u is the distance from the
+axis. The check keeps a projection every few degrees. It compares it with the projection 180° later, mirrored, or 360°
+later. The best fit gives the rotation axis, and the shift of the sample in between. The remaining difference is stated
+as the shift of the whole sample that would cause the same difference.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A view that is kept until the one half a turn later arrives."""
+    """A projection that is kept until the projection 180° later arrives."""
 
     view: CellView
     after: CellView | None = None  # the next one, later the nearest in angle so far, which gives the velocity
@@ -97,7 +98,9 @@ class OppositeCheck(Logged):
     meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
     warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
-    changed: float = setting(1.0, "pixels by which parts may differ, as an equivalent shift of the whole sample", ge=0)
+    changed: float = setting(
+        1.0, "pixels by which the whole sample would have to shift to cause the same difference in parts of it", ge=0
+    )
     axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
 
     start = OppositeState
@@ -109,7 +112,7 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "they differ in a cone beam" if context.cone else "there are no flats"
+            why = "in a cone beam they differ even if the sample is at rest" if context.cone else "there are no flats"
             advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
@@ -209,8 +212,10 @@ class OppositeCheck(Logged):
         change = (
             f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
-            else f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: it shrank, bent or "
-            "lost something"
+            else (
+                f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: the sample shrank, "
+                "bent or lost something"
+            )
         )
         advice = (
             f"Compare the two frames: relative to {other}, {change}. If `motion` reported a jump, `beamline recon` "

@@ -1,8 +1,8 @@
 """Rules for darks and flats: saturated, without beam, uneven, never written, with beam in darks, or with the sample.
 
-Bad references spoil a volume as surely as bad views. So the same rules judge them before the first projection is taken,
-in `validate` and before a reconstruction: each frame beside its group, the other groups and the views. A new check is a
-predicate and a row in RULES.
+Bad darks and flats spoil a volume as surely as bad projections. The same rules check them before the first projection
+is taken, in `validate`, and before a reconstruction. They compare each frame with its group, with the other groups and
+with the projections. To add a rule, write a predicate and a row in RULES.
 """
 
 from __future__ import annotations
@@ -251,8 +251,8 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (
-                f"something was in the beam. Is the sample out? The intensity differs locally by {places.max():.0%} "
-                f"{how} (limit {limit:.0%})."
+                "something was in the beam. Was the sample out of the beam? The intensity differs locally by "
+                f"{places.max():.0%} {how} (limit {limit:.0%})."
             ))  # fmt: skip
 
 

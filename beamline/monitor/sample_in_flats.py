@@ -1,6 +1,7 @@
 """Rules that find flats with the sample in the beam, by comparing the intensity of flats and projections.
 
-Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
+These rules belong to `beamline.monitor.references`. They compare the intensities of flats and projections on a coarse
+grid, as line integrals.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Views are brighter than flats in places, and less at the edges."""
+    """Rule: projections are brighter than flats at some places, and less so at the edges."""
     if (above := _views_above_flats(evidence)) is not None:
         most = int(np.argmax(above.brightest))
         top = float(above.brightest[most])
@@ -157,9 +158,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
         yield BadFrames(flats, brighter, limit, (
-            "the sample was in the beam, or the beam changed its shape between flats and projections: the projections "
-            f"are locally brighter by {brighter:.2g} in line integral (limit {limit:.2g}), and elsewhere they do not "
-            "absorb more, but a sample can only absorb."
+            "the sample was in the beam, or the beam changed its shape between flats and projections: the "
+            f"projections are locally brighter than the flats by {brighter:.2g} in line integral (limit {limit:.2g}) "
+            "and nowhere else darker than them, but a sample can only absorb."
         ))  # fmt: skip
         return
     turning = depth - mean
@@ -175,7 +176,7 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """A finding where views differ from flats and from one another by noise alone."""
+    """A finding if projections differ from flats and from one another only by noise."""
     if (depth := _depth_over_air(evidence)) is None:
         return
     mean = depth.mean(axis=0)

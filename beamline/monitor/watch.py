@@ -86,7 +86,7 @@ def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
 
 
 class CheckError(Exception):
-    """A check raised; its cause is the error. `name` is the check's."""
+    """A check raised an exception, which is the cause of this error. `name`: name of the check."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the check {name} failed")
@@ -176,9 +176,12 @@ def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
         and all(isinstance(number, Real) for number in numbers)
     )
     if not typed or any(len(box) != 4 for box in boxes if box is not None):
-        raise TypeError(f"its flag has a field of another type: {flag!r:.300}")
+        raise TypeError(f"a field of its flag has the wrong type: {flag!r:.300}")
     if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= at:  # `_from` cuts what reaches too far back
-        raise ValueError(f"its flag is of {flag.check!r}, rows {rows[0]} to {rows[1]}; expected {name!r}, up to {at}")
+        raise ValueError(
+            f"its flag names the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected {name!r} and rows up "
+            f"to {at}"
+        )
     return answer
 
 

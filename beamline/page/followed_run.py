@@ -38,7 +38,7 @@ def published(name: str, about: str, default: Any, unit: str = "") -> Any:
 class RunValues:
     """The current values of a run for control systems. Unknown numbers are NaN or -1.
 
-    Values that tomoscan (APS) also has have the same names.
+    If tomoscan (APS) has the same value, the name is the same.
     """
 
     run: str = published("Run", "folder of the run", "")
@@ -73,10 +73,10 @@ class RunValues:
     option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
     option_times: tuple[float, ...] = published("OptionTimes", "time that each of Options needs", (), "s")
     option_doses: tuple[float, ...] = published(
-        "OptionDoses", "dose of each of Options, as a share of the plan's dose", (), "%"
+        "OptionDoses", "dose of each of Options, as a fraction of the dose of the whole plan", (), "%"
     )
     option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
-    recommended: str = published("Recommended", "the one of Options that the program chooses or would choose", "")
+    recommended: str = published("Recommended", "the choice in Options that the program makes or would make", "")
     wait: float = published(
         "AnswerWithin",
         "time left for the operator to decide what is next; 0: the scan does not wait for a decision",
@@ -119,7 +119,7 @@ class StampedValues:
     """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
 
     Attributes:
-        began: time of values that nothing has set yet, s since the Unix epoch.
+        began: time stamp of values that were never set, in s since the Unix epoch.
         unread: why the file can no longer be read, so that its values are old; "" if it can.
     """
 

@@ -34,7 +34,7 @@ class Recording:
 
     Raises:
         NotReadyError: the file is just being made.
-        DataError: no scan of ours.
+        DataError: the file is not a scan of this program.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +57,7 @@ class Recording:
 
     @property
     def has_references(self) -> bool:
-        """Whether pictures are divided by flats."""
+        """True if pictures are divided by flats."""
         return self._dark_and_flat is not None
 
     def progress(self) -> ScanProgress:
@@ -142,7 +142,8 @@ class Recording:
         return pixels, region, factor
 
     def sinogram(self, row: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.int64], int]:
-        """A detector row in the projections from frame `first` on; of a compressed file, means of the preview's blocks.
+        """A detector row in the projections from frame `first` on; for a compressed file, means of the blocks of the
+        preview.
 
         Returns:
             [view, col / bin] of at most 1024 columns, the frames, and the binning.
@@ -162,7 +163,8 @@ class Recording:
         )
 
     def trace(self, region: TileRegion, first: int) -> list[float | None]:
-        """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""
+        """Mean counts of a region in the frames from `first` on; the region is rounded to whole blocks of the
+        preview."""
         blocks = TileRegion(*(edge // self.preview_bin for edge in astuple(region)))
         rows, cols = blocks.inside((self._preview.shape[1], self._preview.shape[2])).slices
         hdf5.look_again(self._preview)

@@ -75,8 +75,8 @@ def _joined(part: Path) -> Path:
 
 
 class EventLog:
-    """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line comes with the
-    next call; a line that is not an event is skipped, and counted.
+    """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line is returned by
+    the next call; a line that is not an event is skipped and counted.
     """
 
     def __init__(self, folder: Path | None) -> None:

@@ -99,7 +99,8 @@ class ShownScan:
 
     def facts(self) -> dict[str, Any]:
         """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each projection so far
-        (null: not read), two projections about 180 degrees apart and the degrees by which they miss it (null: none)."""
+        (null: not read), two projections about 180 degrees apart and the difference of their angle from 180 degrees
+        (null: there are none)."""
         known = self._degrees[np.isfinite(self._degrees)]
         angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
         over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"

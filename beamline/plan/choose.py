@@ -18,7 +18,7 @@ class PassOption:
     """One choice, with its cost and the predicted improvement in PSNR in dB (NaN: no error model is known).
 
     Attributes:
-        frames, seconds, bytes: what it costs.
+        frames, seconds, bytes: the cost of the choice.
         dose: its exposures of the sample, as a fraction of those of the whole plan.
         low, high: ends of the range of the improvement, as in `recon.base.error_law.Gain`.
     """
@@ -85,14 +85,15 @@ def options(
 def choose(
     offered: Sequence[PassOption], target: ScanTarget, remaining: Gain, seconds: float, dose: float
 ) -> tuple[Choice, str]:
-    """The choice with the best gain a second until the target is met, and why.
+    """The choice with the largest improvement per second until the target is met, and the reason.
 
-    The next pass of the plan keeps its place unless another choice is better beyond the uncertainty of both.
+    The next pass of the plan is chosen unless another choice is better by more than the uncertainty of both.
 
     Args:
-        offered: with known gains.
-        remaining: by all that the plan still has, as of `remaining_gain`.
-        seconds, dose: that the scan has taken, with what follows the passes in any case: offset views, references.
+        offered: the possible choices, with known improvements.
+        remaining: the improvement by the rest of the plan, see `remaining_gain`.
+        seconds, dose: time and dose of the scan so far, including what follows the passes in any case: offset
+            projections, darks and flats.
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
@@ -102,7 +103,7 @@ def choose(
     excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]
     if not allowed:
-        return Choice.ENOUGH, next(iter(excesses.values()), "no choice would improve the volume")
+        return Choice.ENOUGH, next(iter(excesses.values()), "none of the choices would improve the volume")
     best = max(allowed, key=lambda option: option.gain / option.seconds)
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
     taken = following if best.low / best.seconds <= following.high / following.seconds else best
@@ -113,7 +114,7 @@ def choose(
 
 
 def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
-    """The gain by all that the plan still has."""
+    """The predicted improvement by the rest of the plan."""
     views = sum(block.n_to_take for block in passes.to_come) + passes.retakes
     return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.offset))
 
@@ -121,8 +122,8 @@ def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
 def next_is_sure(
     passes: Passes, offered: Sequence[PassOption], target: ScanTarget, law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
-    """Whether the law of an earlier pass already decides: it chooses the next pass, and after that pass the plan surely
-    still has more to gain than the target accepts to lose.
+    """True if the error model of an earlier pass already decides: it chooses the next pass, and after this pass the
+    rest of the plan would certainly still improve the volume by more than the loss that the target accepts.
     """
     choice, _ = choose(offered, target, remaining_gain(passes, law), seconds, dose)
     later = remaining_gain(passes.after(Choice.NEXT), law)

@@ -59,7 +59,7 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     interlaced plans do. The lattice step, not each angle, is rounded: a trigger output counts a fixed distance.
 
     Raises:
-        ValueError: one sentence that says why the plan cannot be flown.
+        ValueError: the plan is not possible as a fly scan; one sentence states why.
     """
     if angles.size < 2:
         raise ValueError(
@@ -71,10 +71,10 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     whole = round(exact)
     if abs(whole / exact - 1) > _OTHER_SPAN:
         raise ValueError(
-            f"views {math.degrees(step):.3g}° apart are {exact:.3g} counts of the stage "
-            f"({math.degrees(abs(scale.per_count)):.3g}° each), which gives pulses at whole ones: they would span "
-            f"{whole / exact:.3g} times the angles of the plan. Take fewer views or a wider span in scan.angles (in "
-            "degrees), or a stage with finer counts"
+            f"the angular step of {math.degrees(step):.3g}° is {exact:.3g} counts of the stage "
+            f"({math.degrees(abs(scale.per_count)):.3g}° each), but the stage can trigger only on whole counts: "
+            f"the scan would cover {whole / exact:.3g} times the planned range. Take fewer projections, or a "
+            "wider range in scan.angles (in degrees), or a stage with finer counts"
         )
     direction = 1 if scale.per_count > 0 else -1
     first = to_counts(float(angles[0])) - direction * whole * int(index[0])
@@ -148,7 +148,7 @@ class PlanFacts:
 
 
 def violations(facts: PlanFacts) -> Iterator[str]:
-    """One sentence for each broken limit."""
+    """One sentence for each violated limit."""
     plan = facts.plan
     if plan.mode is Mode.FLY:
         yield from _timing(facts)
@@ -169,15 +169,16 @@ def violations(facts: PlanFacts) -> Iterator[str]:
             yield f"no {name}: scan.{name}.count is 0; take at least one, or set at: none if you want none"
     if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
         yield (
-            f"scan.pass_views {plan.pass_views} divides {plan.n_views} views into more than {MOST_PASSES} passes; "
-            f"set it to at least {math.ceil(plan.n_views / MOST_PASSES)}, or to 0"
+            f"scan.pass_views {plan.pass_views} divides {plan.n_views} projections into more than {MOST_PASSES} "
+            f"passes; set it to at least {math.ceil(plan.n_views / MOST_PASSES)}, or to 0"
         )
     needed = facts.total_bytes + facts.retake_bytes
     if facts.free_bytes is not None and needed * ROOM + CLOSING > facts.free_bytes:
         yield (
-            f"not enough disk space: the file needs {size(needed)} plus a tenth, and {size(CLOSING)} more when it is "
-            f"closed, but {size(facts.free_bytes)} is free. Free some space, choose another storage.folder, or reduce "
-            "the number of projections, the region or the binning"
+            f"not enough disk space: the file needs {size(needed)} plus a reserve of a tenth, and "
+            f"{size(CLOSING)} more when the file is closed, but {size(facts.free_bytes)} is free. Free some "
+            "space, choose another storage.folder, or reduce the number of projections, the region or the "
+            "binning"
         )
 
 
@@ -211,15 +212,16 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     criterion = math.ceil(math.pi / 2 * camera.shape[1])
     if plan.n_views < criterion:
         yield (
-            f"{plan.n_views} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: filtered "
+            f"{plan.n_views} projections are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: filtered "
             "back-projection will show streaks towards the edge"
         )
     if plan.retakes:
         yield (
-            f"views that the monitor flags (monitor.retake) are taken again after the last view, up to {plan.retakes} "
-            f"(monitor.retake_share): {facts.retake_seconds:.0f} s and {size(facts.retake_bytes)} more at most"
+            "projections that the monitor flags (monitor.retake) are taken again after the last projection, up "
+            f"to {plan.retakes} (monitor.retake_share): {facts.retake_seconds:.0f} s and "
+            f"{size(facts.retake_bytes)} more at most"
         )
-    yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")
+    yield from _reference("flats", plan.flats, plan.exposure, "their intensity will be scaled")
     yield from _reference(
         "darks", plan.darks, plan.exposure, "their hot pixels and dark current differ from those of the projections"
     )
@@ -245,14 +247,15 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
     if facts.flight and facts.flight.interval / facts.plan.period < 0.5:
         slowest = facts.flight.interval
         yield (
-            f"a view every {facts.plan.period:g} s is less than a count a second of the stage; "
-            f"set scan.period_s <= {slowest:g}, take fewer views, or use scan.mode: step"
+            f"with a projection every {facts.plan.period:g} s the stage would turn at less than one count per "
+            f"second; set scan.period_s <= {slowest:g}, take fewer projections, or use scan.mode: step"
         )
     if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (
             f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
-            f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {rounded(period, up=True):g} or take more views"
+            f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {rounded(period, up=True):g} or take more "
+            "projections"
         )
 
 
@@ -261,16 +264,17 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
     least, unit = least_interval(stage), stage.interval_unit
     if interval % unit:
         yield (
-            f"views are {interval} counts of the stage apart, and a trigger output that is toggled needs a multiple of "
-            f"{unit}. Take another number of views, devices.stage.toggle: false where the firmware can, or "
-            "scan.mode: step"
+            f"projections are {interval} counts of the stage apart, but a trigger output that is toggled needs a "
+            f"multiple of {unit} counts. Take another number of projections, use devices.stage.toggle: false if "
+            "the firmware supports it, or use scan.mode: step"
         )
     elif interval < least:
         fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
         yield (
-            f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
-            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer views, a shorter "
-            f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
+            f"projections are {interval} counts of the stage apart, but its trigger output needs at least "
+            f"{least} counts: {stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take "
+            "fewer projections, a shorter devices.stage.pulse_width_s if the stage has this setting, or "
+            f"devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
         )
 
 
@@ -278,9 +282,9 @@ def _limits(facts: PlanFacts) -> Iterator[str]:
     low, high = facts.reach
     slack = math.pi / facts.stage.counts_per_turn
     if low < facts.stage.low - slack or high > facts.stage.high + slack:
-        taxi = f" (with {degrees(facts.views.taxi)} of taxi at each end)" if facts.views.taxi else ""
+        taxi = f" (with {degrees(facts.views.taxi)} of run-up at each end)" if facts.views.taxi else ""
         yield (
-            f"the stage would go from {degrees(low)} to {degrees(high)}{taxi}, its limits are "
+            f"the stage would go from {degrees(low)} to {degrees(high)}{taxi}, but its limits are "
             f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; {' or '.join(_ways_within(facts))}"
         )
 
@@ -295,7 +299,7 @@ def _ways_within(facts: PlanFacts) -> Iterator[str]:
     step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the taxi
     if views.taxi and room > 2 * step:
         yield f"set scan.period_s >= {rounded(step / math.sqrt(2 * stage.acceleration * (room - 2 * step)), up=True):g}"
-    yield "narrow scan.angles"
+    yield "use a smaller range in scan.angles"
 
 
 def _rounding(facts: PlanFacts) -> Iterator[str]:
@@ -304,9 +308,10 @@ def _rounding(facts: PlanFacts) -> Iterator[str]:
         return
     count = 2 * math.pi / stage.counts_per_turn
     yield (
-        f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; triggers fall on whole counts, so "
-        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, and views move by up to "
-        f"{degrees(flight.drift)}. The file holds the angles that were triggered"
+        f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; the stage can trigger only "
+        f"on whole counts, so the step becomes {flight.step} counts = {degrees(flight.step * count)}, and the "
+        f"angles of projections change by up to {degrees(flight.drift)}. The file contains the angles at which "
+        "the stage triggered"
     )
 
 
@@ -314,4 +319,4 @@ def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> 
     if field.at is Place.NONE:
         yield f"no {name} will be taken (scan.{name}.at: none)"
     elif field.exposure != exposure:
-        yield f"{name} are exposed for {field.exposure:g} s and views for {exposure:g} s; {otherwise}"
+        yield f"{name} are exposed for {field.exposure:g} s and projections for {exposure:g} s; {otherwise}"

@@ -72,19 +72,23 @@ class Passes:
 
 
 def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
-    """A sentence on who ended a scan before its plan, and why; "" if nobody did.
+    """A sentence on who ended a scan before the end of its plan, and why; "" if nobody did.
 
     Args:
         decisions: values of the events `next_chosen`, oldest first.
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
     after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
-    chosen = f" of the {by}" if by else ""
+    chosen = f" by the {by}" if by else ""
     chosen += (
         f": {why}".rstrip(".") if why and by != "operator" else ""
     )  # the reason of the operator is only that the operator chose it
     rest = f" {left} planned frames were not taken." if left else ""
-    return f"Ended after pass {after or last.get('number')} by the choice `enough`{chosen}.{rest}" if last else ""
+    return (
+        f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
+        if last
+        else ""
+    )
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:
@@ -93,9 +97,10 @@ def triggers_to_take(*blocks: Block) -> frozenset[int]:
 
 
 def passes_at_start(views: Block, size: int, choices: Iterable[str], offset: Iterable[Block] = ()) -> Passes:
-    """The passes of a scan at the end of its first one, or, after these choices, of the one that it resumes.
+    """The passes of a scan at the end of its first pass, or, after these choices, at the end of the pass that it
+    resumes.
 
-    Its passes are those of the whole plan, also where earlier files have some of their views.
+    The passes are those of the whole plan, even if earlier files contain some of their projections.
 
     Args:
         size: frames of a pass, as of `pass_blocks`.

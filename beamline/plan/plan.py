@@ -147,19 +147,20 @@ class Timeline:
 
     Attributes:
         blocks: in the order of acquisition.
-        duration: s, with taxi, settling, moves, warm-up and reference frames; without views that are taken again.
-        frame_bytes: of one frame's uint16 pixels.
-        total_bytes: of the whole file, pixels and previews; without views that are taken again.
+        duration: time in s, including run-up, settling, moves, warm-up, darks and flats; without projections that are
+            taken again.
+        frame_bytes: size of the uint16 pixels of one frame.
+        total_bytes: size of the whole file, pixels and previews; without projections that are taken again.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
-        step: the same in radians.
+        step: the angular step in radians.
         blur_px: how far a point at the detector's edge moves during an exposure, in pixels.
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
-        violations: every limit that is broken, each one sentence with values and what to do.
-        remarks: facts for the operator that break no limit.
-        plan: that it is computed from.
-        retake_seconds: for the most views that may be taken again.
-        parts: s of `duration` by what they are spent on: a kind of frames (with the moves before and between them),
-            warm_up of the scintillator, return of the stage.
+        violations: one sentence for each exceeded limit, with values and what to do.
+        remarks: facts for the operator that do not exceed a limit.
+        plan: the plan from which the timeline is computed.
+        retake_seconds: time for the largest number of projections that may be taken again.
+        parts: the parts of `duration` in s: of each kind of frames (with the moves before and between them), warm_up of
+            the scintillator, return of the stage.
     """
 
     blocks: tuple[Block, ...]
@@ -213,7 +214,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 def _require(views: int) -> None:
     if views < 1:
-        raise ValueError(f"a plan needs at least 1 view(s), got {views}")
+        raise ValueError(f"a plan needs at least 1 projection, got {views}")
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
@@ -241,8 +242,8 @@ def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.ran
 def pass_order(passes: int) -> NDArray[np.intp]:
     """The order in which the gaps of the first pass are filled: a permutation of 0 ... passes - 1.
 
-    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, without the values that `passes` does not reach.
-    So each pass falls near the middle of the largest gap that is left, for any number of passes.
+    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, leaving out values of
+    `passes` or more. Therefore each pass falls near the middle of the largest remaining gap, for any number of passes.
     """
     _require(passes)
     bits = (passes - 1).bit_length()
@@ -252,30 +253,38 @@ def pass_order(passes: int) -> NDArray[np.intp]:
 
 
 def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """The `fixed` angles in `passes` sweeps of the span; each sweep goes the same way and takes every passes-th view.
+    """The `fixed` angles in `passes` rotations over the range. All rotations have the same direction, and each takes
+    every passes-th projection.
 
-    One direction for all sweeps, because a motor's backlash would shift the views of the sweeps against each other.
+    All have the same direction, because the backlash of a motor would otherwise shift the projections of different
+    rotations against each other.
 
     Raises:
-        ValueError: the passes do not divide the views, or leave fewer than two views a pass.
+        ValueError: the projections cannot be divided into these passes, or a pass would have fewer than two
+            projections.
     """
     _require(views)
     if passes < 1 or views % passes or (passes > 1 and views // passes < 2):
         legal = [p for p in range(1, views // 2 + 1) if views % p == 0] or [1]
         some = ", ".join(map(str, legal[:12])) + (" ..." if len(legal) > 12 else "")
-        raise ValueError(f"{views} views cannot be taken in {passes} equal passes of two or more; legal passes: {some}")
+        raise ValueError(
+            f"{views} projections cannot be divided into {passes} equal passes of two or more projections; "
+            f"possible numbers of passes: {some}"
+        )
     index = (pass_order(passes)[:, None] + np.arange(0, views, passes)[None, :]).ravel()
     return fixed(views, start, span)[index]
 
 
 def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """View k is at start + span * frac(k * GOLDEN) (Köhler 2004): well spread whenever the scan ends."""
+    """Projection k is at start + span * frac(k * GOLDEN) (Köhler 2004): the angles are well spread whenever the scan
+    ends."""
     _require(views)
     return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
 
 
 def one_way(angles: NDArray[np.float64]) -> bool:
-    """Whether views [view] follow each other in one direction, so that until the last one they cover a sector."""
+    """True if the angles [view] follow each other in one direction, so that they cover only a sector until the last
+    one."""
     steps = np.diff(angles)
     return bool((steps > 0).all() or (steps < 0).all())
 
@@ -294,8 +303,8 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     columns = [*zip(*(word.split(",") for word in words if "," in word), strict=False)]
     if any(map(are_a_count, columns)) and all(len({*column}) > 1 for column in columns):
         raise ValueError(
-            f"it holds {[word for word in words if ',' in word][-1]!r}, which may be the number of a view and its "
-            "angle, or have decimals; expected one angle a line"
+            f"it contains {[word for word in words if ',' in word][-1]!r}, which may be the number of a "
+            "projection and its angle, or an angle with a decimal comma; expected one angle per line"
         )
     degrees = []
     for number, (word, plain) in enumerate(zip(words, with_points(words), strict=True), start=1):
@@ -306,10 +315,10 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) or (unknown and word.lower() == "nan")):
-            raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
+            raise ValueError(f"line {number} contains {word!r}; expected one angle in degrees per line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("it contains no angle; expected one angle in degrees a line")
+        raise ValueError("it contains no angle; expected one angle in degrees per line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 
@@ -322,7 +331,7 @@ class Retake:
 
 
 def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
-    """A limited number of the views, evenly spread, so that gaps between them stay small."""
+    """A limited number of the projections, evenly spread, so that gaps between them stay small."""
     return tuple(views[i] for i in spread(np.arange(len(views)), most))
 
 

@@ -1,9 +1,9 @@
 """Timeline: speeds, times and sizes of a plan with one stage and one camera, as values and as lines for the operator.
 
-Darks then flats come before the views; offset views, flats, then darks after them. A fly scan turns at step /
-period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
-to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return at
-full speed between them.
+Darks and then flats come before the projections; offset projections, flats and then darks come after them. In a fly
+scan the stage rotates at step / period, rounded to whole counts per second (the block of projections has this period).
+It starts far enough before the first pulse to reach this speed (`taxi_angle`), and stops as far behind the last pulse.
+All passes have the same direction, and the stage returns at full speed between them.
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ def describe(
         )
     views = timeline.views
     rows, cols = camera.shape
-    stored = f" ({len(views.stored)} of them stored)" if views.stored else ""
+    stored = f" ({len(views.stored)} of them already taken)" if views.stored else ""
     several = f" of {plan.frames_per_view} frames each" if plan.frames_per_view > 1 else ""
     facts = [("views", f"{plan.n_views}{several}{stored}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
@@ -313,10 +313,16 @@ def describe(
         count = 2 * math.pi / stage.counts_per_turn
         facts += [
             ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(count)}{passes}"),
-            ("speed", f"{degrees(views.speed)}/s (the stage's most {degrees(stage.max_speed)}/s)"),
-            ("taxi", f"{degrees(views.taxi)} before the first and after the last trigger"),
+            ("speed", f"{degrees(views.speed)}/s (the stage's maximum is {degrees(stage.max_speed)}/s)"),
+            ("taxi", f"{degrees(views.taxi)} of run-up before the first trigger and after the last one"),
             ("blur", f"{timeline.blur_px:.3g} px at the detector's edge during an exposure"),
-            ("skew", f"{timeline.skew_px:.3g} px there between the first and the last row (rolling shutter)"),
+            (
+                "skew",
+                (
+                    f"{timeline.skew_px:.3g} px at the detector's edge between the first and the last row (rolling "
+                    "shutter)"
+                ),
+            ),
         ]
     else:
         facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
@@ -327,7 +333,10 @@ def describe(
     total = size(timeline.total_bytes)
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [
-        ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
+        (
+            "camera",
+            f"{rows} x {cols} px of {camera.bits} bits, shortest time between triggers {camera.min_period:.6g} s",
+        ),
         ("duration", f"{hms_text(timeline.duration)} (without shutter and sample moves)"),
         ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
     ]

@@ -133,8 +133,8 @@ def _axis_by_views(
     if not estimate.confident or abs(axis_col - stated) <= _CONFIRMED * binning:
         return stated, None
     warn(
-        f"The rotation axis at column {axis_col:.2f} is used, because held-out projections agree better "
-        f"with it than with the file's column {stated:.2f}. To use the file's, give --axis {stated:g}."
+        f"The rotation axis at column {axis_col:.2f} is used, because held-out projections agree better with it "
+        f"than with the file's column {stated:.2f}. To use the column in the file, give --axis {stated:g}."
     )
     return axis_col, estimate
 

@@ -72,7 +72,7 @@ _AIR = 0.1
 _SURE = 4.0  # standard deviations
 # Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
-_SCALED = ". A difference in pixel size between the projections looks the same"  # in width and height alike
+_SCALED = ". A pixel size that differs between the projections has the same effect"  # in width and height alike
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
@@ -106,8 +106,9 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
 
     In a parallel beam, with the sample inside the field of view, moments of the projections check angles, heights,
     turned frames, total absorption and the rotation axis. In other scans, projections of the same rays are compared.
-    The moments are not checked for a part of the rows: those of Diamond 24737 above its metal indicate a range of
-    angles 14 % too large, for an unknown reason. Projections that measured only a part of their pixels are left out.
+    The moments are not checked if only a part of the rows is used: in scan 24737 of Diamond, the rows above the metal
+    indicate a range of angles that is 14 % too large, for an unknown reason. Projections that measured only a part of
+    their pixels are left out.
     """
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)
@@ -187,7 +188,7 @@ def compare_with_flats(
     for finding in check_air_level(scan, level, air, scan.asked.accepted or said or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
-    return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
+    return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}
 
 
 def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
@@ -238,8 +239,8 @@ def _steady(
     first, last = np.unravel_index(int(change.argmax()), change.shape)
     size = float(max(change[first, last], 0)) if opposite.any() else np.nan
     what = (
-        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, show the same "
-        f"sample but differ by {abs(levels[first] - levels[last]):.2f} in line integral"
+        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, must be mirror "
+        f"images, but they differ by {abs(levels[first] - levels[last]):.2f} in line integral"
     )
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
@@ -250,7 +251,7 @@ def _steady(
         "filter changed, or projections of another scan are among them. Use --views to choose "
         "projections that belong together, or --air to state which columns are air."
     )
-    return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
+    return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "in line integral", sentence)
 
 
 def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
@@ -286,7 +287,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
             f"up to {most:+.1%} in total absorption, but {because}. Something else stood in the beam, or "
             "the intensity is wrong. --views leaves projections out."
         )
-        return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the mass", sentence)
+        return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the total absorption", sentence)
     sentence = (
         f"The total absorption changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%} during the "
         f"scan (lowest in frame {frames[shown.mass.argmin()]}, highest in frame "
@@ -294,7 +295,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         "projections belong to another scan, exposure or flat field? Use --views to choose projections "
         "that belong together (every:2 if two intensities alternate), or --volumes if the sample changes."
     )
-    return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the mass", sentence)
+    return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the total absorption", sentence)
 
 
 def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
@@ -305,14 +306,14 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
         mean += weight * data[view]
     roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
-        return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
+        return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of tilt", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
-        "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis "
-        f"seems to be tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} "
-        f"px over {rows} rows. Otherwise edges are doubled in the first and last slices."
+        "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis seems to be "
+        f"tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} px over {rows} "
+        "rows. Without this correction, edges are doubled in the first and last slices."
     )
-    return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
+    return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of tilt", sentence)
 
 
 def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
@@ -332,8 +333,8 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
         else "If the beam is a cone, give --cone SOD:SDD in mm. Without it, densities and shapes are wrong."
     )
     sentence = (
-        f"{check} The projections contradict the stated geometry: rays that were measured from both sides "
-        f"agree for a fan of {shown:.3g} degrees across the detector{away}, but the stated fan has "
+        f"{check} The projections contradict the stated geometry: rays that were measured from both sides agree "
+        f"if the rays to the detector span {shown:.3g} degrees{away}, but with the stated distances they span "
         f"{told:.3g} degrees."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
@@ -431,11 +432,13 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
         if not off.max() <= worst:
             worst = float(off.max())
             sentence = (
-                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure "
-                "the same rays at two times, and in the later one the sample is "
+                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the "
+                "same rays at two times, and in the later one the sample is "
                 f"{', '.join(np.array(words)[off > 1])}{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. "
-                "Other such pairs show the same. One volume blurs what changes. Use --volumes N for "
-                "several volumes in time, --calibrate shifts if the sample moved as a whole, or --views "
-                "for a part of the scan."
+                "Other such pairs show the same. A single volume blurs everything that changes. Use --volumes N "
+                "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for "
+                "a part of the scan."
             )
-    return ConsistencyCondition("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
+    return ConsistencyCondition(
+        "views of the same rays", worst, 1.0, "times the smallest change that is reported", sentence
+    )

@@ -40,10 +40,10 @@ class ScanCorrectionPlan:
     """How the frames of one scan are converted to line integrals, for the rows and the binning of a selection.
 
     Attributes:
-        filters: of projections, with the rows and the binning.
+        filters: filters of projections, with the rows and the binning.
         beam: the open beam; None: the frames are line integrals already.
         preparation: of the selection; logarithms if filters mix pixels.
-        shadow: what stands in the beam of all projections; None: not searched for.
+        shadow: objects in the beam of all projections; None: not searched for.
     """
 
     filters: ViewFilters
@@ -165,8 +165,8 @@ class ScanCorrection:
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            progress: how many of how many frames are done; each is read, divided by the flat, and cleared of
-                zingers.
+            progress: function that gets the number of frames done and their total number; each frame is read, divided
+                by the flat, and cleared of zingers.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
@@ -188,7 +188,8 @@ class ScanCorrection:
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
     ) -> Projections:
-        """The same bits as `at_once`, with at most `batch` frames in memory; the scan is read twice.
+        """Line integrals bit-identical to those of `at_once`, with at most `batch` frames in memory; the scan is read
+        twice.
 
         Args:
             out: float32 [frame, row, col], at least so many: takes the line integrals.
@@ -309,7 +310,7 @@ class ScanCorrection:
         return then != now or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """True if `feed` took an object that stands in the beam of all these projections of a finished scan for
+        """True if `feed` treated an object in the beam of all these projections of a finished scan as part of the
         sample.
         """
         shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self.source, views).shadow
@@ -350,7 +351,7 @@ def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def at_once_memory(source: ScanSource, selection: ScanSelection, frames: int, rows: slice | None = None) -> int:
-    """Memory in bytes for correcting N frames at once, line integrals included; `rows` as in `at_once`.
+    """Memory in bytes that is needed to correct N frames at once, including the line integrals; `rows` as in `at_once`.
 
     Raises:
         ConfigError: the selection does not fit the scan.

@@ -68,8 +68,8 @@ class OpenBeam:
         """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
-            read: detector rows that are read.
-            warn: takes a sentence on damaged frames, on zingers, and on parts of the scan without flats.
+            read: the detector rows to read.
+            warn: function that gets sentences on damaged frames, on zingers, and on parts of the scan without flats.
 
         Raises:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring
@@ -145,8 +145,8 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
     is that of the largest group of darks.
 
     Raises:
-        ConfigError: counts are asked for, and the flats do not determine the gain. Or the gain given makes the
-            photons of the open beam too many or too few for any detector.
+        ConfigError: photon statistics were requested but the flats do not determine the gain; or the given gain means a
+            number of photons in the open beam that is too large or too small for any detector.
     """
     model = selection.step(Preparation)
     if model.noise == "log":
@@ -164,7 +164,7 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
         low, high = _PHOTONS
         if not low <= light <= high:
             raise ConfigError(
-                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} means {light:.3g} "
+                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} would mean {light:.3g} "
                 f"photons per pixel in the open beam of {source.path}; expected {low:g} to {high:g}."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0

@@ -54,7 +54,7 @@ class DiskBuffer:
 
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
-        batch: projections that are corrected at a time.
+        batch: number of projections that are corrected at a time.
     """
 
     views: NDArray[np.float32]
@@ -74,11 +74,11 @@ def prepare_projections(
     Args:
         source: a finished scan.
         selection: what to use.
-        warn: takes a sentence on everything that is unusual but does not stop the work.
+        warn: function that gets a sentence on everything that is unusual but does not stop the work.
         buffer: takes the line integrals on disk, with missing rays and rays of weight 0 (because of flags)
             interpolated, and no `shares`; None: they stay in memory.
         check: raises an error if the geometry of the projections is wrong, before they are corrected.
-        phases: takes the name of each phase as it begins.
+        phases: function that gets the name of each phase when the phase begins.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -254,7 +254,7 @@ def assemble(
     Args:
         geometry: of these projections.
         axis: the column, and how it was found; None if it was given.
-        usable: the projections that were chosen from.
+        usable: the projections from which the selection chose.
         on_disk: weights of rays in the regions of flags are computed on request.
 
     Raises:

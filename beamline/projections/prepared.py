@@ -28,10 +28,10 @@ class PreparedProjections:
     """Line integrals ready for reconstruction.
 
     Attributes:
-        projections: of the projections used; view_ids are their rows in the file.
+        projections: line integrals of the projections used; their `view_ids` are rows in the file.
         geometry: of these projections, binned; mm, or px if the pixel size is unknown.
         axis_col: rotation axis in columns of the full detector.
-        axis: how it was found; None if it was given.
+        axis: how the axis was found; None if it was given.
         held_out: some projections that are not used, with weights as `projections.weights` of those used (None: the
             weight of a usual ray of these); None if all are used.
         held_out_ids: rows of the file of these projections; None: unknown.
@@ -39,15 +39,15 @@ class PreparedProjections:
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view], less than 1 for projections with a warning of the monitor; None: 1 for all.
-        left_out: projections with an alarm of the monitor, or after a jump of the sample: the selection does not
-            choose from them.
+        left_out: projections with an alarm of the monitor, or after a jump of the sample: the selection never includes
+            them.
         flags: of all frames of the scan; None if the file has no flags.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         done: what each step did, by name, in the order of the steps.
-        shares_of: `shares` of some projections and rows, computed on request if line integrals are on disk; None:
-            use `shares`.
-        times: [view] s when each was exposed; None: no method asked for it.
+        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
+            disk; None: use `shares`.
+        times: [view] time of the exposure of each projection in s; None: the method does not need it.
         laws: the residuals of the consistency conditions, in words, by name.
         sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or
             measured.
@@ -128,7 +128,7 @@ class PreparedProjections:
         return self.wanted(self.geometry.is_centred)
 
     def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
-        """The same projections without those that are not wanted, [view]."""
+        """The same projections, restricted to those that are wanted, bool [view]."""
         return self if views.all() else self.of_views(np.flatnonzero(views))
 
     def of_views(self, views: I64) -> PreparedProjections:
@@ -249,9 +249,8 @@ def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
 
 
 def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
-    """Used and held-out projections as one set, and the numbers of the held-out ones in it.
-
-    The two geometries are of the same set-up.
+    """Used and held-out projections as one set, and the indices of the held-out projections in this set. The geometries
+    of both belong to the same set-up.
     """
     if held_out is None:
         return projections, geometry, []
@@ -266,7 +265,7 @@ def hold_out(
 
     Args:
         most: number of held-out projections at most.
-        advice: how to do without, for the error.
+        advice: what the user can do instead, for the error message.
 
     Raises:
         ConfigError: fewer than two projections would be left.

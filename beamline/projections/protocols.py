@@ -54,7 +54,7 @@ class PrepStep(NamedStep, Protocol):
         """
 
     def memory(self, part: ScanPart) -> StepMemory:
-        """The memory that it needs, known before any frame is read.
+        """The memory that the step needs, known before any frame is read.
 
         Raises:
             ConfigError: the step does not fit the scan.

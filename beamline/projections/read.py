@@ -91,8 +91,8 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 def tell_damaged(
     source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn
 ) -> NDArray[np.bool_]:
-    """Report which frames are left out: unreadable ones and, if the selection says so, those that differ from their
-    checksum. Each is named in a warning.
+    """Warn of the frames that are left out: unreadable frames and, if the selection requires it, frames that differ
+    from their checksum. The warning lists the frames.
     """
     lost = np.isin(frames, sorted(source.unreadable))
     if lost.any():
@@ -255,9 +255,9 @@ class ViewReader:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
         self.named.update(news.tolist())
         self.warn(
-            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} "
-            f"({frames_text(news)}) had no beam: the shutter was closed, the beam was lost, or the file "
-            f"was never written there. {'It is' if news.size == 1 else 'They are'} left out{gap}."
+            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} ({frames_text(news)}) had "
+            "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "
+            f"file. {'It is' if news.size == 1 else 'They are'} left out{gap}."
         )
 
     def no_view(self) -> NoViewError:

@@ -41,7 +41,9 @@ def registered() -> tuple[type[PrepStep], ...]:
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
         names_of_options = {option.name for option in options_of(step).values()}
         if step.name != name or not isinstance(step(), ViewStep | PlaceStep | ScanStep):
-            raise ValueError(f"{step.__name__} is not a ViewStep, PlaceStep or ScanStep with the entry point's name")
+            raise ValueError(
+                f"{step.__name__} is not a ViewStep, PlaceStep or ScanStep with the name of the entry point"
+            )
         if names_of_options & taken or not by_name.keys() >= set(step.follows):
             raise ValueError(
                 f"it has an option of another step ({names_of_options & taken}), or follows a step that "

@@ -26,7 +26,7 @@ class SkippedChecks:
     """Number of exposed projections so far, and for how many of them each check was skipped.
 
     Attributes:
-        views: their number.
+        views: number of exposed projections.
         alone: projections that were not compared with earlier ones.
         without_flats, cones, wider: projections of a scan without flats, of a cone beam, of a sample wider than the
             field of view.
@@ -90,7 +90,7 @@ class Kind:
     """All flags of a check at one level.
 
     Attributes:
-        frames: their numbers in the file, ascending.
+        frames: numbers of the flagged frames in the file, ascending.
         worst: the flag with the largest ratio of score to limit.
     """
 
@@ -105,12 +105,12 @@ class ScanVerdict:
     """The result of the monitor for a whole scan.
 
     Attributes:
-        n_frames: that were checked.
-        kinds: its flags by check and level, the worst level first.
+        n_frames: number of frames that were checked.
+        kinds: the flags by check and level, the worst level first.
         alarmed: numbers of the frames with an alarm, without those that were taken again.
         retaken: numbers of the projections that were taken again.
         references: what is wrong with darks and flats, a text for each group.
-        altered: what in the file is not as it was written; "" if all is.
+        altered: a sentence on what in the file differs from its stored checksums; "" if nothing differs.
         aside: for how many projections each check was skipped, or which checks failed with an error.
     """
 
@@ -147,7 +147,7 @@ def replay(
     Args:
         follow: the clock to wait with for further frames, until the file is finished; None: check the frames that
             are present.
-        should_stop: asked before each frame.
+        should_stop: function that is called before each frame; True ends the replay.
 
     Raises:
         DataError: a followed file that stopped growing before it was finished.
@@ -164,7 +164,7 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """The verdict on the frames, together with the faults of darks, flats and the file.
 
     Args:
-        limits: of darks and flats; None: those of a new scan.
+        limits: limits for darks and flats; None: the default limits.
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(source.table.replaced.tolist())

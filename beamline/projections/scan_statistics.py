@@ -26,11 +26,11 @@ class KindStatistics:
     """Statistics of the pixel values of one kind of frame.
 
     Attributes:
-        frames: that were examined, of `of`.
+        frames: number of frames that were examined, out of `of` frames.
         minimum, maximum, mean, deviation: of all their finite pixels.
-        percentiles: at PERCENT, to a count, or to 1/65536 of the range of real numbers.
-        saturated: share of pixels at the greatest number of the pixels' type; 0 of real numbers.
-        not_finite: share of pixels.
+        percentiles: percentiles at PERCENT, exact to one count, or, for real numbers, to 1/65536 of their range.
+        saturated: fraction of the pixels that have the largest value of their type; 0 for real numbers.
+        not_finite: fraction of the pixels that are not finite.
         absolute: sum of the absolute values of a frame, mean over frames.
         edges, pixels: the histogram.
     """
@@ -165,10 +165,10 @@ class Light:
     """Photons and dose of one projection of a scan.
 
     Attributes:
-        views: of the scan.
+        views: number of projections of the scan.
         photons: per pixel and projection, in the open beam at the sample.
         gray: dose at the surface of the sample per projection; None: not asked for.
-        material: that absorbs it, and the energy, in words.
+        material: the absorbing material and the energy, in words.
     """
 
     views: int

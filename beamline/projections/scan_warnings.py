@@ -144,7 +144,11 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         large = "Shield the detector against scattered and direct X-rays: bright spots larger than 3 x 3 pixels"
         warn(Note(f"{large} ({count(n, 'pixel')} brighter than the open beam) are not removed and make streaks."))
     shares = (
-        (unseen.mean(), Note, "of the detector got no beam or is saturated. Its rays count as missing data."),
+        (
+            unseen.mean(),
+            Note,
+            "of the detector got no beam or is saturated. The rays of these pixels count as missing data.",
+        ),
         (
             (masked & ~unseen).mean(),
             Note,

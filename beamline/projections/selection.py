@@ -31,16 +31,16 @@ class Selection:
     Attributes:
         views: a selection of projections, see recon.base.views.parse_views.
         rows: (first, end) detector rows; None: all.
-        binning: pixels averaged per side.
+        binning: number of pixels averaged along each side.
         axis_col: rotation axis in columns of the full detector; None: it is searched for.
-        sample_width: across the beam, for a sample wider than the field of view, in mm (in px if the pixel size is
-            unknown); None: the file's value, or measured.
+        sample_width: width of the sample across the beam, if it is wider than the field of view, in mm (in px if the
+            pixel size is unknown); None: the value in the file, or estimated from the projections.
         pixel_size_mm: at the sample (of a cone: on the detector); None: the file's value.
         cone: mm from the source to the rotation axis and to the detector; None: the file's values, or a parallel
             beam.
-        central_row: detector row at which the ray perpendicular to the axis meets the detector (cone beam), also
-            outside it; None: the middle row.
-        seed: of random selections of projections.
+        central_row: for a cone beam, detector row at which the ray perpendicular to the rotation axis meets the
+            detector; it may lie outside the detector; None: the middle row.
+        seed: seed of random selections of projections.
         axis_rows: (first, end) detector rows from which the axis is found; None: those of `rows`.
         steps: corrections whose settings differ from the defaults, see `beamline.projections.corrections`.
     """
@@ -68,12 +68,13 @@ class Selection:
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:
-        """The same selection with these steps, each replacing the one of its class."""
+        """The same selection with these steps; each replaces the step of the same class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 
     def of(self, source: ScanSource) -> ScanSelection:
-        """What this selects of a scan.
+        """Apply the selection to a scan: check it, and fill in pixel size, distances and sample width from the scan
+        file.
 
         Raises:
             ConfigError: the rows lie outside the detector, a bin is larger than the selected rows or the width of
@@ -185,7 +186,7 @@ def choose_views(
         raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:
         raise ConfigError(
-            f"--views {selection.views} leaves {chosen.size} of the {frames.size} projections of "
+            f"--views {selection.views} selects only {chosen.size} of the {frames.size} projections of "
             f"{source.path}; a volume needs at least 2."
         )
     return chosen

@@ -81,7 +81,7 @@ class StepDone:
     """What a step did.
 
     Attributes:
-        sentence: a sentence; empty if nothing was asked, or nothing found.
+        sentence: a sentence for the user; empty if nothing was requested or found.
         parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
         warned: the sentence was already given as a warning.
     """

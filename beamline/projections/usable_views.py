@@ -92,7 +92,7 @@ class UsableViews:
         sentence: what was done, in a line; empty if no projection is flagged.
         flags: of all frames, from which the other fields follow unless they are ignored; None: the file has none.
         regions: parts of projections with less weight, in projections that are used otherwise.
-        jumps: int64, rows after which the monitor saw the sample in another place; ascending.
+        jumps: int64, ascending, rows after which the sample had another position according to the monitor.
     """
 
     scan: ScanEvidence

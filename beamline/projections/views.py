@@ -136,7 +136,7 @@ def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> U
     Faults of the file that do not prevent a reconstruction become warnings, and so does the effect of the flags.
 
     Raises:
-        DataError: it cannot be reconstructed; with every reason, and what to do about each.
+        DataError: the scan cannot be reconstructed; the message lists every reason and what to do about it.
     """
     asked = selection.step(Preparation)
     by_option = {

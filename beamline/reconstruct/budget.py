@@ -18,16 +18,17 @@ _TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
 def in_budget(
     method: Method, budget: float, geometry: Geometry, grid: Grid, now: Clock, warn: Warn
 ) -> tuple[Method, str]:
-    """The choice restricted to methods that end in time, or to the quickest; and in words which stay, and why.
+    """The choice, restricted to methods that end in time, or to the fastest method; and a sentence on which methods
+    remain and why.
 
-    A few iterations of each are timed, then forecasts are compared with the seconds that are left. Nothing else
-    changes: the methods that are left run as without a budget, to their own end.
+    A few iterations of each method are timed, and the predicted times are compared with the remaining seconds. Nothing
+    else changes: the remaining methods run to their usual end, as without a time limit.
 
     Args:
-        warn: is told where even the quickest will be late.
+        warn: function that gets a sentence if even the fastest method will be late.
 
     Raises:
-        ValueError: no method takes these views.
+        ValueError: no method can use these projections.
     """
     end = now() + budget
     timing = Timing(geometry, grid, now, _TIMED_VOXELS)
@@ -46,8 +47,8 @@ def in_budget(
         chosen = _without_slow(method, kept)
     if (late := expected - (end - now())) > 0:
         warn(
-            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which is "
-            f"used now, ends about {duration_text(late)} late."
+            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which "
+            f"is used now, will end about {duration_text(late)} after this limit."
         )
     names = [each.name for each in kept]
     out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]

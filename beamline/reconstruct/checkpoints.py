@@ -28,7 +28,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
     """The origin of a fit or a slab: checksum of its data, geometry and settings.
 
     Args:
-        prepared: line integrals and geometry; views held out do not matter.
+        prepared: line integrals and geometry; held-out projections have no effect.
         settings: of the fit, or a method: a dataclass.
         others: seed, start and similar values, by name.
     """
@@ -72,8 +72,8 @@ class CheckpointOptions:
     """The checkpoint files of a fit: where to write, and which to resume from.
 
     Attributes:
-        path: to write; None: no checkpoint.
-        resume: to resume from; None: begin anew.
+        path: checkpoint to write; None: no checkpoint.
+        resume: checkpoint to resume from; None: start from the beginning.
     """
 
     path: Path | None = None
@@ -94,15 +94,16 @@ class CheckpointOptions:
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
-        """The state to resume from; None if the fit starts anew.
+        """The state to resume from; None if the fit starts from the beginning.
 
         Args:
             origin: of the fit, see `origin_of`.
-            steps: planned number; 0 if a time is planned.
-            warn: takes a sentence if the plan differs, so that the volume differs from that of an uninterrupted fit.
+            steps: planned number of steps; 0 if a time limit is planned.
+            warn: function that gets a sentence if the plan differs, because the volume then differs from that of an
+                uninterrupted fit.
 
         Raises:
-            ConfigError: the fit has more steps behind it than planned.
+            ConfigError: the fit has already made more steps than planned.
             DataError: the checkpoint was made from something else.
         """
         if self.resume is None:
@@ -111,12 +112,16 @@ class CheckpointOptions:
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
-                f"--resume {self.resume} has already {reached.step} steps, more than the {steps} requested. Use "
-                f"--steps {reached.step} or more, or start again without --resume."
+                f"--resume {self.resume} already contains {reached.step} steps, more than the {steps} steps that "
+                f"you requested. Use --steps {reached.step} or more, or start again without --resume."
             )
         if steps != kept.steps or steps == 0:
-            was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
-            plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
+            was, now = (f"{n} steps" if n else "a time limit" for n in (kept.steps, steps))
+            plans = (
+                f"that was planned for {was}, and this fit is planned for {now}"
+                if was != now
+                else "that was planned for a time limit, like this fit"
+            )
             warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
         return kept.state
 

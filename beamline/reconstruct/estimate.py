@@ -28,15 +28,15 @@ from recon.warm_up import warm_up
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(Need):
-    """Estimated time, memory and disk of a reconstruction. Seconds exclude reading and correction; no scratch means it
-    runs in memory.
+    """Estimated time, memory and disk space of a reconstruction. The seconds do not include reading and correction.
+    `scratch` is 0 if the reconstruction runs in memory.
 
     Attributes:
         shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
-        at_once: bytes of memory with everything in it.
+        at_once: bytes of memory if everything is in memory.
         allowed: bytes of memory that may be used.
-        slabs: that are still to be made.
-        done: slices that a partial volume has.
+        slabs: number of slabs that are not yet reconstructed.
+        done: number of slices that a partial volume already has.
         free: bytes on the disk of the output.
     """
 
@@ -66,9 +66,9 @@ class Estimate(Need):
 
     def _time(self) -> str:
         if self.seconds is None or self.least_seconds is None:
-            return f"not known: {self.method} has to be tried"
+            return f"not known, because the time of {self.method} cannot be predicted"
         most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
-        span = f"{most}; {least} where the data end it early" if self.least_seconds < self.seconds else most
+        span = f"{most}; {least} if the data let it stop early" if self.least_seconds < self.seconds else most
         return f"{span}; reading and correction not counted"
 
 
@@ -77,10 +77,10 @@ def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
     few iterations on simulated views; frames are read only to find a region around the sample.
 
     Raises:
-        DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
-            partial volume with another number of slices.
+        DataError: the reconstruction does not fit into the memory or on the disk; the message names the option that
+            would make it fit. Also for a partial volume with another number of slices.
         ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
-        All else that the reconstruction refuses before it reads a frame.
+        All other errors that the reconstruction raises before it reads a frame.
     """
     truth = refuse_before_reading(options)
     with options.source.open() as source:

@@ -131,8 +131,8 @@ class AxisSearch:
         self._next, self._turned, self._told = _FIRST_VIEWS, 0.0, False
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Search the axis in these views (rows of the file), if it is time. While the scan runs, only a clear optimum
-        counts.
+        """Search the axis in these projections (rows of the file), if a search is due. While the scan runs, only a
+        clear optimum is accepted.
 
         Raises:
             DataError: the scan has ended, and no axis is found.
@@ -165,13 +165,15 @@ class AxisSearch:
 
 
 _NOISE_FLATS = 8  # at most, which show the noise of a frame
-_NO_GAIN = "No gain by further views is predicted"
+_NO_GAIN = "The improvement by further projections is not predicted"
 
 
 class PassLaws:
-    """Measures the law of the error at the end of each pass, once all usable views until then are corrected.
+    """Measures at the end of each pass how the error of the volume depends on the number of projections (the law of the
+    error), once all usable projections until then are corrected.
 
-    A pass whose law is not measured yet when the next one ends is left out: only the newest law is of use.
+    If the next pass ends before the law of a pass is measured, this pass is left out, because only the newest law is
+    used.
     """
 
     def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
@@ -182,8 +184,9 @@ class PassLaws:
     def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
         """Measure and report the law at the end of the newest pass, unless this was done already.
 
-        It is measured on ordinary views. Where there are wide ones, the density beside the field is known, and the
-        offset of the law is 0. What prevents a law becomes a warning, and the reason in an event without its numbers.
+        The law is measured on ordinary projections. If there are also laterally offset projections, the density outside
+        the field of view is known, and the offset of the law is 0. If no law can be measured, a warning gives the
+        reason, and an event has the reason instead of the numbers.
         """
         ends = self._views.source.table.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -193,7 +196,7 @@ class PassLaws:
             return
         self._end = end
         if references_follow or axis_col is None:  # a scan that waits for the law takes no frame that might show it
-            missing = "darks or flats are not there" if references_follow else "the rotation axis is not known"
+            missing = "darks or flats have not been taken" if references_follow else "the rotation axis is not known"
             self._no_law(ends.size, 0, f"{missing} yet")
             return
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
@@ -206,7 +209,7 @@ class PassLaws:
         }
         rows = np.array([*images], np.int64)
         if not rows.size or correction is None:
-            self._no_law(ends.size, 0, "none of the views can be used")
+            self._no_law(ends.size, 0, "none of the projections can be used")
             return
         views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
         try:
@@ -214,7 +217,7 @@ class PassLaws:
             open_beam = correction.open_beam(_NOISE_FLATS)
             law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
-            self._no_law(ends.size, rows.size, str(error) or "the memory does not suffice")
+            self._no_law(ends.size, rows.size, str(error) or "there is not enough memory")
             return
         if (self._views.source.table.offset_views < end).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)

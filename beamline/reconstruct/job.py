@@ -145,7 +145,7 @@ class Job:
 
     @property
     def method(self) -> Method:
-        """The method that reconstructs the volume from these views."""
+        """The method that reconstructs the volume from these projections."""
         return self.final_fit or self.options.method_for(self.prepared.geometry)
 
     def say(self, text: str, state: str = "slab") -> None:

@@ -4,8 +4,8 @@
 WAITS_FOR_REFERENCES --darks and flats can be used--> WAITS_FOR_AXIS --its column is known--> FEEDS --finish--> ENDED
 ```
 
-Each look at the file goes as far as it can: with the first view it may pass two states, and feed a batch. `Cursor` says
-how far the fit has come in the file.
+Each reading of the file goes as far as possible: with the first projection it may pass two states and feed a batch.
+`Cursor` states how far the fit has come in the file.
 """
 
 from __future__ import annotations
@@ -58,12 +58,14 @@ _OUTDATED = (
     "or new angles lie between earlier ones (neighbours in angle are used to find zingers)"
 )
 _NEXT_PART = (
-    "Correcting all projections again, each with the flats of its own part, because the next part of the run starts"
+    "Correcting all projections again, because the next part of the run starts: each projection is corrected "
+    "with the flats of its own part"
 )
 _SEVERAL_PARTS = "Correcting all projections again at the end of the run, because the run has several parts"
 _OFFSET = "Correcting all projections again, now together with the laterally offset projections"
 _SHADED = (
-    "Correcting all projections again without an object that is in the beam in all projections, but not in the flats"
+    "Correcting all projections again, because an object is in the beam in all projections, but not in the "
+    "flats: its rays are no longer used"
 )
 
 
@@ -98,22 +100,23 @@ class ScanFollower:
 
     @property
     def n_views_taken(self) -> int:
-        """Number of views that the fit has used."""
+        """Number of projections that the fit has used."""
         cursor = self._cursor
         return sum(batch.view_ids.size for batch in cursor.batches) + (cursor.newest is not None)
 
     @property
     def waiting(self) -> int:
-        """Number of views in the file that the fit has not used yet."""
+        """Number of projections in the file that the fit has not used yet."""
         return self._uncorrected + (0 if self._fit is None else self._fit.n_unlearnt)
 
     @property
     def has_volume(self) -> bool:
-        """Whether the fit has taken enough views to give a volume if it stops now."""
+        """True if the fit has used enough projections to give a volume if it stops now."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
 
     def take_new_frames(self, ended: bool) -> bool:
-        """Read the file and feed the fit with at most one batch of new views. Returns whether the file has grown."""
+        """Read the file and feed the fit with at most one batch of new projections. Returns True if the file has
+        grown."""
         assert self.state is not FollowState.ENDED
         n = self.source.refresh()
         grown = n > self._cursor.frames
@@ -249,11 +252,13 @@ class ScanFollower:
     def correct_again(self, usable: UsableViews, why: str, wide: NDArray[np.int64] = _NONE) -> None:
         """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
 
-        Does nothing if the views are of one part, references and air columns are unchanged, nothing stands in the beam
-        of all views, and no `wide` ones (rows of the file) join them. `why` is reported, unless views are unlearned.
+        Does nothing if all projections belong to one part, references and air columns are unchanged, no object is in
+        the beam of all projections, and no `wide` (laterally offset) projections join them. `why` is reported, unless
+        projections are removed from the fit.
 
-        Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
-        again. Then the model goes on without them, at the first rates.
+        Some of these projections may have become unusable, because a check flagged them after later projections
+        arrived, or because the scan took them again. The fit then continues without them, with the initial learning
+        rates.
         """
         assert self._correction is not None and self._fit is not None
         fed = self._cursor.view_ids
@@ -308,13 +313,13 @@ class ScanFollower:
         self._sink(StateEntered("behind", message, time=self._clock.now()))
 
     def measure_law(self) -> None:
-        """Once a pass of views is corrected, measure and report the law of the error."""
+        """Once a pass of projections is corrected, measure and report the law of the error."""
         self._laws.look(self._cursor, self.axis_col, self._correction)
 
     def draw_slices(self, pause: float | None = None) -> None:
-        """Draw slices of the views so far, if there are new ones and `pause` s have passed (None: now).
+        """Draw slices of the projections so far, if there are new projections and `pause` s have passed (None: now).
 
-        Before the axis is known they are about the middle of the detector.
+        Before the axis is known, the middle of the detector is used as axis.
         """
         if self.state is FollowState.WAITS_FOR_AXIS and self._correction is not None:
             self._slices.draw_about_middle(self._correction.renewed, pause)
@@ -328,11 +333,11 @@ class ScanFollower:
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def prepared(self) -> PreparedProjections:
-        """All views, with their final correction, as the model was fitted to them, and wide ones. No view is added
-        afterwards.
+        """All projections with their final correction, as the model was fitted to them, and the laterally offset
+        projections. No projection is added afterwards.
 
         Raises:
-            DataError: a scan without two views that can be used.
+            DataError: fewer than two projections of the scan can be used.
         """
         self._scan = self._scan.renewed()
         usable = checked_views(self._scan, self._selection, self._warn)
@@ -351,7 +356,8 @@ class ScanFollower:
         return self._prepared(self.axis_col, usable)
 
     def final_fit(self, seconds: float, snapshot_every: float) -> FinalFit:
-        """The end of the fit, to be run on the prepared views: one pass over all of them and sweeps, with snapshots."""
+        """The final fit, to be run on the prepared projections: one pass over all of them, then the refinement of the
+        voxel volume, with snapshots."""
         assert self._fit is not None
         last = self._clock.now()
 

@@ -178,9 +178,9 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"Use {rows}--bin, because volumes in time cannot be made in slabs: {options.method.volumes} volumes, "
-            f"each of {Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of memory, but "
-            f"{size(memory)} is allowed. Nothing was written."
+            f"Use {rows}--bin, because a time series cannot be reconstructed in slabs: {options.method.volumes} "
+            f"volumes, each of {Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of "
+            f"memory, but {size(memory)} is allowed. Nothing was written."
         )
     poses = stated_poses(source, options.selection)
     whole = {
@@ -193,7 +193,8 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         if given:
             raise ConfigError(
                 f"{option} needs the whole scan in memory: {source.path} needs {size(needs.at_once)}, but "
-                f"{size(memory)} is allowed. Leave it out, or use --bin {2 * options.selection.binning} or --rows."
+                f"{size(memory)} is allowed. Leave out this option, or use --bin {2 * options.selection.binning} "
+                "or --rows."
             )
 
 
@@ -226,5 +227,5 @@ def cluster(spec: str) -> AbstractContextManager[Any]:
 
 
 def local_workers(spec: str | None) -> int:
-    """Number of workers to start on this machine; 0 where a scheduler has its own, or there is no cluster."""
+    """Number of workers to start on this machine; 0 if a scheduler has its own workers, or if there is no cluster."""
     return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0

@@ -81,7 +81,7 @@ class OutputPaths:
         """
         free = shutil.disk_usage(self.output.parent).free
         if n_bytes + meanwhile > free:
-            work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
+            work = f" and {size(meanwhile)} more during the reconstruction" if meanwhile else ""
             raise DataError(
                 f"Not enough disk space: the volume needs {size(n_bytes)}{work}, but the disk of {self.output} has "
                 f"{size(free)} free. Free some space, name an output on another disk with -o, or use --bin. Nothing "

@@ -1,5 +1,5 @@
-"""The pipeline: from options to a volume with its report. What differs is the source of views: a file that is whole, or
-one that grows."""
+"""The pipeline: from options to a volume with its report. There are two sources of projections: a finished file, or a
+file that is still growing."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
     Raises:
         DataError: the file is not a scan, or it stopped growing without being finished.
-        KeyboardInterrupt: stopped before there was a volume.
+        KeyboardInterrupt: the user stopped before there was a volume.
     """
     timing, sink, clock = options.follow, channels.sink, channels.clock
     assert timing is not None

@@ -1,4 +1,4 @@
-"""Plans a reconstruction: memory, disk and slabs, and errors if they do not suffice.
+"""Plans a reconstruction: memory, disk space and slabs, and raises an error if memory or disk space are not enough.
 
 A run follows the plan that its dry run states.
 """
@@ -110,13 +110,13 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
 
 
 def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepared: PreparedProjections) -> ReconPlan:
-    """The plan for the views after reading.
+    """The plan for the projections after they were read.
 
     Args:
-        plan: before they were.
+        plan: the plan from before they were read.
 
     Raises:
-        DataError: the volume does not fit, as its axis was found near an edge.
+        DataError: the volume does not fit into the memory, because its axis was found near an edge.
     """
     geometry = prepared.geometry
     method, shares = options.method, prepared.shares
@@ -128,8 +128,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         taller=method.knows_outside and taller_than_field(prepared.projections.data, geometry),
         weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
-    more = "the sample goes on beyond the field" if needs.radius is not None or needs.taller else ""
-    more = more or "some pixels have no data, so each ray needs a weight" * bool(needs.weights)
+    more = "The sample extends beyond the field of view" if needs.radius is not None or needs.taller else ""
+    more = more or "Some pixels have no data, so each ray needs a weight" * bool(needs.weights)
     if geometry.is_cone and more and needs.at_once > plan.allowed:
         raise DataError(
             f"{source.path}: not enough memory. {more}, and the {needs.method.name} volume needs "
@@ -148,7 +148,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
 
 
 def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
-    """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
+    """Raise DataError or ConfigError if the geometry of all projections does not allow the reconstruction, once the
+    axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.volumes > 1:
@@ -168,8 +169,9 @@ def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry)
     volumes, least = options.method.volumes, options.method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
-            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes of {geometry.n_views} "
-            f"views: expected {least} views or more for each. Nothing was written."
+            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes from "
+            f"{geometry.n_views} projections are too many, because each volume needs at least {least} "
+            "projections. Nothing was written."
         )
     if options.uncertainty:
         refuse_views(options.method_for(geometry), geometry)
@@ -190,11 +192,14 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
         return _plan(options, needs, allowed, slabs, slabs)
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
-        raise DataError(f"{partial} is of {slabs[-1].own.stop} slices, this volume has {slices}.")
+        raise DataError(
+            f"{partial} contains a volume of {slabs[-1].own.stop} slices, but this reconstruction has {slices}. "
+            "Use the same options as then, or start again without --resume."
+        )
     if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
         raise DataError(
             f"The slabs of {partial} need {size(wanted)} of memory, but {size(allowed)} is allowed. Use --memory "
-            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+            f"{math.ceil(wanted / 1e6)}M if there is as much. No file was changed."
         )
     return _plan(options, needs, allowed, slabs, missing)
 
@@ -253,7 +258,8 @@ def prepare_within(
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
-    """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
+    """[view] time in s at which each of these projections was exposed; if the file states no times, they are evenly
+    spaced in the order of the file."""
     seconds = source.table.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
@@ -269,7 +275,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     """Check all that can be checked without reading a frame.
 
     Returns:
-        The truth [z, y, x] that the volume is to be compared with; None without one.
+        The ground truth [z, y, x] with which the volume is compared; None without a ground truth.
 
     Raises:
         ConfigError, DataError: a check failed; nothing was written.
@@ -309,7 +315,7 @@ def _refuse_several_volumes(options: ReconOptions) -> None:
         of_one = ("region", "truth", "uncertainty", "cluster", "partial")
         if wrong := [name for name in of_one if getattr(options, name)]:
             raise ConfigError(
-                f"{' and '.join(wrong)}: this works only with methods that make one volume, but {options.method.name} "
+                f"{' and '.join(wrong)}: works only with methods that make one volume, but {options.method.name} "
                 "makes several. Leave it out, or choose another method. Nothing was computed."
             )
 

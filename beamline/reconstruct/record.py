@@ -67,13 +67,15 @@ def write_result(
 ) -> ReconRecord:
     """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
-    The record's voxels are read from the file where they are used; where no file is written it holds the volume.
+    The voxels of the record are read from the file when they are used. If no file is written, the record contains the
+    volume.
 
     Args:
-        in_parts: it was made in slabs, and its voxels are on the disk.
+        in_parts: True if the volume was made in slabs, so that its voxels are on the disk.
 
     Raises:
-        DataError: the volume could not be written; none is left. A report that fails is a warning.
+        DataError: the volume could not be written; no incomplete file remains. If only the report fails, a warning is
+            given.
     """
     phases, ordinary = context.phases, prepared.centred
     phases.enter("checking the volume")
@@ -163,7 +165,7 @@ def _record(
 
 def _title(made: Reconstruction, context: ReportContext) -> str:
     if made.series is not None:
-        return f"{made.series.n} volumes in time of {context.facts.name}"
+        return f"{made.series.n} volumes at successive times of {context.facts.name}"
     return f"{label_of(made.method)} reconstruction of {context.facts.name}"
 
 
@@ -251,7 +253,7 @@ def _pose_parameters(geometry: Geometry) -> dict[str, Value]:
 
 
 def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
-    """Slices that are seen over less of the half turn than others, because views have different heights."""
+    """Slices that are seen over a smaller part of the 180° than others, because projections have different heights."""
     if geometry.is_cone or not geometry.is_straight or not geometry.shifts[:, 1].any():
         return np.zeros(0, np.intp)
     heights = Grid.matching(geometry).coordinates()[0]
@@ -259,14 +261,14 @@ def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
 
 
 def partly_seen_warning(geometry: Geometry) -> str:
-    """The warning that some slices are seen by few views; empty if all are seen equally."""
+    """The warning that some slices are seen in few projections; empty if all slices are seen equally."""
     some = partly_seen(geometry)
     if not some.size:
         return ""
     return (
-        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than the "
-        "others, because the projections are at different heights. The volume has streaks there, and FBP is not dense "
-        "enough."
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than "
+        "the others, because the projections are at different heights. The volume has streaks in these slices, "
+        "and FBP gives too low densities."
     )
 
 

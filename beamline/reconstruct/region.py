@@ -29,8 +29,8 @@ class Region:
     """A box of voxels, first:end along z, y and x, of the whole volume with the same options.
 
     Attributes:
-        requested: somebody asked for this box, which is refused where it lies beyond the volume; else it was found, and
-            what lies beyond is cut off.
+        requested: True if the user gave this box; a box that extends beyond the volume is then an error. False if the
+            box was found; it is then clipped to the volume.
         reason: a sentence on a box that was found.
     """
 
@@ -92,8 +92,8 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     rows.
 
     Raises:
-        ConfigError: a cone, or a region beyond the rows or the widest volume; options that may lean views or move them
-            along the axis. `locate` refuses what only the views tell.
+        ConfigError: a cone beam, a region beyond the rows or the widest volume, or options that may tilt projections or
+            move them along the axis. `locate` raises the errors that only the projections show.
     """
     part = selection.of(source)
     if part.cone is not None:
@@ -122,11 +122,11 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
 
 
 def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
-    """Where the region lies in the volume of `geometry`, the geometry of what `selection_around` selects.
+    """The position of the region in the volume of `geometry`, the geometry of the selection from `selection_around`.
 
     Raises:
-        ConfigError: it lies outside.
-        DataError: the views are shifted along the axis, so that slices are not rows.
+        ConfigError: the region lies outside the volume.
+        DataError: the projections are shifted along the axis, so that slices are not detector rows.
     """
     assert selection.rows is not None and selection.axis_rows is not None
     grid, side = Grid.matching(geometry), selection.binning
@@ -137,8 +137,8 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
     if not geometry.rows_show_slices:
         raise DataError(
-            "The views are shifted along the axis, rolled or tilted, but --roi needs slices that are aligned with "
-            "rows. Use --rows instead."
+            "The projections are shifted along the axis, rolled or tilted, but --roi needs slices that are "
+            "aligned with rows. Use --rows instead."
         )
     _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
@@ -149,7 +149,7 @@ def _refuse_beyond(region: Region, width: int, whose: str) -> None:
     """Raise ConfigError for voxels beyond a volume that is `width` voxels wide."""
     for name, (first, end) in (("y", region.y), ("x", region.x)):
         if end > width:
-            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in {whose} 0:{width}.")
+            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie within {whose} range 0:{width}.")
 
 
 def _widest(source: ScanSource, selection: Selection) -> int:
@@ -179,12 +179,13 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     """The box around everything that absorbs, in voxels of the volume of this selection, and a sentence that reports
     it.
 
-    A voxel may be of the sample where it lies in the shadow, from the first to the last pixel with matter, of nine
-    tenths of the views (the visual hull of Laurentini 1994, of the convex shadows). Views are 72, binned. Where the
-    sample goes on beyond the field the box is the whole volume, and the sentence says why.
+    In each projection, the shadow of the sample reaches from the first to the last pixel with material. A voxel may
+    belong to the sample if it lies in this shadow in nine tenths of the projections (the visual hull of Laurentini
+    1994, of the convex shadows). 72 binned projections are used. If the sample extends beyond the field of view, the
+    box is the whole volume, and the sentence states the reason.
 
     Raises:
-        ConfigError: a cone. DataError: no view shows matter.
+        ConfigError: the scan has a cone beam. DataError: no projection shows a sample.
     """
     part = selection.of(source)
     if part.cone is not None:
@@ -232,7 +233,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
 
 
 def _uncut(height: int, across: int, why: str) -> Region:
-    reason = f"--roi auto makes the whole volume: {why}."
+    reason = f"--roi auto reconstructs the whole volume, because {why}."
     return Region((0, height), (0, across), (0, across), requested=False, reason=reason)
 
 

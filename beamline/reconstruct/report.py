@@ -30,7 +30,9 @@ from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, StrayMass, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
-_NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
+_NO_REFERENCE = (
+    "Neither volume is the ground truth: if only one of them shows a feature, look for it in the projections."
+)
 
 
 def compose(
@@ -83,7 +85,7 @@ def _summary(
     shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
     if made.series is not None:
         seconds = made.series.seconds
-        what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
+        what = f"{len(seconds)} volumes at successive times, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
         f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in {made.seconds:.1f} "
         f"s; {METRICS[best].label} {formatted(best, own[best])}"
@@ -105,7 +107,8 @@ def _footnotes(
 ) -> list[str]:
     """The meaning of the figures of merit that this report shows."""
     of_several = (
-        "difference of all projections and the volumes at their times, relative to them; smaller with less noise."
+        "difference between each projection and the forward projection of the volume at its time, relative to "
+        "the projection. Less noise in the projections makes it smaller."
     )
     of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
@@ -117,10 +120,10 @@ def _footnotes(
         ),
         (
             any("cnr" in values for values in metrics.values()),
-            "SNR, CNR: computed between the dense and the empty part (two classes by k-means) of "
-            f"{'the ground truth' if truth else 'FBP of these projections'}, without voxels near the boundary. All "
-            "volumes use the same two parts. A smoother volume has higher values, although it may show less: look for "
-            "cracks and pores in the pictures.",
+            "SNR, CNR: computed from the dense and the empty part (two classes by k-means) of "
+            f"{'the ground truth' if truth else 'FBP of these projections'}, without voxels near the boundary. "
+            "All volumes use the same two parts. A smoother volume has higher values, although it may show "
+            "less: look for cracks and pores in the pictures.",
         ),
         (
             any("air" in values for values in metrics.values()),
@@ -173,8 +176,8 @@ def _further(
     if facts.references:
         yield Picture(
             "Darks and flats",
-            "As the camera recorded them. Smooth flats are better: dust that moves, or that the projections do not "
-            "show, makes rings. If there are two groups of flats, their ratio should be near one everywhere.",
+            "As the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
+            "only in the flats. If there are two groups of flats, their ratio should be near one everywhere.",
             reference_sheet(facts.references, facts.shape),
         )
     if facts.flagged:
@@ -200,15 +203,16 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
     )
     yield Picture(
         "Sharpest edge, and values",
-        "Values along a line through the sharpest edge: a steeper edge is sharper; dips and overshoots next to it are "
-        "artefacts. Histogram: narrower peaks are better, unless the sample has values between them.",
+        "Values along a line through the sharpest edge: the steeper the edge, the sharper the volume; dips and "
+        "overshoots next to the edge are artefacts. Histogram: narrower peaks are better, unless the sample has "
+        "values between them.",
         pictures.profile_and_values(shown, unit, kind),
     )
     if len(shown) > 1:
         yield Picture(
             "Differences",
             f"The first slice of each volume minus that of {next(iter(shown))}. Red: higher, blue: lower. "
-            + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
+            + ("White means no difference: the whiter, the better." if truth is not None else _NO_REFERENCE),
             pictures.differences(shown, unit, kind),
         )
 
@@ -217,7 +221,7 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
     """Slices of some of several volumes, side by side."""
     n, depth = series.data.shape[:2]
     some = spread(np.arange(n), _SHOWN)
-    for title, turned in (("Slices of each time", False), ("Upright slices of each time", True)):
+    for title, turned in (("Slices at each time", False), ("Vertical slices at each time", True)):
         if turned and depth < _UPRIGHT:
             continue
         sheet = SliceSheet("z" if turned else "y")
@@ -240,17 +244,18 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
     if made.deviation is not None:
         yield Picture(
             "Error bars",
-            "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
-            "within one standard deviation of the volume. Fine texture that the method smoothed away may be outside.",
+            "A slice, and the standard deviation of its voxels. In about two of three voxels the true density "
+            "is within one standard deviation of the volume. Where the method smoothed fine texture away, the "
+            "error may be larger.",
             pictures.error_bars(made.volume, made.deviation, unit, kind),
         )
     if unexplained is not None:
         at = len(unexplained.significance) // 2
         yield Picture(
             "Residual in the projections",
-            "Filtered back-projection of the residual, divided by its noise. It should be even noise, seldom beyond "
-            "4. An edge, crack or pore that is visible here is in the projections, but not in the volume. Blue: the "
-            "volume is too dense, red: not dense enough.",
+            "Filtered back-projection of the residual, divided by its noise. It should be even noise, with "
+            "values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
+            "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
             pictures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
         )
     if made.history:
@@ -279,15 +284,16 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     if axis is not None:
         yield Picture(
             "Rotation axis",
-            f"Mismatch of the projections for each candidate of the rotation axis ({axis.method}): 0 if they agree, "
-            "about 1 if they have nothing in common. Columns are those of the binned detector.",
+            "How badly the projections fit together for each candidate column of the rotation axis "
+            f"({axis.method}): 0 if they agree, about 1 if they have nothing in common. Columns are those of the "
+            "binned detector.",
             pictures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
     if geometry.shifts.any() or turns.any():
         moved = geometry.shifts * geometry.sample_pitch
         yield Picture(
-            "Poses of the views",
+            "Poses of the projections",
             "Shift at the sample, roll and tilt of each projection, against the angle of the stage. They show runout, "
             "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
             pictures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
@@ -307,9 +313,9 @@ def _of_wedges(unseen: Sequence[Wedge]) -> str:
 def _history_caption(made: Reconstruction) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * views_grew(made) + ["Gaussians"] * (len(gaussians) > 1)
-    parts = ["Misfit to the views in use"]
+    parts = ["Misfit to the projections in use"]
     if (judged := residual_curve(history_arrays(made.history))) is not None:
-        parts.append(f"the residual of {judged.views} as dB below the data")
+        parts.append(f"the residual of {judged.views}, in dB below the data")
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
     since = "the file was found" if views_grew(made) else "the start"
     return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."

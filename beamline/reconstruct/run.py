@@ -70,7 +70,7 @@ def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
     """Subtract the part of the sample outside the volume from the projections, in place, so that the volume and FBP are
-    compared with the rest. Does nothing if nothing is known outside.
+    compared with the rest. Does nothing if nothing is known about the sample outside.
     """
     if made.outside is None:
         return prepared
@@ -115,9 +115,10 @@ def fit_within(
     remaining = limit - spent - measuring - after
     if remaining <= 0:
         warn(
-            f"{duration_text(limit)} is not enough for this scan: reading and correction took {duration_text(spent)}, "
-            f"and checks, report and writing need about {duration_text(measuring + after)}. Nothing is left for the "
-            f"{by_name(method.name).label} method, which makes only one step."
+            f"{duration_text(limit)} is not enough for this scan: reading and correction took "
+            f"{duration_text(spent)}, and checks, report and writing need about "
+            f"{duration_text(measuring + after)}. No time is left for the {by_name(method.name).label} method, "
+            "so it makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
@@ -151,7 +152,7 @@ def refuse_impossible(options: ReconOptions) -> None:
 
 
 def refuse_views(method: Method, geometry: Geometry) -> None:
-    """Raise ConfigError before any work if these views do not allow error bars."""
+    """Raise ConfigError before any work if error bars cannot be computed from these projections."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
             f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
@@ -192,7 +193,7 @@ def deviation_by_slabs(
     """The standard deviation of each voxel, stored on the output's disk, of a volume on disk; None if `control` stopped
     it.
 
-    The slab with most matter comes first, and the others follow its decisions.
+    The slab with the most material comes first, and the other slabs use its decisions.
     """
     grid = Grid.matching(prepared.geometry)
     parts = slabs_of(grid.shape[0], slabs[0].own.stop, max(method.halo, HALO))

@@ -137,15 +137,15 @@ class ScanFacts:
 
     Attributes:
         table: facts for people, by name.
-        frames: frames in the file of those planned, e.g. "110/110".
-        remarks: faults during the scan, by the file.
+        frames: number of frames in the file and number of planned frames, e.g. "110/110".
+        remarks: faults during the scan, as the file states them.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
         shape: of a frame.
         columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
-        ended: how the scan ended where it did not take all its frames, and why; empty: it did, or runs.
-        frames_per_view: that a view is the mean of.
-        live_picture: file name of the last picture of a volume that grew with its scan; empty: none did.
+        ended: how and why the scan ended before it took all its frames; empty: it took all frames, or is still running.
+        frames_per_view: number of frames that are averaged to one projection.
+        live_picture: file name of the last picture of a live volume; empty: there was no live volume.
     """
 
     path: Path
@@ -169,7 +169,7 @@ class ReportContext:
 
     Attributes:
         filter: of FBP, also of the one that the volume is compared with.
-        leaves: whether there is time for so many seconds before the report.
+        leaves: function that returns True if this number of seconds is left before the report.
     """
 
     facts: ScanFacts
@@ -197,7 +197,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
     missing, flags = int(attributes.get("missing_triggers", 0)), source.table.flags if flags is None else flags
     table = _table(source, sample or "not stated", columns)
-    table["flagged by the monitor"] = "no monitor looked at it" if flags is None else counted(flags.counts())
+    table["flagged by the monitor"] = "not checked by the monitor" if flags is None else counted(flags.counts())
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n, again = len(source.table), source.table.replaced
     if again.size:

@@ -57,17 +57,17 @@ def in_slabs(
 ) -> Reconstruction:
     """Reconstruct a volume on disk, slab by slab; for a partial volume only the missing slabs.
 
-    The slab with most matter comes first; the others follow its decisions, so that slabs fit together.
-    From slab to slab the volume fades. Each slab depends on the data and the first slab alone: a volume that was
-    stopped and resumed is equal to the bit.
+    The slab with the most material comes first. The other slabs use its decisions, so that all slabs fit together.
+    Neighbouring slabs overlap and are blended. Each slab depends only on the data and on the first slab, so that a
+    volume that was stopped and resumed is bit-identical.
 
     Args:
-        control: of all slabs together; `decide`, if given, gets the decisions that they follow.
-        warn: takes a sentence on slices that are not by the method.
-        workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
+        control: control of all slabs together; `decide`, if given, gets the decisions that the slabs use.
+        warn: function that gets a sentence on slices that were reconstructed with another method.
+        workers: workers that reconstruct all slabs except the first, several at a time; only this thread writes.
 
     Raises:
-        DataError: the views are zero everywhere, or the partial volume is of other data or options.
+        DataError: the projections are zero everywhere, or the partial volume belongs to other data or options.
     """
     job = _SlabJob(run, prepared, options, slabs, control, say, begin=control.now())
     partial = job.resumed()
@@ -115,25 +115,26 @@ class _SlabJob:
     def tell(self, done: int) -> None:
         """Report the number of finished slices."""
         slices = self.grid.shape[0]
-        self.say(f"{done} of {slices} slices are there.")
+        self.say(f"{done} of {slices} slices are done.")
         if (listen := self.control.on_progress) is not None:
             seconds, views = self.control.now() - self.begin, self.prepared.geometry.n_views
             listen(Progress(done, slices, seconds, nan, nan, 0, views, unit="slices"))
 
     def resumed(self) -> PartialVolume | None:
-        """The partial volume to complete; None: a new one. DataError where it belongs to another reconstruction."""
+        """The partial volume to complete; None: a new one is needed. DataError if it belongs to another
+        reconstruction."""
         if (path := self.options.partial) is None:
             return None
         partial = open_partial(path)
         refuse_other(path, _made_from(self.prepared, self.options), partial.made_from, "reconstruction")
-        self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are there.")
+        self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are done.")
         return partial
 
     def begun(self, numbers: Sequence[int]) -> tuple[PartialVolume, list[int]]:
-        """Reconstruct slabs until one shows matter; return the new partial volume and the remaining slabs.
+        """Reconstruct slabs until one contains material; return the new partial volume and the remaining slabs.
 
         Raises:
-            DataError: none does.
+            DataError: no slab contains material.
         """
         for at, n in enumerate(numbers):
             self.announce(n)
@@ -152,11 +153,11 @@ class _SlabJob:
     def made(
         self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool
     ) -> tuple[Reconstruction | None, str]:
-        """The slab, and a sentence on it; None for views that are zero.
+        """The slab, and a sentence on it; None if all projections are zero.
 
         Args:
-            done: slices that are there before it.
-            first: of all slabs, whose decisions the others follow.
+            done: number of slices that are finished before this slab.
+            first: the first of all slabs, whose decisions the other slabs use.
         """
         slab, slices, method = self.slabs[n], self.grid.shape[0], self.options.method
         listen = _of_all(self.control, self.begin, done, slab, slices)
@@ -204,7 +205,7 @@ def keeping(path: Path) -> Iterator[None]:
     """A context that removes the partial volume at `path` on success, and keeps it otherwise.
 
     Raises:
-        ScanStopped: instead of KeyboardInterrupt, where there are slabs to go on from.
+        ScanStopped: instead of KeyboardInterrupt, if there are finished slabs from which to continue.
     """
     try:
         yield
@@ -271,7 +272,7 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
-    """Numbers of the slabs, beginning with the slab whose rows show most matter."""
+    """Numbers of the slabs, beginning with the slab whose rows show the most material."""
     data = prepared.projections.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
     matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]

@@ -122,7 +122,7 @@ class Snapshots:
 def _why(errors: Mapping[str, float]) -> str:
     """Why the volume of a method is shown, in words."""
     if not errors:
-        return "the only one so far"
+        return "the only volume so far"
     each = ", ".join(f"{name} {error:.3f}" for name, error in errors.items())
     return f"because it matches the held-out projections better (errors: {each})"
 

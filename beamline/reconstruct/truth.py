@@ -81,11 +81,11 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
     """Figures of merit of a volume file: against a reference volume, and in regions drawn by the user.
 
     Args:
-        truth: as of `read_truth`.
+        truth: as for `read_truth`.
         masks: labels [z, y, x] of the volume's shape: 1 dense, 2 empty, 0 not used.
 
     Raises:
-        DataError, ConfigError: files that hold no volumes, or of another shape.
+        DataError, ConfigError: a file contains no volume, or a volume of another shape.
     """
     with opened_volume(path) as record:
         volume = np.asarray(record.volume.data[:], np.float32)

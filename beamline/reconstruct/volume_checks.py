@@ -140,12 +140,16 @@ def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:
         known = "assumed, because there are too few projections to measure it"
     elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} fit the projections nearly as well"
-        advice = "; offset projections (scan.offset_views) reduce this" if prepared.geometry.is_centred.all() else ""
+        advice = (
+            "; offset projections (scan.offset_views) reduce this uncertainty"
+            if prepared.geometry.is_centred.all()
+            else ""
+        )
         sure = f" Densities near the axis are uncertain by {density:.1%} or more{advice}."
     return Note(
         f"The sample is wider than the field of view: its radius about the rotation axis is {radius:.4g} {unit}, "
-        f"{radius / reach:.2f} times that of the field ({known}). The whole sample was reconstructed, but only the "
-        f"part in the field of view is written.{sure}"
+        f"{radius / reach:.2f} times the radius of the field of view ({known}). The whole sample was "
+        f"reconstructed, but only the part in the field of view is written.{sure}"
     )
 
 
@@ -272,7 +276,7 @@ def _unused_levels(made: Reconstruction) -> str:
         return ""
     stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
     return (
-        f"The levels {stated} were not used, because held-out projections are not predicted better with them. The "
-        "volume is the FISTA-TV volume. Levels are densities in the unit of the volume, without that of air. Leave out "
-        "--levels to have the levels determined from the scan."
+        f"The levels {stated} were not used, because held-out projections are not predicted better with them. "
+        "The volume is the FISTA-TV volume. Levels are densities in the unit of the volume; do not list the "
+        "density of air. Leave out --levels to have the levels determined from the scan."
     )

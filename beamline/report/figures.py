@@ -56,7 +56,8 @@ def show_image(
 
 
 def finish(axes: Axes, across: str, down: str, title: str = "", size: float = 10.0, grid: bool = False) -> None:
-    """Axis labels of `size` points, a title, a legend of what has a label, and the lines of a `grid` under curves."""
+    """Add axis labels of `size` points, a title, a legend if curves have labels, and the lines of a `grid` under the
+    curves."""
     axes.set_xlabel(across, fontsize=size, labelpad=1)
     axes.set_ylabel(down, fontsize=size, labelpad=1)
     axes.set_title(title, fontsize=size + 1, pad=4)
@@ -130,7 +131,7 @@ def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
 
 
 def dpi_for(voxels: int, inches: float) -> float:
-    """Pixels an inch that show every voxel of a row of them."""
+    """Resolution in pixels per inch at which every voxel in a row is visible."""
     return float(np.clip(voxels / inches, DPI, _FINEST))
 
 
@@ -152,7 +153,7 @@ def panels(
 ) -> tuple[Figure, list[list[Axes]]]:
     """A figure with a fixed grid of panels [row, column], with equal room for their labels.
 
-    A layout that measures labels takes as long as all that is drawn.
+    The grid is fixed, because a layout that measures labels needs as much time as the whole drawing.
 
     Args:
         across, down: widths and heights of the panels, inches.

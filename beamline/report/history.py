@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _FIELDS = {f.name: f.type for f in fields(Progress) if f.name != "unit"}  # figures
-_WORDS = {"held_out": "views held out", "residual": "views used"}
+_WORDS = {"held_out": "held-out projections", "residual": "projections used"}
 
 
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
@@ -47,7 +47,7 @@ class ResidualCurve:
     """The residual that measures the quality of a fit, against time.
 
     Attributes:
-        views: the views of the residual: "views held out" or "views used".
+        views: the projections of the residual: "held-out projections" or "projections used".
         seconds, residuals: [measurement].
     """
 
@@ -63,7 +63,8 @@ class ResidualCurve:
 
 
 def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve | None:
-    """The residual of the views held out, if there are any, else of the views used; None if neither was recorded."""
+    """The residual of the held-out projections, if there are any, otherwise of the projections used; None if neither
+    was recorded."""
     name = next((name for name in _WORDS if name in arrays and np.isfinite(arrays[name]).any()), None)
     if name is None:
         return None
@@ -75,7 +76,7 @@ def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve 
 
 
 def views_grew(made: Reconstruction) -> bool:
-    """Whether the number of views grew during the fit."""
+    """True if the number of projections grew during the fit."""
     return len({progress.n_views for progress in made.history}) > 1
 
 
@@ -107,7 +108,7 @@ def quality_against_time(
             values = history[name] / np.max(history[name])
             axes.step(seconds, values, where="post", color=colour, lw=1.2, label=f"{label} / {history[name].max():.0f}")
         axes.set_ylim(0, 1.05)
-        finish(axes, "time (s)", "share of the largest", "Growth", grid=True)
+        finish(axes, "time (s)", "fraction of the largest value", "Growth", grid=True)
     return png(figure)
 
 

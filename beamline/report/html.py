@@ -35,11 +35,11 @@ class Report:
 
     Attributes:
         summary: one or two sentences, the result first.
-        metrics: by method, then by name of the metric (see METRICS); a method may lack some.
-        frames: frames in the file of those planned, e.g. "90/90".
+        metrics: by method, then by name of the metric (see METRICS); a method need not have all of them.
+        frames: number of frames in the file and number of planned frames, e.g. "90/90".
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
-        recipe: its options that hold for other scans; empty: none are shown.
-        done: what was found in the views, and what was done with them, where nothing is wrong.
+        recipe: the options that also apply to other scans; empty: no options are shown.
+        done: what was found in the projections and what was done with them, if nothing is wrong.
         footnotes: definitions that the metrics need.
         volume: name of the volume's file, in the folder of the page; empty: it was not written.
         live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.
@@ -73,7 +73,7 @@ def write_report(path: Path, report: Report, *, replace: bool = False) -> None:
 def write_timed(path: Path, report: Report, label: str, elapsed: float) -> None:
     """Write the report page again, with the duration of the whole command in the column of a method.
 
-    These are known when all else is written. Where the disk takes no more, the page stays as it is.
+    This duration is known only after everything else is written. If the disk is full, the page stays as it is.
     """
     timed = {**report.metrics, label: {**report.metrics[label], "elapsed": elapsed}}
     with suppress(DataError):

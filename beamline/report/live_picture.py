@@ -41,7 +41,8 @@ class PictureRow:
 
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
-    """The rows as PNG, without axes and layout, which would take ten times as long: it is drawn during the fit."""
+    """The rows as PNG. Axes and layout are left out, because they would take ten times as long, and the picture is
+    drawn during the fit."""
     from PIL import Image, ImageDraw
 
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
@@ -122,9 +123,9 @@ def _view_panels(view: F32, render: F32) -> list[_Panel]:
     spread = f"black {-reach:.2g} to white {reach:.2g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
     (view, render, difference), _ = _sized((view, render, difference))
     return [
-        _Panel(view, window, "newest view, u → z ↓", greys),
-        _Panel(render, window, "the fit seen from there", "the same greys"),
-        _Panel(difference, (-reach, reach), "difference in noise of a pixel", spread),
+        _Panel(view, window, "newest projection, u → z ↓", greys),
+        _Panel(render, window, "the fit, projected at the same angle", "the same greys"),
+        _Panel(difference, (-reach, reach), "difference, in units of the pixel noise", spread),
     ]
 
 
@@ -173,7 +174,7 @@ class _Panel:
         draw.ellipse(place, outline="#999999")
         for turn in (0, 180):  # a ray runs both ways
             draw.pieslice(place, first + turn, last + turn, _ORANGE)
-        draw.text((right - side - 4, top), "rays to come", _ORANGE, _font(11), anchor="ra")
+        draw.text((right - side - 4, top), "rays not yet measured", _ORANGE, _font(11), anchor="ra")
 
 
 def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:

@@ -78,7 +78,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     ticks = MaxNLocator(7, steps=[1, 1.5, 2, 3, 4.5, 6, 9, 10]).tick_values(angles[0], angles[-1])
     ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
     axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
-    finish(axes, "column (px)", "angle (°)", f"Sinogram of row {row}, {len(order)} views")
+    finish(axes, "column (px)", "angle (°)", f"Sinogram of row {row}, {len(order)} projections")
     add_bar(figure, image, "line integral")
     return png(figure)
 
@@ -148,7 +148,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     """Profile of each volume through the sharpest edge of the last one, and a histogram of its values.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
-    voxel. So single noisy voxels are no edges.
+    voxel. Therefore single noisy voxels do not count as edges.
     """
     from matplotlib.ticker import MaxNLocator, NullFormatter
 
@@ -185,7 +185,7 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
-    window, title = (float(np.min(image)), float(np.max(image))), "Highest density where views show nothing"
+    window, title = (float(np.min(image)), float(np.max(image))), "Highest density where projections show nothing"
     return _map(image, grid, unit, title, kind.label(unit), window, "magma")
 
 
@@ -205,7 +205,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = one_panel(5.4, 6.4)
-    image, title = volume.data[at], f"Rays that no view shows, slice {at}"
+    image, title = volume.data[at], f"Rays that no projection has, slice {at}"
     draw_slice(axes, image, planes(grid, unit)[0], title, matter_window(image))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:

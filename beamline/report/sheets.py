@@ -40,9 +40,10 @@ class SliceSheet:
     """The slice [y, x] of each volume by label: through the bright parts of the first one, in its grey window.
 
     Args:
-        down: name of the axis that goes down, of volumes that are turned.
-        across: slices beside one another.
-        closer: the middle slice instead, and of large ones the part in which they differ most, in the window of all.
+        down: name of the axis that points down, if the volumes are turned.
+        across: number of slices side by side.
+        closer: show the middle slice instead, in a grey window for all slices; if slices are large, only the part in
+            which they differ most.
     """
 
     def __init__(self, down: str = "y", across: int = COLUMNS, *, closer: bool = False) -> None:

@@ -33,8 +33,8 @@ class Acquisition:
         timeline: without violations.
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
-        sink: takes `BlockStarted`, `BlockDone` and warnings.
-        supervision: what may pause the scan, or end it before its first projection, and gets its states.
+        sink: gets the events `BlockStarted` and `BlockDone`, and warnings.
+        supervision: callbacks that may pause the scan, or end it before its first projection; they get its states.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Acquisition:
         Raises:
             LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
             ScanStopped: a stop was requested, and the scan has ended in order.
-            ReferencesError: no projection was taken, because supervision refused them.
+            ReferencesError: no projection was taken, because supervision found that darks or flats cannot be used.
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
@@ -223,7 +223,9 @@ class Acquisition:
             replaces = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
-            self._sink(Warned(f"Frames {spans(rows)}: repeated, but again without a frame."))
+            self._sink(
+                Warned(f"Frames {spans(rows)}: the exposure was repeated, but the camera again delivered no frame.")
+            )
 
     def _offset(self, block: Block) -> Iterator[Frame]:
         """Take offset projections, at angles of the first projections. They replace nothing."""
@@ -298,9 +300,8 @@ class Acquisition:
             )
         if text := discrepancies(self._done):
             raise LedgerError(
-                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat "
-                "these projections, or reconstruct without them. A longer period_s gives the camera more "
-                "time.",
+                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat the "
+                "missing projections, or reconstruct without them. A longer period_s gives the camera more time.",
                 self.missing,
             )
 

@@ -37,9 +37,10 @@ def frames_in_memory(timeline: Timeline) -> int:
 
 
 def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[int, int]) -> str:
-    """Memory for the frames that may wait for the disk, before the first comes; a sentence on it, or "" without any.
+    """Reserve memory, before the first frame comes, for the frames that may wait for the disk; returns a sentence on
+    it, or "" if none is needed.
 
-    At most a quarter of the free memory, as a live volume takes half.
+    At most a quarter of the free memory is reserved, because a live volume may use half of it.
     """
     n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
     if memory is None or n == 0:

@@ -1,12 +1,13 @@
 """Braking: assigns triggers to the frames that were taken while the stage was braking after a stop within a pulse
 train.
 
-Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
-frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
-begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then the
-number of exposures must be the number of triggers up to that place, and the intervals between them must grow. Frames
-that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that wait
-for their trigger.
+Noise on the trigger line also exposes frames, and during braking the times of triggers are no longer regular. The final
+position of the stage confirms the frames: with speed u and constant deceleration a, the stage stops u²/2a after braking
+began. The final position therefore gives the time at which braking began, and the position of the stage at the time of
+each frame. If the stage brakes in another way, for example with jerk-limited ramps, the number of exposures must equal
+the number of triggers up to the final position, and the intervals between exposures must increase. Frames that neither
+test confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that wait for their
+trigger.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ BESIDE = 0.02  # intervals: a stage that stands this close to a trigger may or m
 
 @dataclass(frozen=True)
 class Braking:
-    """A stage that was stopped during a train of triggers, and stands."""
+    """A stage that was stopped during a train of triggers and is now at rest."""
 
     stop_sent: float  # time at which it was told to stop, in s
     stood: float  # where it stands, in intervals beyond trigger 0

@@ -1,8 +1,8 @@
 """Control: the states of a scan and their allowed order, and commands to a running scan from another terminal.
 
-docs/states.md draws the states and explains the verbs in each. A verb is an empty file of that name in the folder
-`control` of the run, which only its owner can enter. The scan removes the file and obeys. This works on every system
-and file system, without an open port or a parser.
+docs/states.md has a diagram of the states and explains the commands in each state. A command is an empty file of that
+name in the folder `control` of the run, which only the owner of the run can enter. The scan removes the file and
+carries out the command. This works on every operating system and file system, without an open port or a parser.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def verbs_taken(
     enter.
 
     Args:
-        choose: takes the operator's choice of what is measured next.
+        choose: function that gets the operator's choice of what is measured next.
 
     Raises:
         DataError: the folder for the commands cannot be created.
@@ -162,7 +162,7 @@ class Asked:
     since: float
 
     def state(self) -> State | None:
-        """The scan's state once the command is done, or after 20 s; None before that. Returns at once.
+        """The state of the scan once the command is carried out, or after 20 s; None before that. Returns at once.
 
         Raises:
             ConfigError: the scan has not answered for 5 s; the request is withdrawn.
@@ -173,8 +173,8 @@ class Asked:
                 return None
             if _taken(request):
                 raise ConfigError(
-                    f"the scan in {self.part} does not answer: its process was killed, or its disk hangs. "
-                    "Nothing was changed. If it was killed, check the instrument, and run `beamline "
+                    f"the scan in {self.part} does not answer: either its process was killed, or its disk hangs. "
+                    "Nothing was changed. If the process was killed, check the instrument, and run `beamline "
                     "recover` on its file."
                 )
         state = state_of(self.part)
@@ -185,7 +185,7 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
-        verb: what the scan is to do; or a choice of what it measures next, which it accepts only while it waits for a
+        verb: the command; or a choice of what the scan measures next, which the scan accepts only while it waits for a
             decision.
 
     Raises:

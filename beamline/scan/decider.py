@@ -1,6 +1,6 @@
 """Decider: after each pass of projections, decides from the error model, or asks the operator, what to measure next.
 
-It costs no frame, and the scan does not depend on it: without a law in time the plan goes on.
+It needs no additional frame, and the scan does not depend on it: if no error model arrives in time, the plan continues.
 """
 
 from __future__ import annotations

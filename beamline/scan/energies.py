@@ -1,6 +1,6 @@
 """Energies: a series of scans of one sample, one per energy, in one folder; the series can be continued later.
 
-Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
+Each scan has an ordinary run folder within the folder of the series, so that every program that reads runs can read it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
 
     Args:
-        warn: takes a sentence on energies whose scan is incomplete or does not exist.
+        warn: function that gets a sentence on energies whose scan is incomplete or does not exist.
 
     Raises:
         DataError: no energy has a scan.
@@ -72,8 +72,8 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
     if files and len(whole) < len(runs):
         warn(
-            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with "
-            f"frames are used. `beamline scan --resume {folder}` takes the rest."
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with frames are "
+            f"used. `beamline scan --resume {folder}` takes the missing scans."
         )
     if not files:
         raise DataError(
@@ -103,7 +103,8 @@ def run_energies(
         place: the folder in which the series gets its own; None: the configured one.
         stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
         commands: of the reconstruction of each scan.
-        series: the folder of a series that is continued: complete scans stay, one that ended early is continued.
+        series: the folder of a series to be continued: complete scans are kept, and a scan that ended early is
+            continued.
 
     Raises:
         ConfigError: a limit is exceeded at one of the energies; nothing has moved. What `run_scan` raises: the scans

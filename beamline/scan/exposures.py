@@ -43,8 +43,8 @@ class Exposures:
         camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         sink: where warnings go.
-        supervision: says when to pause, and gets the states of a fly scan.
-        wait_while_paused: called before each frame of a stage that stands, and before each run-up.
+        supervision: tells when to pause, and gets the states of a fly scan.
+        wait_while_paused: called before each frame with the stage at rest, and before each run-up.
     """
 
     def __init__(

@@ -1,13 +1,14 @@
 """Ledger: assigns frames to triggers from framestamps and times, so that no angle is guessed.
 
-A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
-camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
-While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
-nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the first
-frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does. This
-needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at which their
-triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
+A camera counts the frames that it exposes. A gap in its framestamps means that a frame was exposed but lost in
+transfer. If a trigger comes too early, the camera ignores it: framestamps then stay contiguous, and only the times show
+a gap of two periods. While the stage rotates at constant speed, trigger times are linear in the index of the trigger.
+Therefore the index of a frame follows from the nearest whole number of periods since the previous frame. Slow drift is
+followed by an alpha-beta filter (Benedict & Bordner 1962). Noise on the trigger line exposes frames, too. If the time
+of the first trigger is not known well, the first frames are those that form a regular train. If two frames could belong
+to a trigger, it gets the nearer one. This requires the following frames, see `enter`. Frames exposed while the stage
+brakes come with the times at which their triggers would have come at constant speed (see braking.py). All functions are
+pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -150,7 +151,8 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
 
     Args:
         time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
-        steady: the stage turned at constant speed; else the time is as if it had, and must fit better.
+        steady: True if the stage rotated at constant speed; otherwise `time` is the time at which the trigger would
+            have come at constant speed, and must fit better.
     """
     train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):

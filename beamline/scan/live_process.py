@@ -69,7 +69,7 @@ class Commands:
     """The commands that reconstruct a scan: while it runs, or when it is complete; neither: no reconstruction.
 
     Attributes:
-        remark: for the operator; "" without one.
+        remark: a remark for the operator; "" if there is none.
     """
 
     live: LiveCommand | None = None
@@ -78,7 +78,7 @@ class Commands:
 
 
 def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
-    """The commands by the configuration of a scan, or of a resumed run."""
+    """The commands for the configuration of a scan, or of a resumed run."""
     method = config.recon.method
     if not config.recon.live:
         return Commands()
@@ -86,7 +86,7 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
         remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
-        remark = "Only darks and flats are taken now: reconstruct joined.h5 afterwards."
+        remark = "No live volume is made, because only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
@@ -116,8 +116,8 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
 
 
 def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
-    """A function for the wait for the live volume after a scan: was the scan aborted? Then the live reconstruction is
-    killed.
+    """A function that is called during the wait for the live volume after a scan; it returns True if the scan was
+    aborted, and the live reconstruction is then killed.
 
     For a stopped scan it reports how long the wait has lasted, when first called and then every 5 s.
     """
@@ -147,7 +147,7 @@ class LiveReconstruction:
     most twice: the file has all projections, and the final fit makes up for the lost steps.
 
     Args:
-        on_law: takes each error model that it measures, in the thread that reads the output.
+        on_law: function that gets each measured error model, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan on the same computer takes precedence.
@@ -191,10 +191,10 @@ class LiveReconstruction:
             self._sink(Warned(f"The {self._what} could not be started ({error}). The scan is not affected."))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
-        """Wait until it has compiled its kernels or ended, `stop` returns True, or the timeout (s of real time) has
-        passed; `say` is told what the scan waits for.
+        """Wait until the reconstruction has compiled its kernels or ended, `stop` returns True, or the timeout (s of
+        real time) has passed; `say` gets a sentence on what the scan waits for.
 
-        A time-out is a warning: the scan need not wait for it.
+        After a timeout there is only a warning, because the scan can start without the reconstruction.
         """
         deadline = time.monotonic() + seconds
         if not self._ready.is_set():
@@ -257,10 +257,15 @@ class LiveReconstruction:
             when = "during the scan" if self._ready.is_set() else "before it was ready"
             if killed := process.code is not None and process.code < 0 and self._again > 0:
                 self._again -= 1
-                then = "It is started again, and uses the projections in the file."
+                then = (
+                    "A new live reconstruction is started; it begins with the projections that are already in the file."
+                )
             else:
                 self.ended = True
-                then = "The scan continues without it. To start another one: beamline recon FILE --follow -o OUT.h5"
+                then = (
+                    "The scan continues without a live reconstruction. To start another one: beamline recon "
+                    "FILE --follow -o OUT.h5"
+                )
             message = f"The live reconstruction ended {when} (code {process.code}). See {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
             if killed:
@@ -291,7 +296,8 @@ class Standby:
         self._process: ChildProcess | None = None
 
     def prepare(self) -> None:
-        """Start a waiting process, unless there is one; a failure shows when the process is used."""
+        """Start a waiting process, unless there already is one; if the start fails, the error appears when the process
+        is used."""
         if self._process is None or not self._process.running:
             with suppress(OSError), Path(os.devnull).open("w") as nowhere:
                 self._process = ChildProcess(

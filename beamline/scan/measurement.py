@@ -50,7 +50,7 @@ class FrameSource(Protocol):
 
     Attributes, to be read after the last frame:
         missing: triggers, counted over the whole plan, that gave no frame.
-        recovered: projections that gave no frame at first, but when they were repeated.
+        recovered: projections that gave no frame at first, but gave one when they were repeated.
         unsafe: a device failed while the instrument was made safe.
     """
 
@@ -69,7 +69,7 @@ class Measurement:
     """The frames of a scan on connected devices, from the first one to the closed file.
 
     Attributes:
-        began: when the run did, on the monotonic clock.
+        began: time at which the run began, on the monotonic clock.
         series: the run that is continued, if any.
         source_of: makes the object that delivers the frames if another program controls the scan; None: this program
             does, with the devices.
@@ -127,7 +127,7 @@ class Measurement:
         """Take the scan, and close its file.
 
         Args:
-            command: of the live reconstruction.
+            command: the command of the live reconstruction.
             release: called when the instrument is free for another scan.
         """
         storage, shape = self.config.storage, self.ready.timing.shape
@@ -285,9 +285,9 @@ class Measurement:
             return None
         return (
             "Stopped before the first projection, because the darks or flats cannot be used. "
-            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks "
-            "and flats are in the file. Fix this, check a few frames and the exposure with `beamline "
-            "tune`, and start the scan again. To scan anyway, set references.on_fault: log."
+            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks and flats "
+            "are in the file. Fix the fault, check a few frames and the exposure with `beamline tune`, and "
+            "start the scan again. To scan anyway, set references.on_fault: log."
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:

@@ -53,7 +53,7 @@ def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest
 
 
 def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
-    """Decelerate and wait until the stage stands. Raises InstrumentError if it does not."""
+    """Decelerate and wait until the stage is at rest. Raises InstrumentError if it keeps moving."""
     limits = stage.limits
     deadline = clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
     stage.stop()
@@ -65,8 +65,8 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
 
 
 def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
-    """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
-    anything.
+    """Position of the stage during the exposure of a frame that was planned at `angle`, and a sentence if this position
+    is wrong.
 
     The frame exists, and the stage was at `before` (rad) when its exposure began.
     """
@@ -75,14 +75,14 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
         return (before + after) / 2, ""
     return after, (
-        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, although it "
-        f"had arrived there: it was at {math.degrees(before):.4f}° before the exposure and "
-        f"{'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
+        f"its frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, "
+        f"although it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure "
+        f"and {'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
 
 
 def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[], None]) -> None:
-    """Bring shutter and sample where the block needs them; a shutter that does not move ends the scan.
+    """Move shutter and sample to the positions that the block needs; if the shutter does not move, the scan ends.
 
     Args:
         warm_up: called once a closed shutter has opened.
@@ -138,7 +138,7 @@ def make_safe(
     """Stop the stage, disarm, close the shutter; all steps are tried.
 
     Args:
-        home: where the stage goes then, after the sample is back, rad; None: both stay.
+        home: angle in rad to which the stage moves after the sample is back; None: neither moves.
 
     Returns:
         The first error of each step, and True if stage, camera or shutter may still be as during the scan.

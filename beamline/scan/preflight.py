@@ -60,7 +60,7 @@ class EnergyNeeds(NamedTuple):
 class DryRun:
     """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
-    Of a series of energies it is the first scan; `energies` has what each needs.
+    For a series of energies it is the first scan; `energies` lists the needs of each scan.
 
     Attributes:
         disk: an existing folder on the disk of the file.
@@ -166,8 +166,9 @@ def dry_run(
     Args:
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) of a series that were already taken; not all of them.
-        locks: what is wrong with the locks of a folder, as `no_locks` finds out, which writes there.
+        whole: energies (keV) of a series whose scans are already complete; never all of them.
+        locks: function that states what is wrong with the file locks of a folder, such as `no_locks`, which writes
+            there.
 
     Raises:
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
@@ -310,12 +311,12 @@ def preflight(
     Args:
         runs: where the file will be, for the free disk.
         remaining: the part of the plan that is still to be taken.
-        check_stop: called between pieces that take long, as kernels load; an exception from it ends them.
+        check_stop: function that is called between long steps, such as loading kernels; an exception from it ends them.
 
     Raises:
-        ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
-            be exposed with the camera's settings.
-        DeviceRefused: the camera does not take its settings.
+        ConfigError: the plan is impossible, limits are exceeded (all are listed), or the simulated scene cannot be
+            exposed with the settings of the camera.
+        DeviceRefused: the camera does not accept its settings.
     """
     stage, camera = instrument.devices.stage, instrument.devices.camera
     plan = remaining(plan_of(config))
@@ -338,7 +339,8 @@ def ready_scan(
     info: ScanInfo,
     check_stop: Callable[[], None] = lambda: None,
 ) -> ReadyScan:
-    """A planned scan with the monitor before its first frame; sections `monitor` and `storage` of `config` count."""
+    """A planned scan, with the state of the monitor before the first frame; the sections `monitor` and `storage` of
+    `config` are used."""
     monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames arrive.
     check_stop()

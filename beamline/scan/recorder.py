@@ -1,10 +1,10 @@
 """Recorder: computes statistics of every frame, checks it and writes it, in threads of its own, so that acquisition
 never waits for the disk.
 
-Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
-frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
-of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same. Where a
-check hangs, the second thread goes on without the first.
+Two threads handle the frames in order. The first computes the statistics of a frame and runs the checks of the monitor,
+while the second writes the previous frame. Both spend nearly all their time in code that releases the interpreter lock.
+The monitor sees each frame as a reader of the file will see it, in blocks that do not depend on the preview in the
+file, so that `beamline monitor FILE` finds the same. If a check hangs, the second thread continues without the first.
 """
 
 from __future__ import annotations
@@ -55,12 +55,13 @@ class Recorder:
     No frame is dropped: while the disk is too slow, `put` waits. A fly scan cannot wait for room, so it pauses before
     the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish` raise DataError if a
     frame could not be written, or if a write takes longer than STALL. If checks hang, the monitor is switched off. A
-    stop or an abort waits for neither: frames that the camera still delivers are kept in memory.
+    stop or an abort waits neither for the disk nor for the checks: frames that the camera still delivers are kept in
+    memory.
 
     Args:
         flagged: gets the flags of each frame.
         pause: a request that pauses the scan.
-        stop: the scan's.
+        stop: the stop request of the scan.
 
     Attributes:
         n_frames: written so far.

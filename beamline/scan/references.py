@@ -37,7 +37,8 @@ class ReferenceLog:
         """What is wrong with darks and flats so far, by kind, in one or more sentences each.
 
         Args:
-            planned: blocks that are over by now; darks or flats without any frame are missing.
+            planned: planned blocks that should be done by now; darks or flats without any frame are reported as
+                missing.
         """
         missing = {
             block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."

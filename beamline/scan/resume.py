@@ -57,11 +57,12 @@ class ResumableRun:
         parts: its files so far, each with at least one frame.
         views: planned projections that are in these files, or that the scan decided to omit.
         planned: projections of the whole plan.
-        offset: triggers of the offset projections in these files; offset_missing: how many the plan still has.
-        choices: after each pass that ended in them, oldest first.
-        choice_due: the last pass ended, and nothing was chosen yet.
+        offset: triggers of the offset projections in these files; offset_missing: number of planned offset projections
+            that are missing.
+        choices: the choice after each pass that ended in these files, oldest first.
+        choice_due: True if the last pass has ended and no choice was made yet.
         seconds: duration of the files, from the first frame of each to its last one.
-        retaken: projections that they took again, in place of others.
+        retaken: projections in these files that were taken again and replace others.
         end_references: missing kinds of darks and flats after the projections, if no projection is missing; None if
             some are.
         last_frame_time: time of the last frame, s since the Unix epoch.
@@ -89,14 +90,15 @@ class ResumableRun:
         """The run in one line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
-            kinds = ["offset views"] if self.offset_missing else []
+            kinds = ["offset projections"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
-            all_views = "the projections that it was to take" if self.choices else f"{self.planned} views"
+            all_views = "the projections that were planned" if self.choices else f"{self.planned} projections"
             return (
-                f"Preparing: {self.run} has all {all_views}; its missing {' and '.join(kinds)} of the end are taken now"
+                f"Preparing: {self.run} has all {all_views}; the {' and '.join(kinds)} that are missing at its "
+                "end are taken now"
             )
         if self.choices:  # some projections were omitted by a decision, or are taken twice
-            return f"Preparing: {self.run} lacks {missing} of the projections that it was to take; they are taken now"
+            return f"Preparing: {missing} of the projections planned for {self.run} are missing and are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
@@ -145,11 +147,11 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
     """A context that locks the run in this folder, so that no other process can resume it.
 
     Args:
-        given: a configuration that must be the run's.
+        given: a configuration that must equal that of the run.
 
     Raises:
-        ConfigError: it is not a run, another process is working on it, or its configuration differs. NothingMissing,
-            NoFrame, or NotJoined if only `recover_run` is needed.
+        ConfigError: the folder is not a run, another process is working on it, or its configuration differs.
+            NothingMissing, NoFrame, or NotJoined if only `recover_run` is needed.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
@@ -226,7 +228,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
-    whole = f"{run} has all projections that it was to take, and its darks and flats"
+    whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
     what = f"{JOINED} does not have the frames of its {len(parts)} parts" if closed else "a file was not closed"
@@ -284,14 +286,14 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     The record of a run whose process was killed then gets the state of its newest file.
 
     Args:
-        say: takes a sentence on the disk space that each needs, before anything is written to it.
+        say: function that gets a sentence on the disk space that each file needs, before anything is written.
 
     Returns:
         The result for each file, and a sentence on each part that was left out.
 
     Raises:
         ConfigError: a process is taking, recovering or continuing the run.
-        DataError: no run, or a part that cannot be recovered; those before it are recovered.
+        DataError: the folder is not a run, or a part cannot be recovered; the parts before it are recovered.
     """
     with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on copies of its files
         files, left_out = _files(run)

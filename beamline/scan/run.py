@@ -160,7 +160,7 @@ def _announcing(
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
         if settings := description.get(FOUND):
-            sink(Warned(f"{device}: settings before it was opened: {settings}."))
+            sink(Warned(f"{device}: the settings in the device before this program opened it: {settings}."))
     return sink
 
 

@@ -1,5 +1,5 @@
-"""Runs of a folder: sample and state of each, by the records of its parts, or by its files where an earlier version
-made it."""
+"""The runs in a folder: sample and state of each, from the records of its parts, or from its files if an earlier
+version of this program made it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Run:
         time: s since the Unix epoch, when it began.
         frames: in its files; None: not known.
         planned: frames of the parts before the newest one, plus the planned frames of the newest; None: not known.
-        ended: who ended it before its plan by a choice, and why; "" if nobody did.
+        ended: who ended the scan before the end of its plan, and why; "" if nobody did.
         flags: frames that the monitor flagged: their number by check, then by level.
         state: of its newest part, see docs/states.md; `died` if its process ended without writing its final state.
         bytes: of all files in the folder.
@@ -70,7 +70,7 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def newest(folder: Path) -> Path:
-    """The folder of the scan that is running, else of the newest run. Raises ConfigError if there is no run."""
+    """The folder of the running scan, or else of the newest run. Raises ConfigError if there is no run."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
         raise ConfigError(f"{folder} contains no run. Name the folder of a run, or a scan file.")
@@ -147,8 +147,7 @@ def record_sink(file: RecordFile) -> Sink:
 
 
 def record_of(part: Path) -> RunRecord:
-    """The record of a part; for frames of one whose process was killed, and for a part without a record, the file is
-    read.
+    """The record of a part. If its process was killed, or if it has no record, the file is read.
 
     If the file cannot be read, for example after a kill while it was created, the number of frames is the record's last
     one. Flags come from the record if it has any, because the file does not contain those of level `info`.

@@ -69,7 +69,7 @@ class BeamGuard:
     Args:
         pause_below: a reading below it pauses the scan, in the monitor's unit.
         resume_above: readings of at least this value mean that the beam is back.
-        settle: s for which they must be so, before the scan continues.
+        settle: time in s for which readings must stay above this value before the scan continues.
     """
 
     def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
@@ -113,7 +113,8 @@ class BeamLog:
         monitor: None: nothing is read.
         period: s of real time between readings.
         sink: takes (event, data) of `beam` and `warning`, called in the log's thread.
-        react: told each reading. Then the first one is taken before the context is entered.
+        react: function that gets each reading; if it is given, the first reading is taken before the context is
+            entered.
     """
 
     def __init__(

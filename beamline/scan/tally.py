@@ -18,9 +18,9 @@ NAMED = 5  # projections that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 TRIES = 3  # exposures of a projection whose stage is not at its angle, after which the projection counts as missing
 ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its projection is taken again, up to {TRIES} times in "
-    "total. Possible causes are another program or person that moves the stage, its manual knob, a servo "
-    "that oscillates, or a controller that reports the end of a move too early"
+    "A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to "
+    f"{TRIES} times in total. Possible causes are another program or person that moves the stage, its manual "
+    "knob, a servo that oscillates, or a controller that reports the end of a move too early"
 )
 
 Exposed = tuple[CameraFrame, int, float, bool]
@@ -32,15 +32,17 @@ class BlockTally:
     """A block with its frames and missing triggers; filled while the block is recorded.
 
     Attributes:
-        again: the block repeats projections, so losing them is no failure.
+        again: True if the block repeats projections; losing them is then not a failure.
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, whose expected frame did not come.
-        lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
+        lost, ignored: numbers of missing frames that were exposed but not delivered, and that were not exposed, if
+        known.
         extra: frames that no trigger exposed.
         unconfirmed: of the extra ones, those exposed while the stage braked.
-        shift, off: the largest of the passes, see `Ledger`.
-        astray: by trigger, of the frames exposed while the stage was not at its angle, the row and where it was, rad.
+        shift, off: the largest values of all passes, see `Ledger`.
+        astray: for frames exposed while the stage was not at its planned angle: by trigger, the row and the actual
+            angle in rad.
     """
 
     block: Block
@@ -82,7 +84,8 @@ def missing_views(done: Iterable[BlockTally]) -> tuple[int, ...]:
 
 
 def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
-    """These views have a frame: they are not missing, if they were. Returns how many were."""
+    """Record that these projections now have a frame and are no longer missing; returns how many of them were
+    missing."""
     came = [(taken, i) for taken in first_taken(done) for i in {*taken.missing}.intersection(triggers)]
     for taken, trigger in came:
         taken.missing.remove(trigger)
@@ -119,8 +122,8 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" {taken.lost} were exposed but never delivered by the camera: "
-                "`beamline check --connect` looks at its link."
+                f" {taken.lost} were exposed but never delivered by the camera: `beamline check --connect` tests "
+                "its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
@@ -137,12 +140,12 @@ def _of_block(taken: BlockTally) -> str:
         )
     if taken.shift:
         text += (
-            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra frames, "
-            "and it is not known whether at its start or at its end."
+            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra "
+            "frames, and it is not known whether they are at its start or at its end."
         )
     if text and taken.off > DOUBTFUL:
         text += (
-            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong "
-            "by as much of a step (warnings of `timing` name such frames)."
+            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong by the "
+            "same fraction of an angular step (the warnings of the check `timing` list such frames)."
         )
     return text.strip()

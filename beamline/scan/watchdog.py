@@ -1,11 +1,11 @@
 """Watchdog: a process that stops the stage and closes the shutter if the process of the scan is killed or freezes.
 
-`python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
-it writes a byte each BEAT: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A line
-says that it is ready. One that has ended is replaced. A frozen scan holds the stage's port, so it is killed first. What
-the scan held is free then: the port, which the watchdog opens, and the camera, which stops without its program. A scan
-that ends by itself kills the watchdog first. As long as its scan lives, the watchdog ignores the requests to end that a
-shutdown sends to every process.
+`python -m beamline.scan.watchdog RUN PID` reads its stdin. The scan holds this pipe open as long as it lives, and
+writes a byte to it every BEAT seconds. The watchdog acts if the pipe closes (kill -9), or if no byte comes for FROZEN s
+(SIGSTOP, a hung disk). It prints a line when it is ready. If a watchdog ends, the scan starts another one. A frozen
+scan holds the port of the stage, so the watchdog kills it first. Then the port is free, and the watchdog opens it; the
+camera stops when its program ends. A scan that ends normally kills the watchdog first. As long as the scan lives, the
+watchdog ignores the termination signals that a shutdown sends to every process.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def watched(
 ) -> Iterator[None]:
     """A context in which a watchdog process guards the run in this folder; warns if it cannot be started.
 
-    A watchdog that ends meanwhile is reported and replaced.
+    If the watchdog ends before the scan, this is reported and another watchdog is started.
 
     Args:
-        stop: is aborted if a watchdog took the scan for dead and acted.
-        pause: requested after the last watchdog has ended; None: the scan goes on without one.
+        stop: request that is set to abort if a watchdog took the scan for dead and acted.
+        pause: a pause is requested after the last watchdog has ended; None: the scan continues without a watchdog.
     """
     with Path(os.devnull).open("w") as nowhere, inhibited():
         keeper = _Keeper(folder, sink, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
@@ -129,7 +129,7 @@ class _Keeper:
             if not left:
                 self._sink(
                     Warned(
-                        f"The watchdog ended as well (code {code}): if the scan is killed now, the shutter stays open."
+                        f"The new watchdog also ended (code {code}): if the scan is killed now, the shutter stays open."
                     )
                 )
                 if pause is not None:
@@ -212,10 +212,10 @@ class _Life:
 def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
     """Wait until the scan process is dead or hangs; returns whether it hangs.
 
-    A step in which this process did nothing either (the computer slept, or was busy with its memory) counts once.
+    If this process also did nothing during a step (the computer slept, or was swapping memory), the step counts once.
 
     Args:
-        signs: of life so far; None: the process has ended.
+        signs: function that returns the number of signs of life so far; None: the process has ended.
     """
     silent, before = 0.0, clock.now()
     last = signs()
@@ -253,8 +253,8 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
     if frozen:
         say(
-            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. The watchdog "
-            "kills it to free its port."
+            f"The process of the scan did nothing for {FROZEN:.0f} s and is taken to be dead. The watchdog kills "
+            "the process to free the port of the devices."
         )
         try:
             psutil.Process(scan).kill()  # the number still belongs to that process: the pipe is open

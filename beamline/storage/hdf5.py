@@ -41,9 +41,9 @@ class UnreadableError(DataError):
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, even a file that is being written or whose program was killed (SWMR).
 
-    HDF5 shares a file within a program. A reader in the program that writes would see half of the file, and write to it
-    at the end. Two readers that follow one file would both get wrong values. Therefore such a file gets a handle of its
-    own.
+    HDF5 shares an open file within a program. A reader in the same program as the writer would see only half of the
+    file, and would write to it when it closes. Two readers that follow the same file would both get wrong values.
+    Therefore such a file is opened with a separate handle.
 
     Raises DataError if it is not a readable HDF5 file, or refers to a path that is not a file (see storage.structure).
     NotReadyError: it may become one (`follow`).

@@ -1,7 +1,7 @@
 """Interrupted runs: finds the scan file and the volume of a run, and tells the user the next step if the run ended
 early.
 
-Every command that meets such a run says the same, by `next_step`.
+Every command that finds such a run prints the same advice, from `next_step`.
 """
 
 from __future__ import annotations

@@ -45,19 +45,20 @@ def unpacked(item: h5py.Dataset) -> h5py.Dataset:
 def packing(
     attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
 ) -> Callable[[Any], NDArray[Any]] | None:
-    """A function from stored numbers [...] to values, NaN for those that stand for none; None if they are the values.
+    """A function that converts stored numbers [...] to values, with NaN for numbers that mark missing values; None if
+    the stored numbers are the values.
 
-    Values are of a real type that holds all that is stored: by CF stored * scale_factor + add_offset, by CIL (stored -
-    offset) / scale.
+    The values have a real type that can represent all stored numbers. They are stored * scale_factor + add_offset in CF
+    files, and (stored - offset) / scale in CIL files.
 
     Args:
         attributes: of the numbers.
         dtype: of the stored numbers.
         where: names them in an error.
-        by_cil: CIL wrote them: others mean something else by scale and offset.
+        by_cil: True if CIL wrote the file, because other programs use scale and offset with another meaning.
 
     Raises:
-        DataError: nobody says what they mean, or no number has such a value.
+        DataError: the meaning of the attributes is unknown, or they give no finite value.
     """
     real = np.result_type(dtype, np.float32)
     pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*attributes} and not {*_CF} & {*attributes} else _CF

@@ -1,12 +1,8 @@
 """Parts: a resumed scan has several files. Finds which projections each contains, and joins them in one file.
 
 The joined file is an NXtomo of this program whose pixels are virtual (HDF5 virtual datasets, as in the /exchange
-projection). It contains no frame itself, so it can be made again at any time. The files with the frames are never
+view). It contains no frame itself, so it can be made again at any time. The files with the frames are never
 written again. It records name and number of frames of each part, so that a reader can check that it has all parts.
-
-The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
-holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
-records name and number of frames of each part, so that a reader can check that it has all parts.
 """
 
 from __future__ import annotations
@@ -118,7 +114,9 @@ def join(parts: Sequence[Path], joined: Path) -> int:
     """
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
-            raise DataError(f"{joined} could not be made, because {part} was not closed. The parts were not changed.")
+            raise DataError(
+                f"{joined} could not be made, because the file {part} was not closed. The parts were not changed."
+            )
     with atomic_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:
@@ -174,7 +172,7 @@ def to_join(run: Path) -> str:
 
 
 def require_joined(file: h5py.File) -> None:
-    """Raise DataError if a joined file refers to frames of changed parts, or lacks a part.
+    """Raise DataError if a joined file refers to frames of changed parts, or if a part is missing.
 
     A file with frames of its own, such as a repacked copy, always passes.
     """

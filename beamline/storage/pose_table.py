@@ -40,7 +40,8 @@ _ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and 
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
 _HOW = (
-    "state the directions: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+    "state the directions: --poses FILE:x,-y means that a positive x_translation shifts the sample towards higher "
+    "columns, and a positive y_translation towards lower rows"
 )
 
 
@@ -227,10 +228,10 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
         np.atleast_1d(np.asarray(parameters.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
     )
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
-        raise ValueError(f"{path} contains no poses: its projections were used as not displaced and not tilted")
+        raise ValueError(f"{path} contains no poses: its projections were used without displacement and without tilt")
     if CENTRES_KEPT in parameters:
         raise ValueError(
-            f"{path} was made with vectors of each projection, but does not contain them: give the file of the vectors"
+            f"{path} was reconstructed with geometry vectors, but does not contain them: give the file with the vectors"
         )
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning

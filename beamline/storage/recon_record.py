@@ -62,24 +62,24 @@ class ReconRecord:
     Attributes:
         volume: `volume.data` float32 [z, y, x]; of an open file, a dataset that is sliced along z. Of a file just
             written, it is read at the first use.
-        length_unit: "mm" where the pixel size is known, else "px".
+        length_unit: "mm" if the pixel size is known, otherwise "px".
         raw_file: name of the scan it was made from.
         time: s since the Unix epoch when it was made.
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty if there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
-        series: all volumes, where `volume` is one of several; None: it is the only one.
+        series: all volumes, if `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
         model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
             none.
-        compared: metrics of FBP of the same projections; None without. This and what follows are of a volume that was
-            made by this program just now; files do not hold it.
+        compared: metrics of FBP of the same projections; None: not computed. This attribute and the following ones
+            exist only for a volume that was just reconstructed; files do not contain them.
         warnings: sentences.
-        hiding: the warning of what the volume may hide; empty without.
+        hiding: the warning that the volume may hide details; empty: no such warning.
         chosen: how `auto` or a preset came to its settings; empty if they were given.
         output, report: files of the volume and of its report; None: not written.
-        elapsed, times: s in all, and of each phase.
+        elapsed, times: seconds in total, and of each phase.
     """
 
     volume: VolumeField = VolumeField()

@@ -23,12 +23,12 @@ _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED]
 
 
 def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
-    """What the log says of the first n frames, without flags.
+    """The table of the first n frames, as the log in the file records them, without flags.
 
     Alignment frames aside are offset projections; frames whose record differs from its checksum are INVALID.
 
     Args:
-        n: None: those that are committed.
+        n: number of frames; None: all committed frames.
 
     Raises:
         ValueError: a column is not as `create` made it, or a row claims to replace a later one.
@@ -90,8 +90,8 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
 def codes_of(kind: FrameKind) -> dict[str, int]:
     """The codes of a kind of frame, by their columns: NXtomo's image key, and the finer one of the log.
 
-    NXtomo has no key for alignment frames: programs that do not know them must not use them. An offset projection is a
-    projection, of a translated sample; the log has it as an alignment frame.
+    NXtomo has no image key for alignment frames, so they get a key with which other programs do not use them. An offset
+    projection is a projection of the translated sample; the log records it as an alignment frame.
     """
     key = {FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind)
     return {layout.IMAGE_KEY: int(key), layout.KIND: max(int(kind), int(FrameKind.ALIGNMENT))}

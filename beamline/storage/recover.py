@@ -1,7 +1,7 @@
 """recover: replaces the file of a scan whose process was killed by an ordinary file with all complete frames.
 
-The frames are copied to a new file, which takes the place of the old one once it is on the disk. Whatever stops the
-copy leaves the old file as it was.
+The frames are copied to a new file, which takes the place of the old one once it is on the disk. If the copy is
+interrupted for any reason, the old file stays unchanged.
 """
 
 from __future__ import annotations
@@ -45,13 +45,14 @@ class Recovered:
 
     Attributes:
         changed: whether the file was changed.
-        frames: committed, and kept.
+        frames: number of committed frames, all of which are kept.
         dropped: frames at the end that were not committed when the process was killed, and are cut off.
-        missing: projections that were to be taken, by the plan and by what the scan chose, and were not; None if the
-            file does not hold its plan, and of a later part of a run, which others come before.
-        lost: frames that were committed and are not on the disk; they are cut off, with all after them.
+        missing: number of projections that were planned or chosen but not taken; None if the file does not contain its
+            plan, and for a later part of a run.
+        lost: frames that were committed but did not reach the disk; they are cut off, together with all frames after
+            them.
         damaged: frames that differ from their checksum; they are kept.
-        altered: frames whose row in the log differs from its checksum; in the same way kept.
+        altered: frames whose row in the log differs from its checksum; they are also kept.
         remark: a step that failed although the frames are in order; "" if none failed.
     """
 
@@ -88,10 +89,10 @@ class Recovered:
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
     """Put a closed file with the committed frames in the place of one whose process was killed, or that was cut off;
-    add the /exchange view where a closed one lacks it.
+    add the /exchange view to a closed file that does not have it.
 
     Args:
-        say: takes a sentence on the room that the copy needs.
+        say: function that gets a sentence on the disk space that the copy needs.
 
     Raises:
         DataError: no scan of this program, a damaged one, one that a running program has open, or that changed within

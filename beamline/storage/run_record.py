@@ -1,8 +1,9 @@
 """The record of a run: a small file in the folder of each of its parts, and locks that tell whether a process is at
 work there.
 
-The process of a part holds a lock on the part's configuration as long as it lives, to the end of its last fit. The
-system drops it with the process. A process that recovers a run or continues it holds one on the run's events.
+The process of a part locks the part's configuration as long as it lives, that is, until the end of its final fit. The
+operating system releases the lock when the process ends. A process that recovers or continues a run locks the events of
+the run.
 """
 
 from __future__ import annotations
@@ -31,12 +32,13 @@ class RunRecord:
 
     Attributes:
         state: see docs/states.md.
-        over: whether that is its last state.
+        over: True if this is the last state.
         sample: its name.
-        frames: in its file, or where `joined` in the file that joins the parts so far; None: not known.
-        planned: frames that it is to have; None: not known.
+        frames: number of frames in the file of the part, or, if `joined`, in the file that joins the parts so far;
+            None: not known.
+        planned: planned number of frames; None: not known.
         flags: frames that the monitor flagged: their number by check, then by level; empty before its file is closed.
-        ended: who ended it before its plan by a choice, and why; "" if nobody did.
+        ended: who ended the scan before the end of its plan, and why; "" if nobody did.
         time: when this was written, s since the Unix epoch.
     """
 
@@ -55,9 +57,9 @@ _RECORDS = TypeAdapter(RunRecord)
 
 
 def read_record(part: Path) -> RunRecord | None:
-    """The record of a part, `died` where its process has ended without writing its last state.
+    """The record of a part; its state is `died` if the process ended without writing its last state.
 
-    None: it has none, as those of earlier versions, or it is damaged.
+    None: the part has no record, because an earlier version wrote it, or the record is damaged.
     """
     lives = alive(part)  # asked first: the last record is written before the lock goes
     with suppress(OSError, ValueError):
@@ -67,7 +69,8 @@ def read_record(part: Path) -> RunRecord | None:
 
 
 def write_record(part: Path, record: RunRecord) -> None:
-    """Write the record of a part: readers see the one before or this one. Raises OSError."""
+    """Write the record of a part. Readers see either the previous record or this one, never a part of it. Raises
+    OSError."""
     path = part / RECORD
     partial = path.with_name(f".{RECORD}.new")
     partial.write_text(json_of(replace(record, time=time.time())), encoding="utf-8")
@@ -93,7 +96,7 @@ class RecordFile:
         self._written = record
 
     def close(self) -> None:
-        """Let go of the part; one without a last state has failed."""
+        """Release the part; if it has no last state, its state becomes `failed`."""
         last = self.record if self.record.over else replace(self.record, state="failed", over=True)
         for _ in range(_TRIES):
             self.put(last)
@@ -101,8 +104,8 @@ class RecordFile:
         self._lock.release()
 
     def put(self, record: RunRecord, *, at_once: bool = True) -> None:
-        """Note what it is doing, unless `at_once` only once in EVERY; a disk that refuses is asked again at the next
-        call."""
+        """Record what the part is doing: immediately with `at_once`, otherwise at most once in EVERY seconds. If the
+        disk fails, the next call tries again."""
         self.record = record
         if record == self._written or not (at_once or time.monotonic() - self._written_at > EVERY):
             return

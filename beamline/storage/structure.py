@@ -1,6 +1,6 @@
 """Structure of an HDF5 file: checks its objects and the other files that it refers to, before any of them is opened.
 
-HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of deeply nested groups.
+HDF5 opens whatever a link names. It would wait forever for a pipe, and for the names of deeply nested groups.
 
 Functions on shape, type and place of voxels raise ValueError, which the reader of a format turns into a DataError with
 the path.
@@ -122,10 +122,10 @@ _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far bey
 
 
 def is_blank(unpacked: int, stored: int, piece: int) -> bool:
-    """Whether images that unpack in large pieces take less than a 500th of their bytes in the file.
+    """True if images that are unpacked in large pieces use less than a 500th of their bytes in the file.
 
-    Shot noise of one count in a hundred pixels takes 0.08 of their 16 bits, a 200th: what is packed closer than that
-    holds no image, and may be made to fill the memory.
+    Shot noise of one count in a hundred pixels needs 0.08 bits per pixel of 16 bits, a 200th. Data that are packed more
+    closely are not an image, and may have been made to fill the memory.
     """
     return piece > _LARGE and unpacked > _BLANK * stored
 

@@ -1,10 +1,10 @@
 """Low-level blocks of HDF5: the first 48 bytes of a file, and blocks that are half written because the process was
 killed.
 
-The head says whether the file is being written and how many bytes it has. A kill may end a write where two pages of the
-file system's memory meet. The block is then new up to there, and old after it. Each field is the new or the old one,
-and both are right. Only the checksum, at the block's end, is not. (Specification 3.0: object headers IV.A, extensible
-arrays VII.D.)
+The superblock states whether the file is being written and how many bytes it has. If the process is killed, a write may
+end at the boundary of two pages of memory. The block is then new before this boundary and old after it. Each field has
+its new or its old value, and both are valid. Only the checksum at the end of the block is wrong. (Specification 3.0:
+object headers IV.A, extensible arrays VII.D.)
 
 Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
 signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,

@@ -34,7 +34,7 @@ def read_volume(
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     """Read a volume, and the voxel spacing in mm along its axes, if the file states it.
 
-    NIfTI, OME-Zarr, ImageJ's and OME's TIFFs and `voxel_mm` (`slice_mm`) of an .npz do.
+    The spacing is stated by NIfTI, OME-Zarr, TIFFs of ImageJ and OME, and by `voxel_mm` (`slice_mm`) in an .npz.
 
     Args:
         dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array of three axes.

@@ -1,8 +1,9 @@
 """Locks on files: those of this program on a file that is being written, and failures of HDF5's own locks.
 
-Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
-however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read
-whole. On a file system without locks (many NFS mounts) that fails.
+The lock of this program shows that a writer is alive, even if it writes nothing for a long time. The operating system
+releases the lock when the program ends for any reason. HDF5 holds no lock on a file that others may follow, but it
+locks every file that it creates or opens for ordinary reading. On a file system without locks (many NFS mounts) this
+fails.
 """
 
 from __future__ import annotations
@@ -87,9 +88,9 @@ def no_locks_sentence(place: Path, number: int | None = None) -> str:
     """A sentence with the cause and the remedy."""
     told = "" if number is None else f" (errno {number})"
     return (
-        f"the file system of {place} has no file locks{told}, which is often so with NFS, and HDF5 "
-        "creates no file there. Choose a storage.folder on a local disk, mount the file system with "
-        f"locks, or set {WITHOUT} in the environment"
+        f"the file system of {place} has no file locks{told}, which is common with NFS, so HDF5 cannot create a "
+        "file there. Choose a storage.folder on a local disk, mount the file system with locks, or set "
+        f"{WITHOUT} in the environment"
     )
 
 
@@ -141,8 +142,8 @@ def held(path: Path, *, exclusively: bool = False) -> bool | None:
     its file system has no locks.
 
     Args:
-        exclusively: those who hold this file lock it exclusively. Then those who ask do not hinder one another (but on
-            Windows).
+        exclusively: True if the holder of this file locks it exclusively. Several processes can then ask at the same
+            time without blocking one another (except on Windows).
     """
     writable = not exclusively and os.access(path, os.W_OK)
     try:
@@ -185,8 +186,9 @@ class WriterWatch:
         """How the loss of the writer was detected, as the end of a sentence; "" if it was not.
 
         Args:
-            grew: since the last call.
-            finished: asks the file; the lock goes after the end is written.
+            grew: True if the file has grown since the last call.
+            finished: function that reads from the file whether the scan has ended; the lock is released after the end
+                is written.
         """
         if now - self._last_look >= _LOOK:
             self._last_look, self._was_held, self._held = now, self._held, held(self._path)

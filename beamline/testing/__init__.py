@@ -1,4 +1,5 @@
-"""ReaderConformance: what every reader of scans does, as a pytest class that a format's tests subclass.
+"""ReaderConformance: tests that every reader of scans must pass, as a pytest class from which the tests of a format
+derive.
 
 class TestMine(ReaderConformance):
     @pytest.fixture

@@ -1,5 +1,5 @@
 """Families of devices, each a folder.
 
-Adding one takes its folder, whose SHUTTERS, FILTERS, MONOCHROMATORS and BEAM_MONITORS are sections of the configuration
-by `kind`. They derive from `FoundShutter` and others like it, and connect the device.
+To add a family, add its folder. Its SHUTTERS, FILTERS, MONOCHROMATORS and BEAM_MONITORS are sections of the
+configuration by `kind`. These sections derive from `FoundShutter` and similar classes, and connect the device.
 """

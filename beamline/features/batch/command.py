@@ -188,7 +188,7 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
             log.unlink()
             reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
             if ending is ProcessEnd.SILENT:
-                reason = f"its process was ended, because it gave no output for {_SILENCE:g} s"
+                reason = f"its process was ended, because it printed nothing for {_SILENCE:g} s"
             if code not in _WITH_VOLUME or not (work / RECON).is_file():
                 raise DataError(reason or f"no volume: its process ended with code {code}")
         state, why = _WITH_VOLUME[code], [reason] if code else []
@@ -245,7 +245,7 @@ def _refuse_names(rows: Sequence[BatchRow]) -> None:
     folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
     for n, row in enumerate(rows, start=2):
         if row.name != safe_name(row.name) or folded[n] in folded[:n]:
-            raise ValueError(f"{row.name!r} is not a name that this program gives to the folder of a scan")
+            raise ValueError(f"{row.name!r} is not a name that this program would give to the folder of a scan")
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:

@@ -36,8 +36,10 @@ if TYPE_CHECKING:
 @click.option(
     "--seconds",
     type=POSITIVE,
-    help="Time limit for the reconstruction after the scan, in seconds. If it is too short for the fit, the volume is "
-    "poorer. Default: as long as the fit needs.",
+    help=(
+        "Time limit for the reconstruction after the scan, in seconds. If this limit ends the fit early, the volume "
+        "is less accurate. Default: as long as the fit needs."
+    ),
 )
 @json_option
 def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:

@@ -28,15 +28,15 @@ class RunServer:
     """Serves the newest run of a folder, also one that begins later, until it is closed.
 
     Args:
-        prefix: before each name, such as "2bma:splatline:".
-        address: to listen at.
-        control: verbs and answers are taken, from everybody who reaches the address.
-        say: takes a line for each verb.
+        prefix: prefix of each name, such as "2bma:splatline:".
+        address: network address at which the server listens.
+        control: True if the server accepts commands and decisions from everybody who can reach the address.
+        say: function that gets a line for each command.
         now: a clock, s since the Unix epoch.
 
     Raises:
         ConfigError: p4p is not installed.
-        DataError: the address cannot be listened at.
+        DataError: the server cannot listen at this address.
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class RunServer:
         return dict(self._server.conf())
 
     def look(self) -> None:
-        """Answer clients whose verbs are done. Look at the run, and post what has been set since, with the time and the
-        alarm of what set it."""
+        """Answer clients whose commands are done. Read the state of the run, and post every value that has changed,
+        with its time and its alarm."""
         for _ in range(len(self._asked)):
             self._answer(*self._asked.popleft())
         before, now = self._run.stamped, self._run.look()

@@ -90,8 +90,10 @@ class ExportRequest:
         "--material",
         type=WholeRange(min=1),
         metavar="K",
-        help="For a volume with discrete levels: write the probability that a voxel is material K instead of its "
-        "density. 1: the least dense material.",
+        help=(
+            "For a volume with discrete levels: instead of the density of each voxel, write the probability that "
+            "the voxel is material K. 1: the least dense material."
+        ),
     )
     at: int | None = set_by(
         "--at", type=WholeRange(min=0), metavar="K", help="Write volume K of a time series, counted from 0."
@@ -133,15 +135,17 @@ def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None
     for name, (wanted, suffix, _) in parts.items():
         if (request.output.suffix.lower() == suffix) != wanted:
             raise click.UsageError(
-                f"-o {request.output}: {name} writes {suffix} files, and only {name} writes them. Change the suffix or "
-                f"add {name}."
+                f"-o {request.output}: {name} writes {suffix} files, and only {name} writes this format. Change "
+                f"the suffix or add {name}."
             )
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
             if request.bits != "32" or any(
                 x is not None for x in (request.window, request.dataset, request.at, request.material)
             ):
-                raise click.UsageError(f"{name} does not go with --bits, --window, --material, --at or --dataset.")
+                raise click.UsageError(
+                    f"{name} cannot be combined with --bits, --window, --material, --at or --dataset."
+                )
             return export_part
     return None
 
@@ -172,7 +176,7 @@ def _export_voxels(request: ExportRequest) -> None:
             shape = record.volume.grid.shape
         share, window = clipped / math.prod(shape), request.window
         facts = {"output": request.output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
-        outside = f"{share:.3%} of the voxels are outside it and were clipped"
+        outside = f"{share:.3%} of the voxels are outside the window and were clipped"
         answer.done(
             {**facts, "seconds": answer.seconds},
             f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})",

@@ -37,7 +37,7 @@ _PATH = click.Path(path_type=Path)
 @click.option(
     "--statistics",
     is_flag=True,
-    help="For a scan: range, percentiles, mean and saturated pixels of the stored values, before any correction.",
+    help="For a scan: print range, percentiles, mean and saturated pixels of the stored values, before any correction.",
 )
 @click.option(
     "-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: write the histograms to this PNG file."
@@ -46,13 +46,13 @@ _PATH = click.Path(path_type=Path)
 @click.option(
     "--truth",
     metavar="FILE",
-    help="For a volume: PSNR and SSIM against this ground truth (FILE, or FILE:FIRST:END for some slices).",
+    help="For a volume: print PSNR and SSIM against this ground truth (FILE, or FILE:FIRST:END for some slices).",
 )
 @click.option(
     "--masks",
     metavar="FILE",
     type=_PATH,
-    help="For a volume: SNR and CNR in the regions of this label image, in which 1 is dense and 2 is empty.",
+    help="For a volume: print SNR and CNR in the regions of this label image, in which 1 is dense and 2 is empty.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(
@@ -220,11 +220,9 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
 @click.option(
     "--pixel-size-um",
     type=POSITIVE,
-    help="Pixel size at the sample in µm, if IN does not state it or states a wrong one.",
+    help="Pixel size at the sample in µm, if the file IN states none or a wrong value.",
 )
-@click.option(
-    "--energy-kev", type=POSITIVE, help="Photon energy in keV, if IN does not state it or states a wrong one."
-)
+@click.option("--energy-kev", type=POSITIVE, help="Photon energy in keV, if the file IN states none or a wrong value.")
 @click.option(
     "--sample", help="Name of the sample, which the file will state. Default: the name in IN, or its file name."
 )

@@ -1,8 +1,8 @@
 """ingest: copies any scan, frame by frame, into one of our files, with statistics of each frame.
 
-Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
-rounding would lose what was measured. They keep their type, at the same paths, under the definition
-`splatline_float_projections`, so that they do not count as counts; open_scan reads both.
+Integer frames become an NXtomo. Float frames (such as float32 stacks) cannot become an NXtomo, because its data are
+integers and rounding would lose information. They keep their type and have the same paths, under the definition
+`splatline_float_projections`, so that no program takes them for counts. open_scan reads both kinds of files.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Rows, ScanEn
 class Ingested:
     """The written copy. `definition`: NXtomo, or float projections; `invalid_frames`: frames without a valid pixel.
 
-    `doubts`: what the input states that may change the volume, that is not used, and that the copy does not state.
+    `doubts`: values in the input that may change the volume but are neither used nor stored in the copy.
     """
 
     path: Path
@@ -57,12 +57,12 @@ def ingest(
     """Copy a scan into the new file `out`, one frame in memory at a time.
 
     Args:
-        pixel_size_mm, energy_kev, sample: for the record, where the input does not say.
+        pixel_size_mm, energy_kev, sample: values to store if the input does not state them.
         no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
         progress: called with (frames written, frames in all) after each.
 
     Raises:
-        DataError: unreadable input, `out` exists, or the disk does not take it. No half file is left.
+        DataError: the input cannot be read, `out` exists, or the disk fails. No incomplete file remains.
     """
     out = Path(out)
     with atomic_file(out) as partial, open_scan(scan) as source:
@@ -105,8 +105,8 @@ def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
         )
     if source.table.shifts is not None:
         raise DataError(
-            f"{source.path} states a shift for each projection, which the copy could not state. Reconstruct the "
-            "original file instead. Nothing was written."
+            f"{source.path} states a shift for each projection, but the copy cannot store these shifts. "
+            "Reconstruct the original file instead. Nothing was written."
         )
     if source.table.altered.any():
         raise DataError(f"{altered_sentence(source)} Nothing was written.")

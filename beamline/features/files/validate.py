@@ -1,7 +1,7 @@
 """validate and describe: all findings about the file of a scan or a volume, and its facts as plain values.
 
-The rules of storage.rules look at a scan of any format; those at the end at what the camera's count and the clock say
-of its frames: which are lost, repeated or out of order.
+The rules of storage.rules check a scan of any format. The rules at the end of this module use the frame counter of the
+camera and the times to find frames that are lost, repeated or out of order.
 """
 
 from __future__ import annotations
@@ -52,8 +52,11 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         if finite.any():
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
     raw, there = record.raw_file, record.parameters.get("partial")
-    partial = f"Partial: {there} are there, the others are empty. recon --resume makes them."
-    early = "The reconstruction was stopped early; this is the volume that it had reached."
+    partial = (
+        f"The volume is partial: {there} are reconstructed, the others are empty. `beamline recon --resume` "
+        "reconstructs the others."
+    )
+    early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (
         (bad > 0, Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")),
         (low == high, Finding("error", "voxels", f"Every voxel is {low:g}.")),
@@ -77,7 +80,8 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
 
     Args:
-        deep: every frame is read and compared with its checksum; it is called with how many of how many.
+        deep: function that gets the number of frames read and their total number; if it is given, every frame is read
+            and compared with its checksum.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     findings, stated = list[Finding](), isinstance(scan, SourceOptions) and scan.stated
@@ -104,8 +108,8 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 
 def source_findings(scan: ScanEvidence) -> list[Finding]:
-    """Findings in an open scan: its content, its references, and its flagged frames. Numbers that wrapped explain all
-    that light and references show."""
+    """Findings in an open scan: its content, its references, and its flagged frames. If pixels overflowed, findings on
+    the intensity and on darks and flats are left out, because the overflow explains them."""
     findings = findings_of(scan)
     if any(finding.rule == WRAPPED and finding.severity == "error" for finding in findings):
         findings = [finding for finding in findings if finding.rule not in ("light", "bad-references")]
@@ -113,17 +117,17 @@ def source_findings(scan: ScanEvidence) -> list[Finding]:
 
 
 def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
-    """Views have light throughout the scan. `beamline recon` names and leaves out dark views."""
+    """The projections are exposed throughout the scan. `beamline recon` lists dark projections and leaves them out."""
     views = scan.table.views
     looked_at = views if every else spread(views, VIEWS)
     unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.unlit(row)]
     if unlit:
-        of = f"{views.size} views" if every else f"{looked_at.size} views looked at"
-        more = "" if every else " `validate --deep` looks at all."
+        of = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
+        more = "" if every else " `validate --deep` checks all projections."
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {of} ({frames_text(unlit)}) without beam: the shutter was closed, the beam was lost, or "
+            f"{len(unlit)} of {of} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was lost, or "
             f"these frames were never written. `beamline recon` does not use such projections.{more}",
         )
 
@@ -132,7 +136,8 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
     """Every frame can be read and matches its checksum, if the file has checksums.
 
     Args:
-        progress: how many of how many frames were read; None: only those that other rules have read are judged.
+        progress: function that gets the number of frames read and their total number; None: only frames that other
+            rules have read are checked.
     """
     n, unreadable, why = len(source.table), list[int](), ""
     if source.table.altered.any():
@@ -160,8 +165,8 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
             "error",
             "checksums",
             f"{len(source.damaged)} of {n} frames are damaged, because they differ from their stored checksums: "
-            f"{spans(sorted(source.damaged))}. Look for a good copy; `beamline recon` leaves them out."
-            + ("" if progress else " `validate --deep` compares all frames."),
+            f"{spans(sorted(source.damaged))}. Look for an intact copy of the file; `beamline recon` leaves "
+            "these frames out." + ("" if progress else " `validate --deep` compares all frames."),
         )
     elif progress and not source.checksummed:
         yield Finding(
@@ -185,7 +190,7 @@ def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
 
 
 def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, Any]:
-    """Format, voxels, where they come from, and every setting and figure of merit that is one number or a text."""
+    """Format, voxels, origin of the volume, and every setting and figure of merit that is a single number or a text."""
     grid, data = record.volume.grid, record.volume.data
     attributes = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray) or v.size == 2}
     return {
@@ -210,8 +215,8 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     """Format, frames, angles, quantity, scale, and the findings of the rules; None for what is unknown.
 
     Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
-    are the numbers that the file states and nobody uses, by path. `findings` are the
-    messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
+    contains the numbers that the file states but this program does not use, by path. `findings` are the messages of
+    errors and warnings, `reconstructable` is True if no error prevents a reconstruction.
     """
     kinds = {kind.name.lower(): source.table.of_kind(kind).size for kind in FrameKind}
     until = clock() + LOOK
@@ -317,8 +322,8 @@ def time_order(source: ScanSource) -> Iterator[Finding]:
 def framestamp_order(source: ScanSource) -> Iterator[Finding]:
     """The camera's frame counter increases by one for each frame.
 
-    It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
-    another part of a joined file. Not always at 0, for the first frame may be lost.
+    The counter starts again when the camera is armed again: for another kind of frames, for other triggers of the same
+    kind, or in another part of a joined file. It does not always start at 0, because the first frame may be lost.
     """
     table = source.table
     stamps, triggers, key = table.framestamps, table.triggers, table.kinds

@@ -1,8 +1,8 @@
 """Web application of the page: its files, the stream of events, image tiles, and commands for authorised users.
 
-A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
-host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the
-token for acting in a header. No data of a client reach the file system.
+Any other page that is open in the browser can send requests to this server. Therefore each request must name one of our
+hosts and carry the viewing token (a cookie). Actions are POST requests from our own origin, with the control token in a
+header. No data from a client reach the file system.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
 _KEPT = 64  # answers kept for the next client
-_NO_VERB = "do what is no verb"
+_NO_VERB = "an unknown command"
 _ONLY_WATCHES = (
     "This address can only watch the scan. To control the scan, open the address that `beamline scan --page` "
     "or `beamline watch --control` prints for this purpose. Nothing was sent to the scan."
@@ -65,7 +65,7 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """Host names and tokens of a page: who may look, and who may act."""
+    """Host names and tokens of a page: who may watch, and who may control the scan."""
 
     hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
@@ -257,7 +257,8 @@ class _Server:
         return self._reader.do(kept)
 
     def model(self, request: Request) -> Response:
-        """The live picture: newest view, the volume seen from there, their difference in noise."""
+        """The live picture: the newest projection, the projection of the volume at the same angle, and their difference
+        in units of the noise."""
         run, picture = self._reader.what.run, b""
         if run is not None:
             with suppress(OSError):
@@ -265,18 +266,20 @@ class _Server:
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
     async def verb(self, request: Request) -> Response:
-        """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
+        """Send a command to the run immediately, even if all threads that answer other requests are busy."""
         folder, act = self._reader.what.folder, self._access.act
         client = request.client.host if request.client else "?"
         verb = next((verb for verb in (*Verb, *Choice) if verb == request.path_params["verb"]), None)
         name = _NO_VERB if verb is None else str(verb)  # never what was sent
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
-            self._log(f"not done: {name} from {client}, because the token for controlling the scan is missing")
+            self._log(
+                f"not executed: {name}, requested by {client}, because the token for controlling the scan is missing"
+            )
             return JSONResponse({"message": _ONLY_WATCHES}, 403)
         if folder is None or verb is None:
             return JSONResponse({"message": f"{name} is not possible: no scan is running in this folder."}, 404)
-        self._log(f"{name}, asked for from {client}")
+        self._log(f"{name}, requested by {client}")
         asked = ask(folder, verb)
         while (state := await run_in_threadpool(asked.state)) is None:
             await asyncio.sleep(POLL)

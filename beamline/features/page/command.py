@@ -33,7 +33,7 @@ port_option = click.option(
     default=PORT,
     show_default=True,
     type=WholeRange(0, 65535),
-    help="Port of the page. If it is in use, the next free one.",
+    help="Port of the page. If the port is in use, the next free port is used.",
 )
 bind_option = click.option(
     "--bind",
@@ -139,7 +139,7 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
         raise ConfigError(f"the folder {folder} does not exist: name the folder that has the runs.")
     if as_page:
         if as_json:
-            raise click.UsageError("--page does not go with --json.")
+            raise click.UsageError("--page cannot be combined with --json.")
         _serve(folder, port, bind, tethered, browse)
         return
     with answering(as_json) as answer:

@@ -45,15 +45,16 @@ _HEAD = 65536  # bytes of a request in which the token is looked for
 
 
 class Entrance:
-    """The listening socket of a page, until `close`: whose request has the token is served before all others.
+    """The listening socket of a page, until `close`: requests with the token are served before all others.
 
-    The event loop accepts some hundred connections a second if each becomes a protocol at once. The others wait in the
-    system, and one that its full queue drops is tried again after a second or three. Here to accept is one call of the
-    system, so that thousands a second may come.
+    The event loop accepts only some hundred connections per second if each one becomes a protocol at once. Other
+    connections wait in the queue of the operating system. If this queue is full, a connection is dropped, and the
+    client tries again after one to three seconds. Here, accepting a connection is a single system call, so that
+    thousands of connections per second are possible.
 
     Args:
         protocol: makes the protocol of a connection that is handed on.
-        token: connections whose first bytes have it are handed on at once, others one after the other.
+        token: connections whose first bytes contain this token are handed on at once, others one after the other.
     """
 
     def __init__(self, listening: socket.socket, protocol: Callable[[], asyncio.Protocol], token: bytes) -> None:
@@ -69,7 +70,7 @@ class Entrance:
         self._loop.add_reader(listening, self._accept)
 
     def close(self) -> None:
-        """Accept no more, and close those that wait."""
+        """Accept no more connections, and close the waiting ones."""
         self._loop.remove_reader(self._listening)
         for timer in (self._look, self._turn):
             if timer is not None:
@@ -154,8 +155,8 @@ class RunBrowser:
     """The runs of a folder, numbered: no name from a client reaches the file system.
 
     Args:
-        own: runs of the program that this page belongs to, the newest one last, while they come. The table leads to
-            that one, and nobody may act on any other run.
+        own: runs of the program to which this page belongs, the newest one last; more may follow. The table links to
+            the newest one, and no other run can be controlled.
     """
 
     def __init__(self, folder: Path, own: Sequence[Path] = ()) -> None:
@@ -169,7 +170,7 @@ class RunBrowser:
             opened.reader.close()
 
     def app(self, access: Access) -> Starlette:
-        """The application; who may act may do so on the pages of its own runs."""
+        """The application. Users with the control token can control its own runs on their pages."""
         self._access = access
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
         return guarded("runs.html", routes, access)
@@ -197,7 +198,7 @@ class RunBrowser:
     def _open(self, number: int) -> _Opened:
         runs = list(self._numbers)  # by number; a copy, since `table` adds to it in another thread
         if number >= len(runs):
-            raise DataError(f"There is no run {number} here.")
+            raise DataError(f"This page has no run {number}.")
         opened = number, (is_own := runs[number] in self._own)
         if opened not in self._opened:
             unused = [n for n, opened in self._opened.items() if not opened.requests]
@@ -211,7 +212,7 @@ class RunBrowser:
 
 @dataclass(frozen=True)
 class Addresses:
-    """Addresses for a browser: to look, and to act as well (None: not allowed)."""
+    """Addresses for a browser: one to watch, and one that also allows control (None: not allowed)."""
 
     look: str
     act: str | None
@@ -314,7 +315,7 @@ def start(app: Callable[[Access], Starlette], listening: socket.socket, *, contr
     """A server of an application, with new tokens.
 
     Args:
-        control: allow verbs from the page, with the address for acting.
+        control: allow commands from the page, at the address for control.
     """
     access = Access(_names(listening), act=secrets.token_hex(16) if control else None)
     return PageServer(app(access), listening, access)

@@ -56,7 +56,8 @@ def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
     thread = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
     def read_more() -> None:
-        """A slice of a volume that is not read whole yet; then what was asked for in the meantime goes first."""
+        """Read one more slice of a volume that is not completely read; then requests that arrived in the meantime are
+        answered first."""
         if any(volume.read_more() for volume in volumes):
             thread.submit(read_more)
 
@@ -65,7 +66,7 @@ def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
 
 
 def tile_of_volume(tile: VolumeTile) -> Response:
-    """A tile of a slice; `ready` below 1: it gets better while the volume is read."""
+    """A tile of a slice; if `ready` is below 1, the tile improves while the volume is read."""
     return tile_of(tile.values, {"region": astuple(tile.region), "bin": tile.bin, "ready": tile.ready})
 
 
@@ -81,7 +82,7 @@ class _Viewer:
         return tile_of_volume(self._on(request, lambda volume: volume.cut(axis, index, region_of(request), time)))
 
     def difference(self, request: Request) -> Response:
-        """The second volume less the first one; DataError unless both have one shape."""
+        """The second volume minus the first one; DataError unless both have the same shape."""
         (axis, index, time), region = _place(request), region_of(request)
 
         def cuts(volumes: Sequence[ShownVolume]) -> list[VolumeTile]:
@@ -91,7 +92,9 @@ class _Viewer:
 
         first, second = self._do(cuts)
         if first.values.shape != second.values.shape:  # one of them has scales
-            raise DataError("The two volumes have this slice at two resolutions; zoom in.")
+            raise DataError(
+                "The slices of the two volumes have different resolutions here, so no difference can be shown: zoom in."
+            )
         return tile_of_volume(replace(first, values=second.values - first.values, ready=min(first.ready, second.ready)))
 
     def histogram(self, request: Request) -> Response:
@@ -107,7 +110,7 @@ class _Viewer:
 
         def read_it(volumes: Sequence[ShownVolume]) -> _Result:
             if which >= len(volumes):
-                raise DataError(f"Volume {which} is not shown here.")
+                raise DataError(f"This page does not show volume {which}.")
             return read(volumes[which])
 
         return self._do(read_it)

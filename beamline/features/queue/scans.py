@@ -79,12 +79,13 @@ def run_queue(
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
-    """Run the scans of a queue. After a failed one the next follows, unless `stop_on_failure`.
+    """Run the scans of a queue. If one fails, the next one still runs, unless `stop_on_failure`.
 
-    It ends where somebody stopped a scan (Ctrl-C, a signal, `beamline stop`), and where an instrument did not obey.
+    The queue ends if the operator stops a scan (Ctrl-C, a signal, `beamline stop`), or if a device does not respond.
 
     Args:
-        take: takes a scan, the n-th from 0 on, tells its events to the last argument, and raises what `run_scan` does.
+        take: function that runs a scan, given its number from 0 on; it sends its events to its last argument, and
+            raises the errors of `run_scan`.
     """
     outcomes: list[ScanOutcome] = []
     ended = ""
@@ -100,11 +101,11 @@ def run_queue(
             asked = stop.by_person or isinstance(error, KeyboardInterrupt)
             status = QueueStatus.STOPPED if asked else QueueStatus.FAILED
             outcomes.append(ScanOutcome(name, status, run.folder, user_message(error), exit_code(error)))
-            ended = "somebody stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
+            ended = "the operator stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
         else:
             status = QueueStatus.ALARMS if faults else QueueStatus.COMPLETE
             outcomes.append(ScanOutcome(name, status, path, " ".join(faults), AlarmError.exit_code if faults else 0))
-            ended = "somebody stopped the queue" if stop.by_person else ""
+            ended = "the operator stopped the queue" if stop.by_person else ""
         if run.unsafe:
             ended = f"stage, camera or shutter did not respond at the end of {name}"
     return tuple(outcomes)

@@ -100,8 +100,11 @@ class SimulateRequest:
     truth_bin: int | None = set_by(
         "--truth-bin",
         type=WholeRange(min=1),
-        help="Voxel size of the ground truth in pixels. Use the value of --bin of the reconstruction that you want to "
-        "compare. Default: such that the ground truth has about 256 voxels a side.",
+        help=(
+            "Voxel size of the ground truth in pixels. Use the same number as for --bin of the reconstruction that "
+            "you want to compare. Default: the number with which the ground truth has about 256 voxels along each "
+            "side."
+        ),
     )
     picture: Path | None = set_by(
         "--picture", type=_FILE, help="Write a picture of some frames to this PNG file. Default: next to the scan file."
@@ -215,7 +218,7 @@ def _explain(scan: Scan, output: Output) -> None:
         "\n".join(
             [f"{'step':<22}{'acts on':<15}what happens"]
             + [f"{name:<22}{domain:<15}{summary}" for name, domain, summary in steps]
-            + ["\nEffects that the scene does not use, and that are therefore neither imported nor computed:"]
+            + ["\nEffects that the scene does not use (they are neither imported nor computed):"]
             + [f"  {name:<20}{summary}" for name, summary in unused]
         )
     )

@@ -157,7 +157,8 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
 
 
 def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
-    """The scan of a scene, see Scan.of. Its last frame is computed once, to refuse an impossible scene early.
+    """The scan of a scene, see Scan.of. Its last frame is computed once, so that an impossible scene raises its error
+    early.
 
     Raises:
         CannotExposeError: the scene cannot be exposed with its settings.

@@ -152,7 +152,10 @@ class StudyRequest:
         default=(DEFAULT, BASELINE),
         show_default=True,
         metavar="NAME",
-        help=f"Method for every row: {', '.join(names_of_one_volume())}. Can be given several times.",
+        help=(
+            f"Method with which every row of the table is reconstructed: {', '.join(names_of_one_volume())}. Can "
+            "be given several times."
+        ),
     )
     truth: str | None = set_by(
         heading(DATA),
@@ -168,7 +171,10 @@ class StudyRequest:
         type=NameChoice(get_args(Filter)),
         default="hann",
         show_default=True,
-        help="Filter of every FBP, both of the rows and of the volume from all projections.",
+        help=(
+            "Filter of every FBP volume: of those in the rows of the table, and of the reference volume from "
+            "all projections."
+        ),
     )
     draws: int = set_by(
         "--draws",

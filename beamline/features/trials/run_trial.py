@@ -33,7 +33,7 @@ _UNWATCHED = RunControl()
 
 
 class TrialRun(NamedTuple):
-    """What a trial runs: a method on views, for a volume on this grid."""
+    """What a trial runs: a method on projections, for a volume on this grid."""
 
     method: Method
     prepared: PreparedProjections
@@ -43,7 +43,7 @@ class TrialRun(NamedTuple):
 
 
 class TrialScan(Protocol):
-    """The scan of some trials: what each runs, and what its volume is worth.
+    """The scan of some trials: what each trial runs, and how good its volume is.
 
     Attributes:
         truth: the volume [z, y, x] of all trials, if it is known.
@@ -52,13 +52,13 @@ class TrialScan(Protocol):
     truth: F32 | None = None
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
-        """What a trial runs. Raises ValueError for a setting, or views, that there are not."""
+        """What a trial runs. Raises ValueError for a setting or projections that do not exist."""
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """Figures of a volume by name, and the squared residual of each view held out."""
+        """Figures of merit of a volume by name, and the squared residual of each held-out projection."""
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with what follows from all of its trials."""
+        """The table with the conclusions from all of its trials."""
         return table
 
 

@@ -213,8 +213,8 @@ def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock
 
 
 def with_references(data: TrialData, references: Sequence[MethodTrial], run: Run) -> TrialData:
-    """The data with volumes that others are compared with, in addition to the truth, each with those of its method; and
-    with the dense and empty regions of the truth, or of the first one.
+    """The data with reference volumes in addition to the ground truth: each trial is compared with the reference of its
+    own method. Dense and empty regions come from the ground truth, or else from the first reference.
 
     Raises:
         DataError: a reference could not be made.

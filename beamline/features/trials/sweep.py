@@ -154,7 +154,7 @@ class SweptScan(TrialScan):
         if self._views is None or self._views[:2] != (source_words, wanted):
             with options.source.open() as source:
                 views = prepare_projections(source, wanted, Warnings(self._sink, self._clock))
-            views = hold_out(views, ONE_IN, advice="take a scan with more views")
+            views = hold_out(views, ONE_IN, advice="take a scan with more projections")
             if wanted.axis_col is None and source_words == self._first:
                 self._axis = views.axis_col
                 wanted = replace(wanted, axis_col=self._axis)
@@ -162,7 +162,7 @@ class SweptScan(TrialScan):
         return self._views[2]
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """The residual of the views held out, as this trial corrects them, and its square in each."""
+        """The residual of the held-out projections, as this trial corrects them, and its square in each projection."""
         used = self._used
         assert used is not None and used.held_out is not None and used.held_out_ids is not None and self._views
         projector, data = Projector(used.held_out.geometry, made.grid), used.held_out.data
@@ -176,10 +176,10 @@ class SweptScan(TrialScan):
         return {HELD_OUT: left.residual}, left.left.tolist()
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with scores in place of residuals by each trial's own views, with verdicts and remarks.
+        """The table with scores instead of the residuals in each trial's own projections, with verdicts and remarks.
 
         Raises:
-            DataError: no slice was made, or the views held out show nothing.
+            DataError: no slice was made, or the held-out projections show no sample.
         """
         if not table.compared:
             raise DataError(f"No slice was made. Reason for the first one: {table.outcomes[0].message}.")
@@ -197,8 +197,8 @@ class SweptScan(TrialScan):
                 metrics = {HELD_OUT: share}
                 table = table.with_outcome(at, replace(table.outcomes[at], verdict=verdict, metrics=metrics))
         notes = [
-            f"{BASELINE} leaves mostly the blur of its filter in the residual. -m fista-tv distinguishes the values "
-            "better."
+            f"Use -m fista-tv to distinguish the values better: with {BASELINE} the residual is mostly the blur "
+            "of its filter."
         ] * direct
         notes += [] if same_views else [_OTHER_VIEWS]
         if (best := table.best) is None:
@@ -213,9 +213,10 @@ class SweptScan(TrialScan):
 
 
 def middle_axis(selections: Sequence[Selection]) -> float | None:
-    """The axis used to correct all views if the axis itself is swept; None if it is not.
+    """The axis with which all projections are corrected if the axis itself is swept; None if it is not swept.
 
-    Corrections look at views on both sides of the axis: with each its own, some would correct and others not.
+    Some corrections compare projections on both sides of the axis. If each trial used its own axis, some trials would
+    apply such a correction and others would not.
     """
     axes = sorted(each.axis_col for each in selections if each.axis_col is not None)
     return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
@@ -235,17 +236,18 @@ def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProje
 
 
 def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tuple[TrialChoice, bool] | None:
-    """How well each slice's volume predicts views held out, as shares of these; and whether all options give the same
-    views. None if slices differ in pixels, or in their views held out.
+    """The residual of each slice's volume in the held-out projections, as a fraction of these projections, and True if
+    all options give the same projections. None if slices differ in their pixels or in the held-out projections.
 
-    A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
-    compared with them as every value corrects them, and the mean counts.
+    A correction also changes the held-out projections: if it smooths, its volume would be compared with smoother
+    projections. Therefore each volume is compared with the held-out projections as every value corrects them, and the
+    mean is the score.
 
     Args:
         direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
 
     Raises:
-        DataError: the views held out show nothing.
+        DataError: the held-out projections show no sample.
     """
     common = reduce(np.intersect1d, (each.ids for each in slices.values()))
     if len({each.model.shape[1:] for each in slices.values()}) > 1 or not common.size:
@@ -265,7 +267,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
 
 
 def shares_of(choice: TrialChoice) -> list[float]:
-    """[candidate] the residual of all views held out, as in `recon.judgement`."""
+    """[candidate] the residual in all held-out projections, as in `recon.judgement`."""
     return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
 
 
@@ -291,7 +293,7 @@ def planned_sweep(trials: Trials, command: str, sink: Sink, clock: Clock) -> Pla
     across = len({values[[*first][1]] for values, _ in trials}) if len(first) > 1 else min(COLUMNS, len(trials))
     table = TrialTable(
         "sweep", f"{' and '.join(first)} of a slice", tuple(Outcome(each, "not run") for each in swept), HELD_OUT,
-        machine(), facts, command, f"Which {' and '.join(first)} predicts views held out best?", asks_best=True,
+        machine(), facts, command, f"Which {' and '.join(first)} predicts held-out projections best?", asks_best=True,
     )  # fmt: skip
     scan = SweptScan(swept, sink, clock)
     return Planned(lambda run: scan, table, SliceSheet(across=across, closer=True))

@@ -161,7 +161,7 @@ def _conclusions(table: TrialTable) -> list[str]:
         out.append(f"+{rise:.2f}{chance} dB for {price}: {after.trial.label}.")
     highest = max((o for o in table.compared if math.isfinite(o.quality(by))), key=lambda o: o.quality(by))
     if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
-        chance = f"+{gain:.2f} dB by {highest.trial.label}, is within chance (± {table.chance(highest, best):.2f} dB)."
+        chance = f"+{gain:.2f} dB with {highest.trial.label}, may be chance (± {table.chance(highest, best):.2f} dB)."
         out.append(f"No further improvement is significant: the best value, {chance}")
     return out
 
@@ -195,16 +195,16 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
         marks = dict[str, tuple[str, str]]()
         if table.asks_best:
             caption = (
-                "The middle slice of each trial, with its residual, all with the same grey window. Of large slices "
-                "only the part that changes most is shown. The best slice has a red frame; slices that are not "
-                "significantly worse have an orange frame."
+                "The middle slice of each trial, with its residual, all with the same grey window. If slices "
+                "are large, only the part in which they differ most is shown. The best slice has a red frame; "
+                "slices that are not significantly worse have an orange frame."
             )
             marks = {each.trial.shown: _mark(table, each) for each in table.compared}
         yield "slices.png", Picture("Slices", caption, slices.png(labels, marks))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
         caption = (
-            f"One slice of every volume by {method}, all with the same grey window. Of repeated random "
-            "selections, the first is shown."
+            f"One slice of every volume by {method}, all with the same grey window. If a random selection was "
+            "repeated, the first one is shown."
         )
         title = f"{by_name(method).label}, slice by slice"
         yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))
@@ -217,7 +217,8 @@ def _mark(table: TrialTable, outcome: Outcome) -> tuple[str, str]:
 
 
 def quality_plot(table: TrialTable) -> bytes:
-    """Quality against time, memory and dose as PNG: a colour a method, and a line along the front of time."""
+    """Quality against time, memory and dose as PNG: one colour per method, and a line along the Pareto front of
+    time."""
     shown = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
     floor = max(outcome.quality(table.by) for outcome in shown) - _SHOWN_DB
     figure = new_figure((WIDTH, 4.2))

@@ -1,6 +1,7 @@
 """Trade-off and studies: the lists of trials that they compare.
 
-The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
+The registry of methods lists which numbers of iterations are tried for a method; a method without a list is tried with
+its defaults.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ def planned_study(
     ramp: Filter = "hann",
     draws: int = 3,
 ) -> Planned:
-    """Read and correct the views, and choose those of each row.
+    """Read and correct the projections, and select those of each row.
 
     Args:
-        scan: the study chooses from its views.
-        settings: of its methods, by name; methods left out have their own.
-        ramp: filter of each FBP, of the rows and of all views.
-        draws: how often random views are drawn.
+        scan: the scan from whose projections the study selects.
+        settings: settings of the methods, by name; a method without an entry uses its defaults.
+        ramp: filter of each FBP, for the rows and for the volume from all projections.
+        draws: number of random selections.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -80,10 +81,10 @@ def planned_study(
 
 def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings. "
-        "They show how much is lost with fewer projections, not which method is better. The reference volume has "
-        "noise, too, and a row shares part of it, because it uses some of the same projections. A smoother volume has "
-        "higher SNR and CNR."
+        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and "
+        "settings. They show how much is lost with fewer projections, not which method is better. The reference "
+        "volume also has noise. A row has part of the same noise, because it uses some of the same projections; "
+        "this makes its PSNR all and SSIM all too high. A smoother volume has higher SNR and CNR."
     )
 
 
@@ -101,7 +102,7 @@ _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.
 
 
 def planned_tradeoff(scan: ComparedScan, sink: Sink, clock: Clock, depth: Depth = "quick") -> Planned:
-    """Read and correct the views, hold some out where there is no truth, and plan the trials.
+    """Read and correct the projections, hold some out if there is no ground truth, and plan the trials.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -124,7 +125,7 @@ def planned_tradeoff(scan: ComparedScan, sink: Sink, clock: Clock, depth: Depth 
 
 
 def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:
-    """The settings that are tried on all views, the baseline first.
+    """The settings that are tried on all projections, the baseline first.
 
     Args:
         depth: "quick" has fewer trials, and shorter ones.
@@ -144,7 +145,7 @@ def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTria
         depth: "quick" has about half as many trials as "full", and shorter ones.
 
     Raises:
-        ValueError: for a method that there is not.
+        ValueError: a method does not exist.
     """
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
     tried = [trials_of(method, n_views, depth) for method in methods]

@@ -26,12 +26,12 @@ class MethodTrial:
     """One reconstruction to make.
 
     Attributes:
-        group: what it varies: "method" where nothing.
+        group: the setting that the trial varies; "method" if none.
         method: its name in `recon.methods`.
-        views: how many, spread evenly over those of the scan, or as many as `choice` has.
-        settings: of the method, by name as `recon.methods.build` takes them.
-        seconds_asked: after which the reconstruction ends; None: when its work is done.
-        choice: which views; None: `views` of them, evenly spread.
+        views: number of projections, evenly spread over those of the scan, or as many as `choice` has.
+        settings: settings of the method by name, as for `recon.methods.build`.
+        seconds_asked: time limit of the reconstruction in s; None: no limit.
+        choice: selection of projections; None: `views` evenly spread ones.
     """
 
     group: str
@@ -43,32 +43,32 @@ class MethodTrial:
 
     @property
     def left_out(self) -> bool:
-        """The scan does not have the views that it asks for."""
+        """True if the scan does not have the requested projections."""
         return self.choice is not None and self.choice.groups is None
 
     @property
     def shown(self) -> str:
-        """The label under which the page shows a slice: of all rows of a study, else of baselines alone."""
+        """The label under which the page shows a slice; in a study all rows are shown, otherwise only baselines."""
         if self.choice is not None:
             return self.label
         return by_name(self.method).label if self.group == "method" else ""
 
     @property
     def frames(self) -> int:
-        """Frames of the scan that it takes, each counted once: its dose."""
+        """Number of frames of the scan that the trial uses, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
 
     def build(self) -> Method:
         """The method with the settings of the trial.
 
         Raises:
-            ValueError: for a method or a setting that there is not.
+            ValueError: the method or a setting does not exist.
         """
         method, seconds = by_name(self.method), self.seconds_asked
         return build(method, {**self.settings, **({} if seconds is None else method.ended_by(seconds))})
 
     def in_time(self, seconds: float | None) -> MethodTrial:
-        """The trial, to end after these seconds, if any; a direct method takes what it takes."""
+        """The trial with this time limit in s, if any; a direct method takes the time it needs."""
         method = by_name(self.method)
         if seconds is None or issubclass(method, Direct):
             return self

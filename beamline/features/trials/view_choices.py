@@ -74,7 +74,7 @@ class Study:
 
     Attributes:
         name: on the command line; `title`: of its page.
-        rows: all rows, those that the scan is too small for with the reason.
+        rows: all rows; if the scan has too few projections for a row, with the reason.
     """
 
     name: str
@@ -84,19 +84,20 @@ class Study:
 
 
 def fixed_views(views: ViewSet) -> list[ViewChoice]:
-    """Falling numbers of views, evenly spread."""
+    """Decreasing numbers of evenly spread projections."""
     return [_fixed(views, n) for n in COUNTS]
 
 
 def sector(views: ViewSet) -> list[ViewChoice]:
-    """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
+    """Sectors of decreasing width: first with proportionally fewer projections, then with equal numbers; the whole
+    range is included for comparison."""
     falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
     equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, count in SECTORS if n != count]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
 
 
 def random(views: ViewSet) -> list[ViewChoice]:
-    """Falling numbers of views, evenly spread and drawn at random."""
+    """Decreasing numbers of projections, evenly spread and selected at random."""
     return [row for n in COUNTS for row in (_fixed(views, n), *_draws(views, n))]
 
 
@@ -111,7 +112,8 @@ def _draws(views: ViewSet, n: int) -> list[ViewChoice]:
 
 
 def window_average(views: ViewSet) -> list[ViewChoice]:
-    """Means of neighbouring views, in windows that do not overlap, then in overlapping ones; single views first."""
+    """Means of neighbouring projections, first in windows that do not overlap, then in overlapping ones; single
+    projections come first for comparison."""
     single = [_fixed(views, n) for n in (OVERLAPPING, 90, 60)]
     disjoint = [_windows(views, width, None) for width in DISJOINT_DEG]
     return [*single, *disjoint, *(_windows(views, width, OVERLAPPING) for width in OVERLAPPING_DEG)]
@@ -120,7 +122,7 @@ def window_average(views: ViewSet) -> list[ViewChoice]:
 STUDIES = {
     study.name: study
     for study in (
-        Study("fixed-views", "Fewer views", "What do fewer views, evenly spread, cost?", fixed_views),
+        Study("fixed-views", "Fewer views", "How much is lost with fewer, evenly spread projections?", fixed_views),
         Study(
             "sector",
             "A narrower sector",
@@ -174,7 +176,12 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     n = order.size // w if count is None else count
     if n < 2 or n > room:
         return ViewChoice(
-            label, None, reason=f"asks for {max(n, 2)} windows of {w}; the {order.size} views hold {max(room, 0)}"
+            label,
+            None,
+            reason=(
+                f"it needs {max(n, 2)} windows of {w} projections, but the {order.size} projections contain only "
+                f"{max(room, 0)} windows"
+            ),
         )
     starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
     groups = order[starts[:, None] + np.arange(w)]

@@ -30,13 +30,13 @@ ROUNDS = 3
 
 
 def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[AxisEstimate, TiltEstimate | None]:
-    """The axis from two views half a turn apart, and its tilt; None if bands of rows do not determine it.
+    """The rotation axis from two projections 180° apart, and its tilt; None if bands of rows do not determine the tilt.
 
     Args:
         p0, p180: float [row, col], line integrals.
 
     Raises:
-        ValueError: shapes that differ, or values that are not finite.
+        ValueError: the shapes differ, or values are not finite.
         AxisError: no axis in the middle three quarters of the columns.
     """
     tilt, found = 0.0, None
@@ -60,13 +60,13 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[Ax
 
 
 def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Pixels over which a view changes: its contrast divided by its slope, both from two frames of it, so free of
-    noise.
+    """Width in pixels of the finest structure in a projection: its contrast divided by its slope, both computed from
+    two frames of the same projection, so that noise cancels.
 
-    It is smaller the sharper the picture is, for the same sample at the same angle. NaN where there is only noise.
+    The sharper the image, the smaller this width, for the same sample at the same angle. NaN if there is only noise.
 
     Args:
-        one, other: float [row, col], the same view twice.
+        one, other: float [row, col], two frames of the same projection.
     """
     contrast = float(np.mean((one - one.mean()) * (other - other.mean())))
     slope = sum(float(np.mean(np.diff(one, axis=axis) * np.diff(other, axis=axis))) for axis in range(2))
@@ -103,7 +103,7 @@ class Alignment:
 
     @property
     def lean(self) -> float:
-        """Columns between the axis at the first row and at the last."""
+        """Difference of the column of the axis between the first and the last row."""
         return math.tan(self.tilt) * (self.rows - 1)
 
     def lines(self) -> list[str]:
@@ -126,7 +126,7 @@ class Alignment:
             )
             tilt += turned if abs(self.lean) > STRAIGHT else "no correction"
         detail = (
-            "not known: the view is only noise"
+            "not known: the projection shows only noise"
             if math.isnan(self.detail)
             else (
                 f"{self.detail:.3g} px is the width of the finest detail in the projection at {degrees(self.angle)}; "
@@ -139,17 +139,18 @@ class Alignment:
 def align(
     config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
 ) -> Alignment:
-    """Take darks, flats and two views half a turn apart, and evaluate them. Nothing is written.
+    """Take darks, flats and two projections 180° apart, and evaluate them. Nothing is written.
 
-    At the end the shutter is closed and stage and sample are where they were, as after a scan.
+    At the end the shutter is closed, and stage and sample are back where they were, as after a scan.
 
     Args:
-        angle: rad, of the first view; None: the first of the plan, or half a turn before it where limits want that.
+        angle: angle of the first projection in rad; None: the first angle of the plan, or 180° before it if the limits
+            of the stage require it.
 
     Raises:
         ConfigError: the stage does not go to both angles.
-        QualityError: the views show no axis.
-        ScanStopped: it was requested. InstrumentError, DeviceError: a device failed.
+        QualityError: the projections do not show the axis.
+        ScanStopped: a stop was requested. InstrumentError, DeviceError: a device failed.
     """
     plan, limits = plan_of(config), instrument.devices.stage.limits
     first = float(plan.angles[0]) if angle is None else angle
@@ -164,13 +165,13 @@ def align(
 
 
 def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
-    """Evaluate darks, flats, and two frames of each of two views.
+    """Evaluate darks, flats, and two frames of each of the two projections.
 
     Args:
         pixel_size: mm, of a (binned) pixel at the sample.
 
     Raises:
-        QualityError: the views show no axis.
+        QualityError: the projections do not show the axis.
     """
     darks, flats, views = (
         [frame for frame in frames if frame.kind is kind]
@@ -183,11 +184,11 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
     try:
         axis, tilt = align_pair(one, other)
     except AxisError as error:
-        raise QualityError(f"The two views show no axis: {error}") from error
+        raise QualityError(f"The two projections do not show the axis: {error}") from error
     if not axis.confident:
         raise QualityError(
-            f"The two projections do not match: the axis may be near column {axis.value:.1f}, or not. Use a sample "
-            "with more contrast that stays in the field of view, and check the flats."
+            f"The two projections do not match: the axis is perhaps near column {axis.value:.1f}, but this is "
+            "not certain. Use a sample with more contrast that stays in the field of view, and check the flats."
         )
     offset = axis.value - (dark.shape[1] - 1) / 2
     return Alignment(

@@ -87,7 +87,7 @@ class Tuning:
             ("saturated", f"{self.saturated:.2%} of the pixels of the flat, at the configured {self.configured:.4g} s"),
             (
                 "photons",
-                f"{self.photons:.4g} photons in a pixel of that flat; camera gain: {self.gain:.3g} counts per photon",
+                f"{self.photons:.4g} photons in a pixel of this flat; camera gain: {self.gain:.3g} counts per photon",
             ),
             (
                 "view",
@@ -116,12 +116,12 @@ class Tuning:
 def tune(
     config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
 ) -> Tuning:
-    """Take darks, flats and views at a few exposures and evaluate them. Nothing is written.
+    """Take darks, flats and projections at a few exposures and evaluate them. Nothing is written.
 
-    At the end the shutter is closed and stage and sample are where they were, as after a scan.
+    At the end the shutter is closed, and stage and sample are back where they were, as after a scan.
 
     Args:
-        angle: rad, of the views; None: the first of the plan.
+        angle: angle of the projections in rad; None: the first angle of the plan.
 
     Raises:
         ScanStopped: it was requested. InstrumentError, DeviceError: a device failed.
@@ -140,7 +140,7 @@ def tune(
 def take(
     blocks: Sequence[Block], config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink
 ) -> tuple[list[Frame], CameraSettings]:
-    """Frames of these blocks, which are kept in memory, and what the camera was set to. Errors are those of `tune`."""
+    """Frames of these blocks, which are kept in memory, and the settings of the camera. Raises the errors of `tune`."""
     plan, camera = plan_of(config), instrument.devices.camera
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
     frame_bytes = 2 * math.prod(camera.timing.shape)
@@ -169,10 +169,10 @@ def mean_counts(frames: Sequence[Frame]) -> F64:
 def evaluate(
     frames: Sequence[Frame], plan: ScanPlan, saturation: float, longest: float, limits: ReferenceLimits
 ) -> Tuning:
-    """Evaluate the frames: two darks, and two flats and a view at each exposure.
+    """Evaluate the frames: two darks, and two flats and one projection at each exposure.
 
     Args:
-        longest: exposure in s that may be advised.
+        longest: longest exposure in s that may be advised.
     """
     darks = [frame for frame in frames if frame.kind is FrameKind.DARK]
     flats = [frame for frame in frames if frame.kind is FrameKind.FLAT]

@@ -1,9 +1,9 @@
 """Check `bands`: rows or columns that suddenly get darker or brighter than the others, for example after a lost packet.
 
-A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
-column is compared with the value expected from the views before. A change of
-all lines is the beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their
-neighbours as at its beginning.
+The rotating sample changes the mean of a column from projection to projection, but hardly the mean of a row. The mean
+intensity of each row and column of the preview is compared with the value expected from the projections before. If all
+lines change, the beam has changed. A band begins where a few lines jump. It lasts as long as these lines differ from
+their neighbours as at its beginning.
 """
 
 from __future__ import annotations
@@ -84,7 +84,13 @@ class BandsCheck(Logged):
     meaning: ClassVar[str] = "rows or columns suddenly became darker or brighter, while the others did not"
 
     alarm: float = setting(
-        0.1, "fraction of the intensity that a preview row or column may lose against the others", ge=0, lt=1
+        0.1,
+        (
+            "fraction of the intensity that a row or column of the preview may lose, compared with the other rows or "
+            "columns"
+        ),
+        ge=0,
+        lt=1,
     )
 
     start = BandsState

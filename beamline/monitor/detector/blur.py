@@ -1,11 +1,13 @@
 """Check `blur`: loss of fine detail because of defocus or motion during the exposure.
 
-The figure is the contrast of second differences over two pixels against that of first differences over four, along the
-rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
-product of a difference and the same difference a line beside it. Noise is independent from line to line and adds
-nothing on average, however few the photons; edges go on. The light's level and a smooth beam cancel.
+Sharpness is the contrast of second differences over two pixels, divided by the contrast of first differences over four
+pixels, along the rows and along the columns. It is 1 for a sharp edge, smaller for a blurred edge, and 0 for a slope.
+The contrast is the mean product of a difference and the same difference in the next line. Noise is independent from
+line to line and adds nothing on average, even with few photons; an edge continues in the next line. The intensity and
+smooth variations of the beam cancel.
 
-Edges that are sharper than any blur leaves them, with rims brighter than the open beam, are looked for once.
+Once per scan, the check also looks for phase fringes: edges that are sharper than any blurred edge, with rims brighter
+than the open beam.
 """
 
 from __future__ import annotations

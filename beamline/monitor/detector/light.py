@@ -85,7 +85,8 @@ class ZingersState:
 class ZingersCheck(Logged):
     """Score: zingers of the frame over its pixels. Their number is reported once, as a fact.
 
-    The default: at 1e-4 a slice 2000 pixels wide of as many views has 400 rays with one, each a streak if it stays.
+    The default: at 1e-4, a slice with 2000 columns and 2000 projections has 400 rays with a zinger. Each zinger makes a
+    streak if it is not removed.
     """
 
     name: ClassVar[str] = "zingers"
@@ -109,7 +110,7 @@ class ZingersCheck(Logged):
             advice = (
                 f"Shield the detector against scattered and direct X-rays: this projection has {count(n, 'zinger')} "
                 "(bright spots that are in no other frame). `beamline recon` replaces zingers of up to 3 x 3 pixels "
-                "with their neighbours, but so many of them hide the sample behind."
+                "with their neighbours, but so many zingers hide too much of the sample."
             )
             return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
         if state.views != VIEWS or not state.zingers:

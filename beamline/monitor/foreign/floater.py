@@ -83,7 +83,11 @@ class FloaterCheck(Logged):
         "a loose particle crosses the field of view, on a path that no point of the rotating sample takes"
     )
 
-    warn: float = setting(7.0, "standard deviations of the sum along the path of a particle", ge=0)
+    warn: float = setting(
+        7.0,
+        "sum of the absorption along the path of a particle, in standard deviations, above which there is a warning",
+        ge=0,
+    )
 
     start = FloaterState
 

@@ -120,7 +120,11 @@ class Air:
             levelled,
         )  # fmt: skip
         line = any(views.projections.air_columns)
-        nothing = "no surface subtracted, only a line through the air at the edges" if line else "nothing subtracted"
+        nothing = (
+            "no polynomial subtracted, only a straight line through the air at the edges"
+            if line
+            else "nothing subtracted"
+        )
         parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or nothing}
         return StepDone(sentence, parameters if terms is None else {**parameters, "background_terms": terms})
 
@@ -200,7 +204,8 @@ def without_background(
         if order is None:
             return "", None
         raise DataError(
-            "--air surface: no surface can be fitted, because too few rays miss the sample. Give --air columns or none."
+            "--air surface: no polynomial can be fitted, because too few rays miss the sample. Give --air "
+            "columns or none."
         )
     if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
         return "", None

@@ -50,12 +50,12 @@ class PosesOfFile:
     table: PoseTable | None = option(
         "--poses",
         None,
-        "Displacement, roll and tilt of each projection; no projection is resampled. FILE is one of "
-        "these. (1) A CSV with the columns view or angle_deg, and shift_col_px, shift_row_px, roll_deg, "
-        "tilt_deg. (2) A volume that has poses. (3) An NXtomo file as FILE:x,-y: columns grow with "
-        "x_translation, rows against y_translation. (4) Vectors of each projection in mm, as ASTRA has "
-        "them: a CSV with ray_x (of a cone: src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. "
-        "ignore: do not use the shifts that a .txrm states.",
+        "Displacement, roll and tilt of each projection; no projection is resampled. FILE is one of these. (1) "
+        "A CSV with the columns view or angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg. (2) A "
+        "volume that has poses. (3) An NXtomo file as FILE:x,-y, where x means that a positive x_translation "
+        "shifts the sample towards higher columns, and -y that a positive y_translation shifts it towards lower "
+        "rows. (4) Vectors of each projection in mm, as ASTRA has them: a CSV with ray_x (of a cone: src_x) to "
+        "v_z, or an .npz with parallel3d_vec or cone_vec. ignore: do not use the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
     )
@@ -167,7 +167,8 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
         )
     for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"{learns} calibrates what {table.path} states. Give either {learns} or --poses, or add --poses ignore."
+            f"{learns} determines from the projections what {table.path} already states. Give either {learns} or "
+            "--poses. To omit the shifts that the scan states, add --poses ignore."
         )
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
@@ -281,8 +282,8 @@ def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
         degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
             f"{table.path} has no pose for {unknown.size} of the {view_ids.size} projections chosen from "
-            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add them, or "
-            "choose only the others with --views."
+            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add the missing poses, or "
+            "choose only projections that have a pose with --views."
         )
 
 

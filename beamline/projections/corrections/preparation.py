@@ -45,16 +45,16 @@ class Preparation:
     references: str = option(
         "--references",
         "check",
-        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven, or darks "
-        "exposed to the beam); stop with an error if no group remains. accept: use all as they are.",
+        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven, or darks exposed to "
+        "the beam); stop with an error if no group remains. accept: use all darks and flats as they are.",
         choices=("check", "accept"),
     )
     noise: Noise = option(
         "--noise",
         "auto",
-        "log: line integrals are logarithms of counts. counts: for few photons, line integrals and weights that "
-        "represent the likelihood of the counted photons. auto: counts if a pixel of the open beam has fewer than "
-        f"{FEW_PHOTONS}.",
+        "Noise model. log: line integrals are logarithms of counts. counts: for few photons; line integrals and "
+        "weights follow from the likelihood of the counted photons. auto: counts if a pixel of the open beam "
+        f"has fewer than {FEW_PHOTONS}.",
         choices=get_args(Noise),
     )
     gain: float | None = option(
@@ -67,9 +67,9 @@ class Preparation:
     flat_fields: FlatFields = option(
         "--flat-fields",
         "groups",
-        "groups: interpolate the flat of each projection between the means of the groups of flats. "
-        "dynamic: for a beam that moves, also add those variations of the flats that the projection "
-        "shows (needs 4 flats or more).",
+        "groups: the flat of a projection is interpolated between the mean flats before and after it. dynamic: "
+        "for a beam that moves, also add those variations of the flats that the projection shows (needs 4 flats "
+        "or more).",
         choices=get_args(FlatFields),
     )
     ring_current: str = option(

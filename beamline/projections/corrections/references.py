@@ -87,10 +87,10 @@ def read_references(
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are
     required.
 
-    Damaged frames (see ScanSource) are left out, unless the selection uses all. Zingers in single frames are
-    replaced, with a note. Flats with an exposure of their own are scaled to that of the projections: dark + (flat -
-    its dark) * t / t_flat, if both are known. If darks have several exposures, each kind of frame has its own dark,
-    see `recon.prep.references.dark_at`.
+    Damaged frames (see ScanSource) are left out, unless the selection uses all frames. Zingers in single frames are
+    replaced, with a note. Flats with another exposure than the projections are scaled to the exposure of the
+    projections: dark + (flat - its dark) * t / t_flat, if both are known. If darks have several exposures, each kind of
+    frame has its own dark, see `recon.prep.references.dark_at`.
 
     Raises:
         DataError: all frames of a kind are damaged.

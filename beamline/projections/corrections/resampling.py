@@ -67,7 +67,7 @@ class TiltAndLens:
     Attributes:
         tilt: degrees of the axis in the detector's plane; the axis's column grows by tan(tilt) per row. "auto": it
             is searched for. None: it is unknown, and projections are used as they are.
-        distortion: of the lens; None: none.
+        distortion: distortion of the lens; None: no correction.
     """
 
     name: ClassVar[str] = "tilt"
@@ -75,9 +75,9 @@ class TiltAndLens:
     tilt: float | str | None = option(
         "--tilt",
         None,
-        "In-plane tilt of the rotation axis in degrees, positive if its column grows with the rows; "
-        "projections are rotated by it. auto: find it from all rows. Default: use projections as they "
-        "are, with a warning if they show a tilt.",
+        "In-plane tilt of the rotation axis in degrees, positive if the column of the axis grows from the first "
+        "row to the last; projections are rotated by this angle. auto: find it from all rows. Default: use "
+        "projections as they are, with a warning if they show a tilt.",
         parse=_tilt,
         metavar="DEGREES|auto",
     )
@@ -161,10 +161,10 @@ def with_tilt(
 
     Args:
         frames: projections that may be used.
-        progress: takes how many bands of rows were corrected, and how many there are at most.
+        progress: function that gets the number of bands of rows that were corrected, and their largest number.
 
     Raises:
-        ConfigError: a cone.
+        ConfigError: the scan has a cone beam.
         DataError: the projections do not determine the tilt.
     """
     from beamline.projections.tilt import MATTERS, tilt_text

@@ -108,8 +108,8 @@ class Width:
         """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:
-            ConfigError: a readout arc in a cone beam, or for projections that roll or tilt or may do so: each row
-                then has angles of its own.
+            ConfigError: a readout arc in a cone beam, or for projections that are or may be rolled or tilted, because
+                each detector row then has different angles.
         """
         from recon.base.ray_width import RayWidth
 
@@ -121,7 +121,7 @@ class Width:
             if self.arc not in ("auto", "none"):
                 raise ConfigError(
                     f"Omit --exposure-arc {self.arc}, because the projections are given by the vectors of "
-                    f"{table.path}, which do not allow for an arc."
+                    f"{table.path}, which cannot describe a rotation during the exposure."
                 )
         parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
@@ -148,7 +148,7 @@ class Width:
         seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
         turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
         statements = [
-            *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
+            *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
             *([f"a projection is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
                 "the edge of the field of view)"] if motion.arc else []),
             *([f"the last detector row is exposed {turned[1]:.2g} degrees later than the first"]

@@ -120,7 +120,7 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
     chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
     if len(chosen) != 1 or chosen[0] >= len(names):
         held = f"its columns are {', '.join(names)}" if titled else f"its {len(names)} columns have no names"
-        raise ValueError(f"{held}; expected one whose name is a word for angle")
+        raise ValueError(f"{held}; expected exactly one column whose name means angle, such as angle or theta")
     for number, line in enumerate(lines):
         cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
         lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)

@@ -25,9 +25,9 @@ class AveragedSource(Frames):
     """A ScanSource whose projections are means of several projections of `base`; darks and flats are unchanged, invalid
     frames are omitted.
 
-    A mean combines up to `n` consecutive frames that are closer in angle than frames of different projections. So a
-    projection with missing frames takes none of its neighbour's. In a growing file a projection is complete as soon as
-    a frame of the next one, or its n-th frame, exists.
+    A mean combines up to `n` consecutive frames that are closer in angle than frames of different projections.
+    Therefore a projection with missing frames never takes frames of its neighbour. In a growing file a projection is
+    complete as soon as a frame of the next one, or its n-th frame, exists.
 
     The mean is that of the frames without an alarm, or of all if each has one. Integers are summed as such, real
     numbers in float64; the mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be read

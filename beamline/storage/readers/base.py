@@ -54,21 +54,22 @@ class ScanSource(ABC):
         shape: (rows, cols) of a frame.
         dtype: of the pixels that read() returns.
         quantity: of the pixels. "unknown" if neither the file nor the caller states it.
-        table: what each frame is; another one after `refresh`.
+        table: the table of the frames; `refresh` replaces it.
         facts: `attributes` of a format in which they do not change.
-        pixel_size_mm: at the sample; on the detector where the beam is a cone.
+        pixel_size_mm: pixel size at the sample; for a cone beam, on the detector.
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        central_ray: (row, column) that it meets, by the file, which is shown and not used; NaN: not stated.
-        unreadable: rows that `read_known` was asked for and the file does not give, and why.
-        row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
+        central_ray: (row, column) at which the central ray meets the detector according to the file; it is shown but
+            not used; NaN: not stated.
+        unreadable: rows that `read_known` could not read from the file, each with the reason.
+        row_pitch_mm: height of a pixel, as `pixel_size_mm`, if it differs from the width; None: pixels are square.
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the projections,
             whenever they were taken.
-        untyped: the file does not say whether the bits of pixels are those of whole or of real numbers.
-        pixel_mask: bool [row, col], pixels that the file says not to use; None if it says nothing.
-        frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
-        not_used: what the file states of geometry, units, order and validity, and what is not used.
+        untyped: True if the file does not state whether pixels are integers or real numbers.
+        pixel_mask: bool [row, col], pixels that must not be used according to the file; None if the file has no mask.
+        frames_per_view: number of camera frames that are averaged to one projection.
+        not_used: fields on geometry, units, order and validity that the file states but that are not used.
         unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
         plan: the requested scan, as this program's files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
@@ -136,7 +137,7 @@ class ScanSource(ABC):
     def damaged(self) -> frozenset[int]:
         """Rows read so far whose pixels differ from their checksums.
 
-        Frames are compared only where half of them or more is read.
+        A frame is compared with its checksum only if at least half of it is read.
         """
         return frozenset()
 

@@ -65,7 +65,7 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             if item is not None
         ]
         facts = {**_attributes(file), "dimensions": dimensions(usual)} | (
-            {"angles_from": "start and step of the rotation, as the file has no exchange/theta"}
+            {"angles_from": "computed from start and step of the rotation, because the file has no exchange/theta"}
             if own_angles and "exchange/theta" not in file
             else {}
         )

@@ -1,7 +1,7 @@
 """Fields in files of other programs that affect geometry, units, frame order or validity, and how each is used.
 
-`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `stated_in` for those that a file states
-and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
+`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader calls `stated_in` to find the fields that a
+file states but no reader uses. `info` shows these fields, and `validate` warns if such a value may change the volume.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ class Entry:
 
     Attributes:
         where: its path below the entry, or below the root of Data Exchange; "detector/" is the detector that is read.
-        use: what we do with it, or, if `used` is False, why its value changes nothing or what to do about it.
+        use: how this program uses the field, or, if `used` is False, why its value changes nothing or what the user can
+            do.
         used: it is read.
-        units: of a number that is used: those that are known.
-        matters: of one that is not used: whether its value may change the volume; None: it cannot.
+        units: the known units of a number that is used.
+        matters: for a field that is not used, whether its value may change the volume; None: it cannot.
     """
 
     where: str
@@ -49,7 +50,7 @@ class Entry:
 def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
     """The fields stated in a file but ignored; a value that may change the volume is a doubt.
 
-    Numbers that would be used, were their unit known, are among them.
+    A number whose unit is unknown is also ignored, and therefore listed.
     """
     frames, views = len(source.table), source.table.views
     unused = list[NotUsed]()
@@ -80,7 +81,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
     if value.dtype.kind not in "uifb":
-        return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
+        return "it is text; expected a number, with a known unit after it or in its attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 

@@ -23,7 +23,7 @@ _COPIED = {*ScanSource.__annotations__} - {"table", "unreadable", "facts", "stat
 class Frames(ScanSource):
     """The frames of several sources, one after the other; facts of the whole scan are those of the last source.
 
-    Row numbers, such as the row that a frame replaces, count from the first frame of all.
+    Row numbers, such as the row that a frame replaces, are counted from the first frame of the first source.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Frames(ScanSource):
         self.table = joined if self._change is None else self._change(joined)
 
     def known(self, name: str) -> Any:
-        """The present value of an attribute."""
+        """The current value of an attribute."""
         each = [getattr(source, name) for source in self._sources]
         join, own = _JOINED.get(name), self._own.get(name)
         value = each[-1] if join is None or len(each) == 1 else join(each, self._sizes)

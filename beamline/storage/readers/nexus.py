@@ -26,7 +26,7 @@ _LONGEST = 100  # steps of a chain of transformations
 class Places:
     """Paths in a file of the fields that are read; None for a missing one.
 
-    `sense` is -1 for angles that count against the turn of `sample/rotation_angle`.
+    `sense` is -1 if the angles increase in the direction opposite to `sample/rotation_angle`.
     """
 
     entry: h5py.Group

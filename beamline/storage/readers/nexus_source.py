@@ -1,7 +1,8 @@
 """NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it; base of the reader of this
 program's own files (`nxtomo`).
 
-What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
+Files are recognised by their structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry
+is.
 """
 
 from __future__ import annotations
@@ -111,7 +112,8 @@ class NexusSource(ScanSource):
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
             raise DataError(
-                f"{self.path} refers to frames in {lost[0]}, which does not exist or differs ({len(lost)} such)."
+                f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape ({len(lost)} "
+                "such links)."
             )
 
     @property

@@ -34,12 +34,12 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
         images[:, no_data[rows]] = 0
         return images
 
-    facts = {"pixels_without_data": f"{no_data.mean():.2%}, replaced with values of their neighbours"}
+    facts = {"pixels_without_data": f"{no_data.mean():.2%}, replaced with the values of neighbouring pixels"}
     not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
     source = Frames(base, pixels=pixels, not_used=not_used, attributes=lambda known: {**known, **facts})
     counter = not base.table.darks.size and counts_photons(source)
     if counter:
-        facts["darks"] = "0, because flats vary as counted photons do"
+        facts["darks"] = "0 (the flats vary like counted photons, so the detector has no dark signal)"
     return source, counter
 
 
@@ -47,9 +47,10 @@ def no_data_of(source: ScanSource) -> Mask | None:
     """bool [row, col], pixels without data, from the file's mask, or because they are at the maximum of their type in
     all frames.
 
-    Only integers have such markers: the largest value of an unsigned type, and values below 0 of the others. Types of 8
-    and 16 bits may also reach their end because of too much light; for these only whole rows and columns count as
-    markers, and no other pixel may be at the end. None if nothing is marked, or more than half.
+    Only integers have such markers: the largest value of an unsigned type, and values below 0 of the others. Pixels of
+    8 and 16 bits may also reach the largest value because they are saturated. For these types, only whole rows and
+    columns count as markers, and no other pixel may have the largest value. None if nothing is marked, or more than
+    half.
     """
     if source.dtype.kind not in "iu":
         return None
@@ -88,8 +89,9 @@ def _end_in(source: ScanSource, row: int) -> Mask:
 def counts_photons(source: ScanSource) -> bool:
     """True if flats fluctuate like counted photons, with the variance of their mean, so that they have no offset.
 
-    For a camera, variance over mean is its gain times the share of the light in its counts. That share is smaller where
-    there is less light, as in dark corners; so both halves of the pixels must agree.
+    For a camera, variance over mean is its gain times the share of the counts that comes from light. This share is
+    smaller where there is less light, for example in dark corners. Therefore the brighter and the darker half of the
+    pixels must give the same result.
     """
     rows = source.table.flats[: 2 * _LOOKED_AT]
     if rows.size < 2 or source.dtype.kind not in "iu":

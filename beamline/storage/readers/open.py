@@ -368,8 +368,8 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     replaced += [f"--{name}" for name, given in (own_kinds | {"scanner-file": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
-            f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
-            "frames, and more frames will arrive."
+            f"{options.path} cannot be followed with {', '.join(replaced)}, because data that replace those of the "
+            "file must match all frames, and the scan is still adding frames."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:

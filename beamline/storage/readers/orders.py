@@ -80,8 +80,8 @@ SINOGRAM = (0, None, 1)
 
 
 def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape, length by place. Surplus dimensions must have length one; the last is dropped first
-    if it cannot be columns, then the first.
+    """The n dimensions of a shape, length by place. Surplus dimensions must have length one. The last dimension is
+    dropped first, if it cannot be that of the columns; then the first dimension.
     """
     sizes = dict(enumerate(shape))
     while len(sizes) > n and 1 in sizes.values():

@@ -46,10 +46,10 @@ Images = Path | str | NDArray[Any]
 def stated_references(
     base: ScanSource, quantity: Stated | None, given: tuple[Images | None, Images | None], white: float | None
 ) -> tuple[Images | None, Images | None]:
-    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
+    """The darks and flats that replace those of the scan (for transmission: 0 and 1); None: those of the scan are used.
 
     Args:
-        given: by the caller.
+        given: darks and flats that the caller gives.
         white: counts of the open beam from the maker's file.
 
     Raises:
@@ -91,7 +91,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         shape: (rows, cols) of the scan's frames; None: any.
 
     Raises:
-        DataError: they cannot be read, are not images, or several could be meant.
+        DataError: the images cannot be read, are not images, or several datasets could be meant.
     """
     if not isinstance(images, Path | str):
         return _stack(np.asarray(images), "The array of reference frames")
@@ -204,7 +204,9 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
-        raise DataError(f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or differs.")
+        raise DataError(
+            f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or has another shape."
+        )
     frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
@@ -232,7 +234,7 @@ def overlaid(
     quantity: Quantity | None = None,
     places: NDArray[np.float64] | None = None,
 ) -> ScanSource:
-    """A scan with references in front: darks, flats, then the frames of `base`.
+    """A scan with further darks and flats in front: darks, flats, then the frames of `base`.
 
     If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
     all parts of the scan. All frames have one dtype, as of one camera.

@@ -1,8 +1,8 @@
 """Settings files that CT scanners write next to their images: distances, pixel size, angles and white level.
 
 Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
-the "data settings XRE.txt" of TESCAN (FleXray), by keys that
-public readers use (TIGRE, CIL). A key that is not there is not guessed.
+the "data settings XRE.txt" of TESCAN (FleXray), by the keys that public readers use (TIGRE, CIL). A value whose key is
+missing is not guessed.
 """
 
 from __future__ import annotations
@@ -151,7 +151,8 @@ def read_side_file(path: Path) -> SideFile:
     """Read a vendor's file.
 
     Raises:
-        DataError: it is none of those, or lacks a distance, the pixel size or the number of projections.
+        DataError: the file is of no known vendor, or a distance, the pixel size or the number of projections is
+            missing.
     """
     try:
         values = _values(path)
@@ -188,7 +189,7 @@ def reconstructed_pixel_mm(log: Path) -> float | None:
 
 
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
-    """A sentence on what a vendor's file beside these images states."""
+    """A sentence on the contents of a vendor's file next to these images."""
     side = side_of(source)
     return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} uses it", True),)
 

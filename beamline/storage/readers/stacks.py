@@ -1,7 +1,7 @@
 """StacksSource: a scan with one stack of projections and others of darks and flats, such as HDF5 datasets of any
 name.
 
-Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
+Such a layout does not state when darks and flats were taken: the frames are numbered with darks first, then flats, then
 projections.
 """
 
@@ -103,7 +103,9 @@ class StacksSource(ScanSource):
             if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
-                    raise DataError(f"{self.path} refers to frames in {lost[0]}, which does not exist or differs.")
+                    raise DataError(
+                        f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape."
+                    )
         if not len(views.frames):
             none = DataError if self.finished else hdf5.NotReadyError
             raise none(f"{self.path} contains no projections: {views.name} has shape {views.frames.shape}.")
@@ -144,7 +146,7 @@ def open_stacks(
             projections.
 
     Raises:
-        DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
+        DataError: an array does not exist, or is not a stack of frames; the message lists the datasets of the file.
     """
     file = open_array_file(path)
     with hdf5.closed_on_error(file):
@@ -214,11 +216,12 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
 
 
 def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
-    """Radians of projections in the frame of their detector, from those of CIL's object; others as they are.
+    """Angles of projections in radians, relative to the detector. CIL states the angles of its object, which are
+    converted; other angles are returned unchanged.
 
     Args:
         angles: the values of `item` in radians.
-        unit: of them, where the caller says another one than the file.
+        unit: unit of the angles, if the caller states another unit than the file.
     """
     config = item.parent if isinstance(item, h5py.Dataset) else None
     if config is None or datasets.dataset(config, "detector/direction_x") is None:

@@ -55,7 +55,7 @@ class Complaints(logging.Handler):
 
 
 def is_hidden(name: str) -> bool:
-    """True if a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
+    """True if a file is not an image but a companion that the operating system made, such as `._0001.tif` of a Mac."""
     return name.rpartition("/")[2].startswith(".")
 
 
@@ -147,7 +147,8 @@ FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read:
 
 
 def images_among(names: Sequence[str]) -> list[str]:
-    """The images among files, of the first kind that there is: other kinds next to it are no frames of the scan."""
+    """The images among files, of the first kind that there is: files of other kinds next to them are not frames of the
+    scan."""
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])
@@ -182,7 +183,7 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
 def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     """Raise ValueError for more pages than any scan has, or for more bytes than allowed, or than the file can contain.
 
-    Pages are grouped without a look at each: tifffile takes minutes for a million.
+    Pages are grouped without reading each one, because tifffile needs minutes for a million pages.
     """
     with suppress(IndexError):
         tif.pages.get(_MOST_PAGES)

@@ -254,8 +254,8 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
     """The real type of integers [..., col] that are the bits of real numbers; None if they are integers.
 
-    Real numbers of one quantity are close together in their bits. Integers would be so only if nearly all of them were
-    within four per cent of the range of their type, around a quarter or three quarters of it.
+    Real numbers of one quantity are close together in their bits. Integers look like this only if nearly all of them
+    are within four per cent of the range of their type, around a quarter or three quarters of the range.
     """
     size = images.dtype.itemsize
     if images.dtype.kind != "u" or size < 4 or images.shape[-1] < 2:
@@ -278,10 +278,11 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
     signed.
 
-    Images are smooth: where counts pass the end of the signed type, neighbours differ by its whole range, but not if
-    they are read without a sign. Counts that are all beyond the end are negative, which light cannot be. Values that
-    are negative because of noise around 0, or that mark pixels without data by one value, have not overflowed. Four
-    bytes may contain values of two, if a file has projections as int16 next to flats as uint16.
+    Images are smooth. If counts exceed the largest value of the signed type, neighbouring pixels differ by the whole
+    range of the type, but not if the pixels are read as unsigned. If all counts exceed this value, all of them look
+    negative, which is impossible for an intensity. Values that are negative because of noise around 0, or that mark
+    pixels without data by one value, have not overflowed. Four bytes may contain values of two, if a file has
+    projections as int16 next to flats as uint16.
     """
     if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
         return None
@@ -307,9 +308,9 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     """Number of edges in counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
 
     Two pixels on either side must be in their half of the range, which is not so for a hot pixel or a zinger. If nearly
-    all at the top have one value, the light was cut off (saturation). 0 if fewer than one in ten rows has such an edge.
-    If a `flat` [..., col] is near the top on both sides, something opaque makes such an edge, unless the step across
-    the end is as smooth as its surroundings.
+    all pixels at the top of the range have the same value, they are saturated. 0 if fewer than one in ten rows has such
+    an edge. If a `flat` [..., col] is near the top on both sides, something opaque makes such an edge, unless the step
+    across the end is as smooth as its surroundings.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0
@@ -336,8 +337,8 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
     """The frames of `earlier`, which are complete, and then of `last`, whose path and metadata the scan has.
 
     Args:
-        path: of the scan, where somebody said that the files are one, taken without a pause; None: they are parts,
-            between which beam and camera may have changed.
+        path: path of the scan, if the user stated that the files are one scan taken without a pause; None: the files
+            are parts, between which beam and camera may have changed.
 
     Raises:
         DataError: frames are of another shape or type.

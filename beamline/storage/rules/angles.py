@@ -84,21 +84,23 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def directions(angles: NDArray[np.float64]) -> int:
-    """The directions of rays that parallel projections [view], in rad, see: 180 degrees later they are the same."""
+    """The directions of the rays of parallel projections [view], in rad: projections 180 degrees apart have the same
+    directions."""
     half = np.mod(np.degrees(angles), 180.0)
     return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Degrees of 180 degrees without a projection, beyond the spacing of the projections [view] in rad: the largest
-    gap, or all.
+    """How many of the 180 degrees have no projection, apart from the normal spacing of the projections [view] in rad:
+    the largest gap, or all gaps.
 
-    All gaps count in which `angular_weights` take projections for missing, if these are a twentieth of 180 degrees.
+    All gaps that `angular_weights` regards as missing projections are counted, if together they are a twentieth of 180
+    degrees.
 
-    Projections 180 degrees apart see the same rays. Of projections at random, the largest gap exceeds the next by an
-    exponentially distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such
-    projections in a thousand, and one of ten projections in a hundred, exceed what is allowed for. Projections in even
-    steps have gaps alike, and half a degree more is named.
+    Projections 180 degrees apart see the same rays. If angles are random, the largest gap exceeds the second largest by
+    an exponentially distributed length, whose mean is the mean gap (Rényi 1953). With random angles, 2 in 1000 scans of
+    45 or more projections, and 1 in 100 scans of ten projections, exceed the allowed gap. If the angles are evenly
+    spaced, all gaps are equal, and a gap that is larger by half a degree is reported.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)
@@ -125,9 +127,9 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
         return (
-            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} "
-            "in radians. These look like degrees that are labelled as radians. If so, give them with "
-            "--angles FILE (degrees, one per line)."
+            f"The stated angles of {angles.size} projections span {np.ptp(distinct) / 360:.1f} turns "
+            f"({np.ptp(angles):.5g} rad). These angles look like degrees that are labelled as radians. If so, "
+            "give them with --angles FILE (degrees, one per line)."
         )
     if between >= 360:
         return (

@@ -52,8 +52,8 @@ class CoarseViews:
     _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """Line integrals [row, col] of a projection, each row less its mean, smoothed along its rows, so that it has
-        two columns less."""
+        """Line integrals [row, col] of a projection, minus the mean of each row, and smoothed along the rows, which
+        removes two columns."""
         if row not in self._depths:
             lines = self._lines(row)
             lines = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
@@ -91,8 +91,9 @@ class CoarseViews:
         return list(zip(first[some].tolist(), second[some].tolist(), strict=True))
 
     def unlike(self, pair: Pair, mirrored: bool = False) -> float:
-        """1 minus the correlation of two projections; of mirror images about the column of best agreement, which is
-        sought in the middle half, and in the whole field where it lies at the edge of that."""
+        """1 minus the correlation of two projections. For mirror images, the second projection is mirrored about the
+        column of best agreement. This column is searched for in the middle half of the detector, and in its whole width
+        if the best column is at the edge of this half."""
         one, other = self.depth(pair[0]), self.depth(pair[1])
         if not mirrored:
             power = float(np.linalg.norm(one) * np.linalg.norm(other))
@@ -145,7 +146,8 @@ def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
 def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames stated at one angle look the same, as those that are averaged do.
 
-    Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
+    If the stage kept rotating, the last frame differs from the first one by more than neighbouring frames do: the
+    squared difference grows with the square of the rotation.
     """
     degrees = seen.degrees[seen.rows]
     starts = np.flatnonzero(np.diff(degrees, prepend=np.nan) != 0)
@@ -165,20 +167,19 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "angle-spread",
-            f"Each angle is stated for {n} frames, but these differ: frames {first[0]} and {last[0]}, "
-            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as "
-            "much as neighbours do. The angles were read back more slowly than frames were taken, while "
-            f"the stage rotated. Give the angle of each of the {degrees.size} projections with --angles "
-            f"FILE (degrees, one per line), from {degrees[0]:.6g} in even steps if the stage rotated "
-            f"evenly.{first_of_each}",
+            f"Each angle is stated for {n} frames, but frames of one angle differ: frames {first[0]} and {last[0]}, "
+            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as much as "
+            "neighbours do. The angles were read back more slowly than frames were taken, while the stage rotated. "
+            f"Give the angle of each of the {degrees.size} projections with --angles FILE (degrees, one per line), "
+            f"from {degrees[0]:.6g} in even steps if the stage rotated evenly.{first_of_each}",
         )
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     """Parallel projections 180 degrees apart by their angles are mirror images, and no others are.
 
-    Their rays see the same from both sides, whatever the sample is, also one that is wider than the field. How much
-    neighbours differ tells what a turn does to this sample, and what noise does: a round sample shows no angle.
+    Rays measure the same from both sides, for any sample, even one that is wider than the field of view. The difference
+    between neighbours shows the effect of a rotation on this sample, and of noise: a round sample shows no angles.
     """
     if seen.scan.cone is not None:
         return
@@ -274,8 +275,8 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
 def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames look similar only if their angles are close, and close angles look similar.
 
-    A list in another order than the frames shows so, and a single angle that is wrong. Only one projection of many
-    tells of it where the list is shifted, so the places are looked at where angles jump.
+    This finds a list in another order than the frames, and a single wrong angle. If the list is shifted, only one of
+    many projections shows it, so the rule checks the places where the angles jump.
     """
     rows, degrees = seen.rows, seen.degrees[seen.rows] % 360
     order = np.argsort(degrees, kind="stable")

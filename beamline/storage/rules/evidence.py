@@ -51,9 +51,9 @@ class EvidenceRequest(NamedTuple):
 
     Attributes:
         accepted: references are used as they are: their faults are warnings.
-        cone: mm from the source to the rotation axis and to the detector, in place of the file's.
-        judged: flags that count in place of the file's.
-        limits: of darks and flats; None: those of a new scan.
+        cone: mm from the source to the rotation axis and to the detector, instead of the values in the file.
+        judged: flags that are used instead of those in the file.
+        limits: limits for darks and flats; None: the default limits.
     """
 
     accepted: bool = False
@@ -64,10 +64,10 @@ class EvidenceRequest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanEvidence:
-    """What the references and some projections of a scan show, beside what its file states.
+    """What darks, flats and some projections of a scan show, in addition to what its file states.
 
-    It is taken once a job and handed on; of a running scan, `renewed` continues the frames recorded by then. What is
-    asked for is computed once, and each frame that it needs is read once.
+    It is computed once per job and passed on. For a running scan, `renewed` adds the frames recorded since then. Each
+    result is computed once, when it is first used, and each frame is read once.
 
     Attributes:
         source: reads the frames.
@@ -89,7 +89,7 @@ class ScanEvidence:
 
     @property
     def in_counts(self) -> bool:
-        """Whether pixels are counts, which references are for."""
+        """True if pixels are counts, so that darks and flats are needed."""
         return self.source.quantity == "counts"
 
     @property
@@ -111,7 +111,7 @@ class ScanEvidence:
 
     @cached_property
     def good(self) -> ReferenceGroups:
-        """The references without a fault; of a kind without a good one, all."""
+        """The darks and flats without a fault; all of a kind, if all of them have a fault."""
         bad = [row for each in self.findings if each.severity != "error" for row in each.frames]
         kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self.taken)
         return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
@@ -123,8 +123,8 @@ class ScanEvidence:
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on references, flats beside those and the projections of their part; errors where none of a kind is
-        good. There are none where pixels are not counts."""
+        """Findings on darks and flats: errors if all frames of a kind have a fault. Flats are compared with the other
+        flats and with the projections of their part. There are no findings if pixels are not counts."""
         if not self.in_counts:
             return ()
         darks, found = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
@@ -159,7 +159,8 @@ class ScanEvidence:
     def frame(self, row: int) -> FrameStatistics:
         """Statistics of a frame of any kind, with its cells, which is read once.
 
-        They are those with the dark of the shortest exposure and, of projections that differ, at the usual exposure.
+        The statistics are computed with the dark of the shortest exposure. If the exposures of projections differ, the
+        projections are scaled to the usual exposure.
         """
         frame, groups = self._as_it_is(row), self._darks
         differ = self.views_differ and groups[0][1].size > 0
@@ -207,7 +208,7 @@ class ScanEvidence:
 
     @cached_property
     def views_differ(self) -> bool:
-        """True if the exposures of the projections differ, and that of each is known."""
+        """True if the exposures of all projections are known and differ."""
         views = self.table.exposures[self.table.views]
         return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
@@ -228,8 +229,9 @@ class ScanEvidence:
     def exposures(self) -> F64:
         """Exposure of each frame in s, NaN if unknown.
 
-        Of flats that state none beside views that differ: the longest, the median or the shortest of the projections',
-        the first for which no place of the projections is brighter than the flats.
+        If the exposures of projections differ and the flats state none, the exposure of the flats is taken as the
+        longest, the median or the shortest exposure of the projections: the first of these for which no place in the
+        projections is brighter than the flats.
         """
         table, exposures = self.table, self.table.exposures
         flats, darks, views = table.flats[~(exposures[table.flats] > 0)], table.darks, table.views
@@ -258,8 +260,8 @@ class ScanEvidence:
 
     @cached_property
     def brightest(self) -> float:
-        """Brightness of the brightest of some projections relative to the flats, see `brightness`; 1 where there is
-        none."""
+        """Brightness of the brightest of some projections relative to the flats, see `brightness`; 1 if there are no
+        projections."""
         if self.beam is None:
             return 1.0
         seen = [brightness(cells, *self.beam) for cells in self.cells(spread(self.table.views, VIEWS))]
@@ -282,14 +284,15 @@ class ScanEvidence:
         return uniform | ~(np.array(shares) >= least)
 
     def unlit(self, row: int) -> bool:
-        """True if a whole projection is dark, or uniform while the flats are not; it is looked at once."""
+        """True if a whole projection is dark, or if it is uniform while the flats are not; each projection is checked
+        once."""
         if row not in self._lit:
             self._lit[row] = not self._unlit(row)
         return not self._lit[row]
 
     @property
     def known_unlit(self) -> list[int]:
-        """The projections of those looked at that have no light."""
+        """The projections without beam, among those that were checked."""
         return [row for row, lit in self._lit.items() if not lit]
 
     def _unlit(self, row: int) -> bool:
@@ -306,7 +309,8 @@ class ScanEvidence:
 
 
 def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
-    """Rows of the references of a kind, by groups: references of one part with no projection between them."""
+    """Rows of the darks or flats, by groups: a group is a series of them in one part of the scan without a projection
+    in between."""
     rows = table.of_kind(kind)
     before = np.searchsorted(table.views, rows)
     before += np.searchsorted(table.part_starts, rows, "right")  # neither decreases, so that the sum tells both

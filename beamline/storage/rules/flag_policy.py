@@ -30,10 +30,11 @@ class FlagPolicy:
     """How the flagged projections of a scan are treated.
 
     Attributes:
-        flags: of all frames, those that count.
-        views, left_out, halved, masked: bool [frame of the file]: the projections. Of these, those with an alarm, which
-            are left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
-        jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
+        flags: the flags of all frames that are used here.
+        views, left_out, halved, masked: bool [frame of the file]: the projections; projections with an alarm, which are
+            left out; projections with a warning, which have half the weight; projections flagged in a region, whose
+            rays have less weight there.
+        jumps: int64, ascending, the first rows after each jump of the sample that the monitor reported.
         parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
     """
 
@@ -52,7 +53,10 @@ class FlagPolicy:
         for some, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
             (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
-            (self.masked, (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: none)")),
+            (
+                self.masked,
+                (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: weight 0)"),
+            ),
         ):
             if n := int(some.sum()):
                 parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")
@@ -62,8 +66,8 @@ class FlagPolicy:
 def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagPolicy:
     """How `beamline recon` treats these projections, whose frames have this shape, unless it ignores flags.
 
-    A projection in which the sample jumped is as good as those after it. Flags of projections from opposite sides for
-    the same jump then do not count.
+    A projection in which the sample jumped is as good as the projections after it. The flags of the check `opposite`
+    for the same jump are then not used.
     """
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
@@ -87,8 +91,8 @@ def boxes_of(
 ) -> Iterator[tuple[int, PixelBox | None]]:
     """Frames that a check flagged, each with its region and a margin; None for (nearly) the whole projection.
 
-    A projection that a check marked when it had seen later ones has no region in the file. It takes the region to which
-    these lead on a straight line.
+    If a check flagged a projection only after later ones, the file has no region for this projection. Its region is
+    then found on a straight line through the regions of the later projections.
     """
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)
     for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):

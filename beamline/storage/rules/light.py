@@ -41,9 +41,10 @@ MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examp
 
 
 def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
-    """Flats are lit, complete and even, and darks are dark; a faulty group is left out if there is a good one.
+    """Flats get beam, are complete and even, and darks are dark; a faulty group is left out if there is a good one.
 
-    An error where all groups of a kind are bad, a warning for others that have a fault, and for all that are accepted.
+    The finding is an error if all groups of a kind have a fault, otherwise a warning; it is also a warning if the user
+    accepts the groups.
     """
     for finding in scan.findings:
         message = finding.message
@@ -63,7 +64,8 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
-    """Each view was rescaled on its own: all have the same least and largest number, at different pixels."""
+    """Finds projections that were rescaled one by one: all have the same smallest and the same largest value, at
+    different pixels."""
     rows = scan.table.views
     if rows.size < VIEWS:
         return
@@ -85,10 +87,10 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         "light",
-        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled "
-        "one by one, as programs do that save pictures, so that one grey value means a different "
-        f"attenuation in each projection: in each of {VIEWS} projections checked, the darkest pixel is "
-        f"{low:g} and the brightest {high:g}, but these are different pixels.",
+        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled one by one, "
+        "as programs do that save pictures, so that one grey value means a different attenuation in each projection: "
+        f"in each of {VIEWS} projections checked, the darkest pixel is {low:g} and the brightest {high:g}, but in "
+        "each projection these are different pixels.",
     )
 
 
@@ -97,8 +99,8 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
 
     Args:
         level: line integral of the air, the median of the projections; without air, of the place that absorbs least.
-        air: columns of air were found, whose light was subtracted.
-        accepted: a fault is a warning.
+        air: True if columns of air were found, and their line integral was subtracted.
+        accepted: True if a fault is only a warning.
     """
     darker = level > WARN and air
     if darker or level < -BRIGHTER:
@@ -194,8 +196,9 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
     """Sentences on what wrong flats and darks do to line integrals (their mean) of projections in which no column is
     air.
 
-    A factor of the light is one constant in every line integral, and may be material beyond the field as well. Of cans
-    of 1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
+    A wrong factor in the intensity adds the same constant to every line integral, as material beyond the field of view
+    may do. For cans of 1.5 to 3 times the width of the field of view, this changes the densities of FBP by 0.4 to 0.8
+    of the relative change of the line integrals, and those of FISTA-TV by 0.9.
     """
     flats, views = scan.table.flats, scan.table.views
     more = math.log1p(MORE_LIGHT)
@@ -281,7 +284,8 @@ _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample take
 
 
 def light_one(scan: ScanEvidence) -> Iterator[Finding]:
-    """Projections in a row have one light, except for a drift; else which step takes one, with its flats."""
+    """Consecutive projections have the same intensity, except for a drift; otherwise the finding names the step that
+    selects one of the intensities, with its flats."""
     flats, views = scan.table.flats, scan.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (

@@ -32,7 +32,7 @@ _FALLS = (
 
 
 def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
-    """Whole numbers stay within their type: what is brighter than its largest begins again at 0."""
+    """Whole numbers must fit their type: a pixel brighter than its largest value starts again at the smallest."""
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if scan.source.dtype.itemsize == 2 else ()
     samples = {kind: images for kind in kinds if (images := sample(scan, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
@@ -62,7 +62,8 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
-    """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
+    """The quantity of the pixels must be known, because a missing or a second logarithm ruins a volume without any
+    other sign."""
     if scan.source.quantity == "unknown":
         note = scan.source.attributes.get("quantity")
         remark = "" if note is None else f"The file has only a remark ({str(note)[:80]!r}). "
@@ -75,7 +76,7 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def darks_computed(scan: ScanEvidence) -> str:
-    """Darks that are no images of the camera, of which no two pixels read the same without light."""
+    """Finds darks that were computed, not recorded: in a dark of a camera the pixels have different values."""
     darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
     return "" if darks is None or darks.min() < darks.max() else (
         f"The darks are {darks.min():g} in every pixel checked: a constant, not what the camera measures "
@@ -108,8 +109,8 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "pixels",
-            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no measurable beam "
-            "passes: are they counts? If so, give --quantity counts, with darks and flats.",
+            f"The line integrals have a median of {np.nanmedian(views):.4g}. No measurable beam passes through so "
+            "much material: are they counts? If so, give --quantity counts, with darks and flats.",
         )
 
 

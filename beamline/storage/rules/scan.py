@@ -45,7 +45,8 @@ _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as 
 
 
 def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
-    """The writer closed the file, and the scan ended as planned; else a remedy, or who ended it."""
+    """The file was closed, and the scan ended as planned; otherwise the finding states what to do, or who ended the
+    scan."""
     ending, n = scan.source.ending, count(len(scan.table), "frame")
     if not scan.source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
@@ -97,7 +98,7 @@ def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
-    """The central ray of a cone, which the file states or the caller, meets the middle of the rows, and the axis."""
+    """In a cone beam, the central ray that the file or the caller states meets the middle row and the rotation axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
     for (side, taken, option), at, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
         if scan.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
@@ -165,7 +166,8 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table for a single finding: told in the sentence that its condition gives, unless that is empty."""
+    """A row of the table for a rule with a single finding: its condition returns the sentence of the finding, or "" if
+    there is nothing to report."""
 
     severity: Severity
     rule: str
@@ -232,7 +234,8 @@ BEFORE_VIEWS: tuple[Rule, ...] = (quantity_stated, references_present, numbers_w
 
 
 def findings_of(scan: ScanEvidence, rules: tuple[Rule, ...] = RULES) -> list[Finding]:
-    """What these rules find in a scan; of one that would take too long, that it was not asked."""
+    """The findings of these rules on a scan. If a rule would take too long, a finding states that it was not
+    applied."""
     findings = list[Finding]()
     for rule in rules:
         try:

@@ -64,10 +64,10 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
     """Squared change of the row sums of [view, row, col] from projection to projection, relative to that of the column
     sums.
 
-    About 1 where there is noise alone. Rotation about the columns moves material along the rows, whose sums stay as
-    they are. What a drifting beam does to rows is in their ends, too, and so is material that leaves a narrow field,
-    from each row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends,
-    are taken off.
+    About 1 if there is only noise. A rotation about the columns moves material along the rows and does not change their
+    sums. A drifting beam also changes the ends of the rows. So does material that leaves a narrow field of view, in
+    proportion to the material in each row. Therefore a parabola over the rows and their mean profile are fitted to the
+    ends and subtracted.
     """
     change = depths - depths.mean(axis=0)
     ends = max(1, depths.shape[2] // 16)
@@ -84,9 +84,8 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
     """If there are as many projections as rows, the first dimension is that of the projections, and the second that of
     the rows.
 
-    In sinograms it is the other way round: of each image the rows are projections, so that they have one mass, and the
-    first moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do
-    not.
+    In sinograms it is the other way round: the rows of each image are projections. They have the same total absorption,
+    and their first moments follow a sine of the angle (Helgason 1965; Ludwig 1966). From image to image this is not so.
     """
     views = scan.table.views
     angles = scan.table.angles[views]
@@ -120,7 +119,8 @@ SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and 
 
 
 def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
-    """Tell what is taken for the projections of an array [view, col], and how to state another order."""
+    """States which dimension of an array [view, col] is used as that of the projections, and how to state another
+    order."""
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size

@@ -28,7 +28,7 @@ class Pixels:
 
     Attributes:
         bits: 32: float32, the value itself; 16 or 8: a grey value.
-        window: of grey values: the values that become 0 and the greatest; what lies outside is clipped.
+        window: for grey values, the two values that become 0 and the largest grey value; values outside are clipped.
     """
 
     bits: int = 32
@@ -131,7 +131,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
     """The record with the metadata of `facts_of` and the values [z, y, x]; a grey window is among its parameters.
 
     Raises:
-        DataError: somebody has changed the facts.
+        DataError: the metadata were changed by another program.
     """
     try:
         z, y, x = map(float, facts["centre_zyx"])
@@ -151,7 +151,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         )
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise DataError(
-            f"{path} was changed: facts that volumes of this program have are missing "
+            f"{path} was changed by another program: metadata that every volume of this program has are missing "
             f"({type(error).__name__}: {error})."
         ) from error
 

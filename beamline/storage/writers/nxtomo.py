@@ -140,8 +140,8 @@ class NXtomoWriter:
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
         """Write the next row; `frame.index` must be `rows`. `flags`: findings of the monitor, also for earlier rows.
 
-        DataError for a wrong shape, type or index; nothing is written then. Also for a disk that does not take the
-        frame; the frames before stay readable, and nothing more can be appended.
+        DataError for a wrong shape, type or index; nothing is written then. Also if the disk does not accept the frame;
+        the earlier frames stay readable, and nothing more can be appended.
         """
         self._check(frame, digest)
         try:

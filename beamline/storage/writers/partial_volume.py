@@ -1,8 +1,8 @@
 """Partial volumes: the finished slabs of a volume, in a file that stays readable even if the process is killed.
 
-An NXtomoproc file whose places are all allocated when it is made, and written through memory maps, so that nothing of
-its structure changes later. Slices that two slabs share are kept beside while one of them is added. A slab that was
-added by half is taken out again when the file is opened.
+The file is an NXtomoproc file whose space is completely allocated when it is created. Voxels are written through memory
+maps, so that its structure never changes. While a slab is added, slices that it shares with another slab are saved
+separately. If a slab was added only in part, it is removed when the file is opened again.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class PartialVolume:
     Attributes:
         slabs: all of them.
         made_from: data and settings, by name; the slabs to come must be made from the same.
-        kept: what else the slabs to come need, in a form that JSON can represent.
+        kept: other values that the remaining slabs need, in a form that JSON can represent.
     """
 
     path: Path
@@ -130,7 +130,7 @@ def open_partial(path: Path) -> PartialVolume:
     """Open the file to add slabs to it.
 
     Raises:
-        DataError: it is no such file, is damaged, or another process adds to it.
+        DataError: the file is not a partial volume, is damaged, or another process is adding slabs to it.
     """
     _refuse_unusable(path)
     lock = WriterLock(path)

@@ -244,7 +244,7 @@ class Checkpoint:
     Attributes:
         state: arrays by name, see recon.splatting.checkpoint.
         made_from: data and settings of the fit, by name; they must be the same when it resumes.
-        steps: that were planned; 0 where a time was.
+        steps: planned number of steps; 0 if a time limit was planned.
     """
 
     state: Mapping[str, NDArray[Any]]

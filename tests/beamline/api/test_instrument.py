@@ -177,7 +177,7 @@ def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(connected
     with connected(say=said.append, **words) as instrument:
         assert instrument.scan(live=False).clean
         instrument.scan(live=False, set={"scan.decide": "off"})
-    sentence = "scan.decide do needs a live reconstruction, and this scan has none, so it follows its plan."
+    sentence = "scan.decide do needs a live reconstruction, and this scan has none, so the scan follows its plan."
     assert said.count(sentence) == 1
 
 

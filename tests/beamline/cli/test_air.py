@@ -79,7 +79,10 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
     page = (tmp_path / "v.html").read_text(encoding="utf-8")
     assert "a polynomial of order" in page.partition("What the metrics mean")[0] and "Air level" in page
     said, record = _recon(scans["bent"], tmp_path / "plain.h5", "-m", "fbp", "--air", "columns", "--no-report")
-    assert "Background" not in said and record == "no surface subtracted, only a line through the air at the edges"
+    assert (
+        "Background" not in said
+        and record == "no polynomial subtracted, only a straight line through the air at the edges"
+    )
 
 
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:

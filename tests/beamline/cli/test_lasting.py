@@ -25,7 +25,7 @@ def _run(folder: Path, redirected: str, *arguments: str) -> subprocess.Completed
 def test_what_is_printed_to_a_full_disk_is_an_error_of_the_disk(folder: Path) -> None:
     done = _run(folder, "> /dev/full", "info", "scan.h5")
     assert done.returncode == 5
-    assert done.stderr == "beamline: the output on stdout is not whole (No space left on device).\n"
+    assert done.stderr == "beamline: the output on stdout is incomplete (No space left on device).\n"
 
 
 @POSIX

@@ -30,7 +30,7 @@ def test_flags_are_listed_with_frames_score_limit_and_advice(here: Path) -> None
     assert result.exit_code == 7
     lines = result.stdout.splitlines()
     assert lines[0] == "alarm stuck       2 frames: 8-9"
-    assert lines[1].strip() == "worst 2 of 0 repetitions, in frame 9"
+    assert lines[1].strip() == "worst score 2 (limit 0 repetitions), in frame 9"
     assert "restart the camera" in lines[2]
     assert lines[-1] == "scan.h5: 34 frames, flagged: stuck 2 alarm"
     assert "2 of 34 frames have an alarm. They are listed on stdout" in result.stderr.splitlines()[-1]

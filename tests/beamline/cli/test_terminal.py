@@ -122,7 +122,7 @@ EVENTS = [
         "Taking 10 dark frames (static, exposure 0.05 s",
     ),
     ("block_done", BLOCK, None),
-    ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
+    ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 extra, without a trigger"),
     ("frame", FRAME, None),
     ("progress", FIT, None),
     ("flag", {**FLAG, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
@@ -201,7 +201,8 @@ PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}
         ({}, ""),
         (
             {"wait": 30.0},
-            "Within 30 s: beamline decide CHOICE, Enter for next; otherwise as planned.\n",
+            "Answer within 30 s: beamline decide CHOICE, or Enter for next.\n"
+            "Without an answer, the scan continues as planned.\n",
         ),
         ({"remark": "No volume yet: \x1b[2J"}, "No volume yet: \\x1b[2J\n"),
     ],

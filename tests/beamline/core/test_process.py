@@ -156,7 +156,7 @@ time.sleep(100)
     ("program", "code", "said"),
     [
         (ENDS_AT_ONCE, 1, b""),
-        (ASKS, 1, b"KeyboardInterrupt: this process ends, because the process that started it has died"),
+        (ASKS, 1, b"KeyboardInterrupt: this process ends, because the process that had started this one has died"),
         (NEVER_ASKS, 130, b""),
     ],
 )

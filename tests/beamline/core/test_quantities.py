@@ -96,7 +96,11 @@ def test_no_shipped_configuration_is_doubted(name: str) -> None:
         (["optics.pixel_size_um=0.003"], "Warning: optics.pixel_size_um = 0.003 um .*Did you mean 3 um", 0),
         (["devices.stage.max_speed_deg_s=4000"], "Warning: devices.stage.max_speed_deg_s = 4000 degrees/s is", 0),
         (["scan.angles.span_deg=3.14159"], "Warning: .*Did you mean 180", 0),
-        (["scan.angles.span_deg=3.14159", "scan.angles.views=3600"], "0.873 counts .* span 1.15 times the angles", 2),
+        (
+            ["scan.angles.span_deg=3.14159", "scan.angles.views=3600"],
+            "0.873 counts .* cover 1.15 times the planned range",
+            2,
+        ),
         (["scan.angles={scheme: sector, views: 90, first_deg: -1.5708, last_deg: 1.5708}"], "Did you mean 180", 0),
         (["scan.angles={scheme: file, path: ANGLES}"], "Did you mean 180", 0),
         (["scan.energies=[8000, 9]", "devices.monochromator.kind=simulated"], "Did you mean 8 keV", 2),

@@ -19,7 +19,7 @@ def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: 
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr("os.fsync", fsync)
-    with pytest.raises(DataError, match=r".Input/output.*left of it"):
+    with pytest.raises(DataError, match=r".Input/output.*left behind"):
         write_whole(tmp_path / "page.html", "a page")
     with pytest.raises(DataError, match="Input/output error"), atomic_file(tmp_path / "folder") as partial:
         (partial / "below").mkdir(parents=True)
@@ -31,7 +31,7 @@ def test_what_is_read_back_is_compared(tmp_path: Path, monkeypatch: pytest.Monke
     path = tmp_path / "table.csv"
     write_whole(path, "old")
     monkeypatch.setattr(files, "bring_to_disk", lambda partial: partial.write_bytes(b"nex"))
-    with pytest.raises(DataError, match=r"read back differ from those written.*there is untouched"):
+    with pytest.raises(DataError, match=r"read back differ from those written.*existing file was not changed"):
         write_whole(path, "new", replace=True)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 

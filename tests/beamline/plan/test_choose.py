@@ -102,7 +102,14 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
         ([NEXT, option(Choice.RETAKE, 0.1, 0.5)], QUALITY, NOTHING, 9, Choice.RETAKE, "0.10 dB"),
         # The next pass takes too long, a few retakes do not.
         ([NEXT, option(Choice.RETAKE, 0.01, 1)], ScanTarget(seconds=5), NOTHING, 9, Choice.RETAKE, "0.01 dB"),
-        ([option(Choice.OFFSET, 0.0)], ScanTarget(seconds=99), NOTHING, 0, Choice.ENOUGH, "no choice would improve"),
+        (
+            [option(Choice.OFFSET, 0.0)],
+            ScanTarget(seconds=99),
+            NOTHING,
+            0,
+            Choice.ENOUGH,
+            "none of the choices would improve",
+        ),
         (
             [option(Choice.NEXT, 0.0), option(Choice.OFFSET, 1.0)],
             ScanTarget(dose=1),
@@ -119,7 +126,7 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
             Choice.OFFSET,
             "1.00 dB",
         ),  # they come anyway
-        ([], ScanTarget(dose=1), NOTHING, 0, Choice.ENOUGH, "no choice would improve"),
+        ([], ScanTarget(dose=1), NOTHING, 0, Choice.ENOUGH, "none of the choices would improve"),
     ],
 )
 def test_the_choice_and_its_reason(

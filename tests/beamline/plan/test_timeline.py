@@ -212,17 +212,17 @@ VIOLATIONS = {
         {"angles": angles.fixed(40, 90 * DEG)},
         "needs 45°/s, the stage turns at most 30°/s; set scan.period_s >= 0.15",
     ),
-    "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of taxi at each end)"),
+    "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of run-up at each end)"),
     "end": ({"angles": angles.fixed(360, 186 * DEG)}, "limits are -5° ... 365°"),
-    "slow": ({"period": 2000.0}, "less than a count a second of the stage; set scan.period_s <= 500"),
-    "step beyond": ({"angles": np.array([0.0, 7.0]), "mode": Mode.STEP}, "go from 0° to 401.07°, its limits"),
+    "slow": ({"period": 2000.0}, "less than one count per second; set scan.period_s <= 500"),
+    "step beyond": ({"angles": np.array([0.0, 7.0]), "mode": Mode.STEP}, "go from 0° to 401.07°, but its limits"),
     "unequal": ({"angles": angles.golden(100)}, "not equally spaced"),
     "one view": ({"angles": np.zeros(1)}, "at least 2 projections"),
     "no flats": ({"flats": FieldPlan(0, Place.START, 0.05)}, "no flats: scan.flats.count is 0"),
     "no darks": ({"darks": FieldPlan(0, Place.BOTH, 0.05)}, "no darks: scan.darks.count is 0"),
     "passes": (
         {"mode": Mode.STEP, "pass_views": 3},
-        "scan.pass_views 3 divides 360 views into more than 100 passes; set it to at least 4, or to 0",
+        "scan.pass_views 3 divides 360 projections into more than 100 passes; set it to at least 4, or to 0",
     ),
 }
 
@@ -299,10 +299,13 @@ def test_no_trigger_output_and_no_room() -> None:
     assert "a stage with a trigger output" in violation
     # 410 frames of 144 x 252 px, 2 bytes a pixel and 4 a block of 4 x 4 pixels, or for each pixel.
     (violation,) = worked(free_bytes=56_000_000).violations
-    assert "needs 33.5 MB plus a tenth, and 20 MB more when it is closed, but 56 MB is free" in violation
+    assert (
+        "needs 33.5 MB plus a reserve of a tenth, and 20 MB more when the file is closed, but 56 MB is free"
+        in violation
+    )
     assert worked(free_bytes=57_000_000).violations == ()
     (violation,) = worked(free_bytes=110_000_000, preview_bin=1).violations
-    assert "needs 89.3 MB plus a tenth" in violation
+    assert "needs 89.3 MB plus a reserve of a tenth" in violation
 
 
 @pytest.mark.parametrize(("axis_col", "legal"), [(-0.5, True), (-0.6, False), (251.5, True), (251.6, False)])
@@ -315,8 +318,9 @@ def test_an_axis_outside_the_frame_is_refused(axis_col: float, legal: bool) -> N
 REMARKS = {
     "rounding": (
         {"angles": angles.fixed(181), "period": 0.2},
-        "the step of 0.994475° is 994.475 counts; triggers fall on whole counts, so it becomes 994 counts = 0.994°, "
-        "and views move by up to 0.0855",
+        "the step of 0.994475° is 994.475 counts; the stage can trigger only on whole counts, so the step becomes "
+        "994 counts = 0.994°, "
+        "and the angles of projections change by up to 0.0855",
     ),
     "whole counts a second": (
         {"angles": angles.fixed(36_000), "period": 0.6},
@@ -324,16 +328,16 @@ REMARKS = {
         "every 0.625 s",
     ),
     "margin": ({"period": 0.0512}, "less than 1 % above the camera's minimum of 0.051 s"),
-    "few views": ({"angles": angles.fixed(180)}, "180 views are fewer than pi/2 x 252 columns = 396"),
+    "few views": ({"angles": angles.fixed(180)}, "180 projections are fewer than pi/2 x 252 columns = 396"),
     "no flats": ({"flats": FieldPlan(0, Place.NONE, 0.05)}, "no flats will be taken"),
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
     "exposure": (
         {"flats": FieldPlan(5, Place.END, 0.1)},
-        "flats are exposed for 0.1 s and views for 0.05 s; their light",
+        "flats are exposed for 0.1 s and projections for 0.05 s; their intensity",
     ),
     "darks' exposure": (
         {"darks": FieldPlan(5, Place.END, 0.1)},
-        "darks are exposed for 0.1 s and views for 0.05 s; th",
+        "darks are exposed for 0.1 s and projections for 0.05 s; th",
     ),
     "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
 }

@@ -90,7 +90,8 @@ def test_a_cone_that_is_not_stated_is_told_and_parallel_rays_are_not() -> None:
         assert len(told_of) == expected, sentences
         for sentence in told_of:
             assert (
-                "If the beam is a cone, give --cone SOD:SDD" in sentence and "the stated fan has 0 degrees" in sentence
+                "If the beam is a cone, give --cone SOD:SDD" in sentence
+                and "with the stated distances they span 0 degrees" in sentence
             )
 
 

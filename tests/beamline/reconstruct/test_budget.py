@@ -59,7 +59,7 @@ def test_the_slowest_is_left_out_until_the_choice_ends_in_time(
     views, warned = Geometry.parallel(np.linspace(0, 3, 20), (4, 16)), list[str]()
     method, words = in_budget(Auto(), budget, views, Grid.matching(views), SteppedClock(0.0, 0.0), warned.append)
     assert [each.name for each in method.alternatives] == left
-    assert [f"about {0.5 * late:.3g} s late" in said for said in warned] == [True] * late
+    assert [f"about {0.5 * late:.3g} s after this limit" in said for said in warned] == [True] * late
     assert all((f"{name} would take about" in words) == (name not in left) for name in SECONDS)
     assert words.startswith(f"{budget:.3g} s for {' or '.join(left)}")
 

@@ -277,7 +277,7 @@ def test_a_pass_without_a_view_that_can_be_used_has_no_law(laws: Laws, follow: C
     scan = follow(flags=alarms(*range(4, 14)))
     scan.seconds(14)
     assert not laws.asked
-    assert [law["reason"] for law in scan.of("error_law")] == ["none of the views can be used"]
+    assert [law["reason"] for law in scan.of("error_law")] == ["none of the projections can be used"]
 
 
 def test_before_the_axis_is_known_there_is_no_law_and_the_scan_is_told_at_once(
@@ -303,7 +303,7 @@ def test_where_flats_come_after_the_views_there_is_no_law_and_the_scan_is_told_a
     for n in (11, 1, 10):
         scan.seconds(n)
     assert [(law["number"], law["reason"]) for law in scan.of("error_law")] == [
-        (n, "darks or flats are not there yet") for n in (1, 2)
+        (n, "darks or flats have not been taken yet") for n in (1, 2)
     ]
     assert len(scan.of("warning")) == 1 and not laws.asked
 

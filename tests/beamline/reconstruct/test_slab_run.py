@@ -111,7 +111,7 @@ def test_other_data_or_options_are_refused_and_nothing_is_touched(
         ("--seed", "3"): "seed (3, 0 in the file)",
         ("--tv-weight", "0.01"): "tv_weight (0.01, 0.002 in the file)",
         ("--air", "none"): "projections (other content)",
-        ("--rows", "0:80"): "is of 96 slices, this volume has 80",
+        ("--rows", "0:80"): "contains a volume of 96 slices, but this reconstruction has 80",
         ("--memory", "3.5M"): "Use --memory 5M if",
     }.items():
         refused = beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5", *options)
@@ -142,9 +142,9 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
     assert all_of_it["scratch"] - rest["scratch"] == rest["output"] and rest["memory"] == all_of_it["memory"]
     said = beamline(*FISTA, "--resume", "out.partial.h5", "--dry-run").stdout
     assert "2 slabs remaining; 32 of 96" in said
-    assert "about 1.67 min; about 50 s where the data end it early; reading" in said
+    assert "about 1.67 min; about 50 s if the data let it stop early; reading" in said
     other = beamline(*FISTA, "--rows", "0:80", "--resume", "out.partial.h5", "--dry-run")
-    assert other.exit_code == 5 and "is of 96 slices, this volume has 80" in other.stderr
+    assert other.exit_code == 5 and "contains a volume of 96 slices, but this reconstruction has 80" in other.stderr
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
 
 

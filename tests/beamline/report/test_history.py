@@ -37,8 +37,8 @@ def test_views_held_out_judge_before_views_used() -> None:
         judged = residual_curve({"seconds": seconds, **arrays})
         return None if judged is None else judged.views
 
-    assert words(residual=seconds, held_out=seconds) == "views held out"
-    assert words(residual=seconds, held_out=np.full(3, np.nan)) == "views used"
+    assert words(residual=seconds, held_out=seconds) == "held-out projections"
+    assert words(residual=seconds, held_out=np.full(3, np.nan)) == "projections used"
     assert words() is None
 
 

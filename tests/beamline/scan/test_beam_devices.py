@@ -175,7 +175,7 @@ URL = f"pva://{PREFIX}it"
 STANDS: dict[str, tuple[str, dict[float, Any]]] = {
     "filter": (
         f"{{kind: epics, pv: '{URL}', places: {{none: 0, Cu: 2}}, timeout_s: 0.5}}",
-        {2.0: {"place": "Cu"}, 1.0: {"place": "none that has a name"}},
+        {2.0: {"place": "Cu"}, 1.0: {"place": "none of the named places"}},
     ),
     "monochromator": (
         f"{{kind: epics, pv: '{URL}', status_pv: '{URL}', timeout_s: 0.5, unit: eV, range_kev: [4, 25]}}",

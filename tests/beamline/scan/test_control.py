@@ -136,7 +136,11 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         assert twice.exit_code == 2 and "has made no other choice" in twice.stderr
         enter(State.ASKING)
         other = CliRunner().invoke(main, ["decide", str(run), "offset"])
-        assert other.exit_code == 2 and "does not take offset" in other.stderr and "took next: because" in other.stderr
+        assert (
+            other.exit_code == 2
+            and "does not measure offset next" in other.stderr
+            and "chose next instead: because" in other.stderr
+        )
         (run / "control" / "enough").touch()
     file.close()
     assert not (run / "control").exists()

@@ -87,7 +87,10 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     ran.assert_good_file(16, "complete")  # with the flats of the end
     assert [(each["passes"], each.get("dropped", 0)) for each in decisions] == [(1, 0), (2, 0), (3, 3)]
     assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 16
-    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: the rest of the plan "
+    run, said = (
+        describe(ran.folder),
+        "The scan ended after pass 3, because `enough` was chosen by the program: the rest of the plan ",
+    )
     assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
     assert "16 of 19" in cells(run)
     with open_scan(ran.folder / "scan.h5") as source:

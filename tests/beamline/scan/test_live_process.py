@@ -175,7 +175,7 @@ print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_co
     )  # fmt: skip
     (folder,) = tmp_path.iterdir()
     assert (folder / "starts").read_text() == "+" * min(times + 1, 3)
-    assert sum("It is started again" in text for text in said) == min(times, 2)
+    assert sum("A new live reconstruction is started" in text for text in said) == min(times, 2)
     assert (result.recon is not None) == (times == 1)
 
 

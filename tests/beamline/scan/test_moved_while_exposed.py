@@ -142,7 +142,9 @@ def test_a_view_during_which_it_is_moved_is_taken_again(stage: str, disturb: str
         assert list(file["entry/frame_log/trigger"][FIRST + MOVED : FIRST + MOVED + 2]) == [MOVED, MOVED]
     assert angles[key == 0] == pytest.approx(np.arange(VIEWS) * 20.0, abs=0.011)
     (said,) = [event.data["message"] for event in events if event.event == "warning"]
-    assert said.startswith(f"Projection {MOVED}: its frame was exposed while the stage was not at its 80.0000°")
+    assert said.startswith(
+        f"Projection {MOVED}: its frame was exposed while the stage was not at the planned angle of 80.0000°"
+    )
     assert [found.rule for found in validate(path) if found.severity == "error"] == []
     assert events[-1].event == "done" and [e for e in events if e.event == "frame"][-1].data["n"] == result.n_frames
 

@@ -232,7 +232,9 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     assert not stop.aborting and f"Stopped after {sizes[0]} of 12 projections: Ctrl-C was pressed." in str(ran.error)
     assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("to take; its missing offset views and flats of the end are taken now")
+        assert series.in_words.endswith(
+            "planned; the offset projections and flats that are missing at its end are taken now"
+        )
     assert "--resume" in next_step(ran.folder / "scan.h5")
 
 
@@ -299,7 +301,9 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + VIEWS + 1: stop.abort}), *WORDS, *words, stop=stop)
     instrument.clock.sleep(1e4)
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("has all 12 views; its missing offset views of the end are taken now")
+        assert series.in_words.endswith(
+            "has all 12 projections; the offset projections that are missing at its end are taken now"
+        )
         run_scan(series.config, series, instrument=instrument.connected())
     frames = frames_of(ran.folder / "joined.h5")
     assert [frame.trigger for frame in frames[FIRST:]] == list(range(VIEWS + WIDE))
@@ -345,7 +349,8 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     resumed, chooser = open_for_resume(ran.folder), Scripted([])
     with choosing(monkeypatch, chooser), killed(monkeypatch), resumed as series, suppress(ScanStopped, DataError):
         assert (
-            f"lacks {missing} of the" in series.in_words or "has all the projections that it was to" in series.in_words
+            f": {missing} of the projections" in series.in_words
+            or "has all the projections that were" in series.in_words
         )
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
     _, part, joined = recover_run(ran.folder)[0]

@@ -156,7 +156,7 @@ def test_references_of_the_end_alone_are_taken(
             lambda said: None,
         )
     assert len(prepared.projections.data) == VIEWS
-    with pytest.raises(ConfigError, match="all projections that it was to take"):
+    with pytest.raises(ConfigError, match="all projections, darks and flats that were planned"):
         go_on(run)
 
 
@@ -164,7 +164,7 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(tmp_path: 
     run = ended_run(tmp_path, "aborted", at=FIRST + VIEWS)
     stop = StopRequest()
     with open_for_resume(run) as series:
-        assert series.in_words.endswith("has all 12 views; its missing flats of the end are taken now")
+        assert series.in_words.endswith("has all 12 projections; the flats that are missing at its end are taken now")
         with pytest.raises(BeamlineError, match="before the first frame"):
             run_scan(
                 series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,

@@ -127,7 +127,7 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
 def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
-    assert "Frames 8: repeated, but again without a frame" in ran.warnings[0]
+    assert "Frames 8: the exposure was repeated, but the camera again delivered no frame" in ran.warnings[0]
     with open_scan(ran.result.path) as source:
         assert source.table.kinds[8] == FrameKind.PROJECTION and source.table.kinds[10] == FrameKind.INVALID
 

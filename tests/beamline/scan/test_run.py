@@ -167,4 +167,7 @@ def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monk
     monkeypatch.setattr(fakes.Stage, "describe", lambda stage: said)
     ran = Ran(tmp_path, FakeInstrument())
     (warning,) = ran.of("warning")
-    assert warning.data["message"] == "stage: settings before it was opened: displaced while at rest (WM)."
+    assert (
+        warning.data["message"]
+        == "stage: the settings in the device before this program opened it: displaced while at rest (WM)."
+    )

@@ -94,6 +94,6 @@ def test_a_snapshot_that_fails_leaves_the_older_file(tmp_path: Path, disk: type[
     path = tmp_path / "fit.h5"
     write_checkpoint(path, Checkpoint({"x": CUBE}, {"seed": 1}, 5))
     disk.n, disk.at = 0, 4
-    with pytest.raises(DataError, match=r"fit.h5.*there is untouched"):
+    with pytest.raises(DataError, match=r"fit.h5.*existing file was not changed"):
         write_checkpoint(path, Checkpoint({"x": CUBE + 1}, {"seed": 1}, 6))
     assert read_checkpoint(path).steps == 5 and list(tmp_path.iterdir()) == [path]

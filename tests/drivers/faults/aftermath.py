@@ -87,7 +87,9 @@ def assert_next_scan_works(rig: Rig, runs: Path, tells: str = "") -> None:
         assert_complete(scanned)
         if words:
             (warning,) = scanned.warnings
-            assert re.fullmatch(rf"stage: settings before it was opened: {words}\.", warning), warning
+            assert re.fullmatch(
+                rf"stage: the settings in the device before this program opened it: {words}\.", warning
+            ), warning
         else:
             assert scanned.warnings == []
         assert_at_rest(rig, scanned)

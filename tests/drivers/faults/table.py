@@ -254,7 +254,7 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("ring overrun", LedgerError, "projections are missing"),
     CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
     CameraFault("triggers too fast", LedgerError, "triggers were ignored by the camera, which was not ready"),
-    CameraFault("slow link", LedgerError, "`beamline check --connect` looks at its link"),
+    CameraFault("slow link", LedgerError, "`beamline check --connect` tests its link"),
 )
 
 
@@ -309,7 +309,7 @@ OF_MOTION = (
     FaultElsewhere(
         'step scan: the stage moved after it had arrived (another program, the panel, a hunting servo, a "done" that '
         "comes too early)",
-        "its frame was exposed while the stage was not at its",
+        "its frame was exposed while the stage was not at the planned angle",
         ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
     ),
     FaultElsewhere(

@@ -46,8 +46,8 @@ def _model(text: str) -> str | None:
     """`fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
-            f"{text!r} is unknown; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a "
-            "tube behind 1 mm Al; or Al:FILE)"
+            f"{text!r} is unknown; expected none, fit or MATERIAL:BEAM, for example Al:60kV,Al=1 (an aluminium "
+            "sample, and a tube of 60 kV behind a filter of 1 mm Al) or Al:FILE"
         )
     return None if text == "none" else text
 
@@ -113,7 +113,7 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
     intensity.
 
     Args:
-        material: a known one, or a chemical formula.
+        material: name of a known material, or a chemical formula.
         beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
             weight, in any unit; the weight includes the detector's response. Filters must be known materials,
             because their density is needed.
@@ -198,10 +198,10 @@ def _clearly_seen(views: PreparedProjections) -> str:
     if evened > _EVENED or corrected < (1 + _MATTERS) * highest:
         return ""
     return (
-        "Give --hardening fit if the sample is of one material, because the projections show beam "
-        f"hardening: the curve of one material would raise line integrals of {highest:.3g} to "
-        f"{corrected:.3g}, and the total absorption of a row would vary {1 / evened:.2g} times less "
-        "between projections. Nothing was corrected"
+        "Give --hardening fit if the sample is of one material, because the projections show beam hardening: "
+        f"the correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}, and "
+        "would reduce the variation of the total absorption of a row between projections by a factor of "
+        f"{1 / evened:.2g}. Nothing was corrected"
     )
 
 
@@ -232,8 +232,8 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
 
     if geometry.is_cone:
         raise NoCurveError(
-            "a fit needs a parallel beam, in which the total absorption is the same in all projections. "
-            "State material and beam"
+            "a fit needs a parallel beam, because only there the total absorption is the same in all "
+            "projections. State material and beam instead"
         )
     some, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])

@@ -59,10 +59,10 @@ class Calibrate:
     terms: tuple[str, ...] = option(
         "--calibrate",
         "none",
-        "Find these from the projections, separated by commas: axis (its column), roll (tilt of the axis "
-        "in the detector's plane), tilt (tilt of the axis along the beam), shifts (of each projection), "
-        "gains (pixel sensitivity). Projections are not resampled. A parameter changes only if the "
-        "held-out projections agree better with the new value.",
+        "Find geometry errors from the projections and correct them. Give one or more, separated by commas: "
+        "axis (column of the rotation axis), roll (tilt of the axis in the detector's plane), tilt (tilt of the "
+        "axis along the beam), shifts (of each projection), gains (pixel sensitivity). Projections are not "
+        "resampled. A parameter changes only if the held-out projections agree better with the new value.",
         parse=_terms,
         metavar="LIST",
     )
@@ -261,8 +261,8 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     if views.held_out is not None:
         views.held_out.data[...] -= learnt.pixels
     sentence = (
-        f"Pixel sensitivities were corrected by {float(learnt.pixels.std()):.4f} in line integral "
-        f"(standard deviation); {judged}. Columns within {NEAR_AXIS:g} of the axis were not corrected, "
-        "because there a sensitivity looks like an object on the axis."
+        f"Pixel sensitivities were corrected by {float(learnt.pixels.std()):.4f} in line integral (standard "
+        f"deviation); {judged}. Columns within {NEAR_AXIS:g} of the axis were not corrected, because a wrong "
+        "sensitivity there looks like an object on the axis."
     )
     return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

@@ -153,7 +153,7 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
     if (none := np.setdiff1d(jumps, real)).size:
         text.append(
             f"The monitor reported motion at {frames_text(none)}, but the projections show no jump of the "
-            "sample: those on both sides are used as they are."
+            "sample: the projections before and after it are used as they are."
         )
     return " ".join(text)
 

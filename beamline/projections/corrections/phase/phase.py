@@ -147,14 +147,15 @@ class Phase:
             return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
         if filter.gain < LEAST_DROP:
             why = (
-                f"No phase filter was applied. A filter over {filter.length:.3g} pixels would lower the "
-                f"residual in held-out projections by {filter.gain:.0%}, but it blurs cracks, so it is "
-                f"applied by default only from {LEAST_DROP:.0%}. --phase paganin:RATIO applies one."
+                f"No phase filter was applied. A filter over {filter.length:.3g} pixels would lower the residual "
+                f"in held-out projections by {filter.gain:.0%}. Because a filter blurs cracks, it is applied by "
+                f"default only if it lowers this residual by at least {LEAST_DROP:.0%}. To apply a filter, give "
+                "--phase paganin:RATIO."
             )
             return replace(self, explanation=f"{overshoot.in_words()} {why}")
         why = (
             "A phase filter was applied, because it lowers the residual in held-out projections by "
-            f"{filter.gain:.0%}. They determine the square of the filter's length within "
+            f"{filter.gain:.0%}. The held-out projections determine the square of the filter's length to within "
             f"{filter.factor - 1:.0%}. --phase none omits the filter."
         )
         return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")

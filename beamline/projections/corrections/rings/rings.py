@@ -30,9 +30,9 @@ class Rings:
     way: Way = option(
         "--rings",
         "none",
-        "Remove the stripes in sinograms that make rings in slices. none: do not. sort: small stripes. "
-        "vo: dead columns, large and small stripes. auto: the kinds that it detects. Layers of the "
-        "sample around the axis are kept.",
+        "Remove the stripes in sinograms that make rings in slices. none: remove nothing. sort: small stripes. "
+        "vo: dead columns, large and small stripes. auto: only the kinds of stripes that are found in the "
+        "projections. Layers of the sample around the axis are kept.",
         choices=get_args(Way),
     )
 

@@ -33,9 +33,9 @@ class NamedAngles(NamedTuple):
     """The angles in the names of a series.
 
     Attributes:
-        plain: the names without them.
-        radians: float64 [file]; None if the names state none, or can be read in two ways.
-        doubt: which ways these are; "" otherwise.
+        plain: the names without the angles.
+        radians: float64 [file]; None if the names state no angles, or if they can be read in two ways.
+        doubt: a description of these two ways; "" if there is no doubt.
     """
 
     plain: list[str]
@@ -48,7 +48,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     in some names and none in others; or as three digits of degrees and three of thousandths before the number of the
     frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
 
-    Decimals follow a point, a comma or p; n, m, neg and minus are signs as a hyphen is.
+    Decimals follow a point, a comma or p. n, m, neg and minus mean a negative sign, like a hyphen.
     """
     stems = [name.rpartition("/")[2].rpartition(".")[0] for name in names]
     numbers = [[*_NUMBER.finditer(stem)] for stem in stems]
@@ -158,7 +158,8 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
             return (
-                "the number next to each angle does not count images; are the two numbers an integer and its decimals?"
+                "the number next to each angle does not count images; are the two numbers the integer part and the "
+                "decimals of one angle?"
             )
     return ""
 

@@ -33,9 +33,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
     called.
 
-    Words for darks and flats (dark, flat, white, open beam; ob, df, dc as whole words) decide. If they leave no
-    projection, the sample's name contains such a word: it is the one series with another word in its name, or the only
-    series, or the largest, if both kinds of references exist without it.
+    Words for darks and flats (dark, flat, white, open beam; ob, df, dc as whole words) decide. If no projection would
+    remain, the name of the sample contains such a word. The projections are then the one series with another word in
+    its name, or the only series, or the largest series, if darks and flats exist without it.
 
     Raises:
         DataError: no series can be recognised as the projections.
@@ -94,14 +94,15 @@ def _without_common_folder(names: Sequence[str]) -> list[str]:
 @dataclass(frozen=True, eq=False)
 class NamedImages:
     """The images of a scan ordered by their names: darks, flats, then the projections by number, and after them the
-    darks and flats that are named so (after, post), and images of no use.
+    darks and flats that are named so (after, post), and images that are not used.
 
     Attributes:
         names: of the files.
         kinds: int32 [file], values of FrameKind.
-        angles: float64 [file] radians, NaN if the name says none.
-        numbers: int64 [file], -1 of references that do not count with the series; None if files are not numbered.
-        of_series: int64 [projection], the numbers of the series; None if they count no images.
+        angles: float64 [file] radians, NaN if the name states no angle.
+        numbers: int64 [file], -1 for darks and flats whose numbers do not belong to the series; None if files are not
+            numbered.
+        of_series: int64 [projection], the numbers of the series; None if the numbers do not count images.
         plain: the names of the projections without their angles.
         doubt: why the angles in the names are not used; empty if they are used or the names have none.
         half_turn: images in a folder of their own that is named after 180 degrees, which are invalid frames.

@@ -1,6 +1,6 @@
 """Image series: a folder (or .zip) with one image per file, as TIFF, .npy or PNG; or a scene of R²-Gaussian.
 
-The name of a file tells its kind, see `image_names`; all files except darks and flats must be one series. They are
+The name of a file states its kind, see `image_names`; all files except darks and flats must be one series. They are
 sorted by the numbers in their names, never by a directory listing. Files are read one at a time, so that the memory
 needed does not grow with the scan. Hidden files (`._0001.tif` of a Mac) are ignored.
 """
@@ -130,9 +130,8 @@ class TiffSeriesSource(ScanSource):
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
             if not np.can_cast(image.dtype, self.dtype):
                 raise DataError(
-                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have "
-                    f"{self.dtype}, which cannot represent them all. Write all images of a scan in one "
-                    "pixel type."
+                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have {self.dtype}, "
+                    "which cannot represent all of their values. Write all images of a scan in one pixel type."
                 )
             out[i] = image[rows]
         return out

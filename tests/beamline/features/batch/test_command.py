@@ -166,7 +166,7 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
     ("program", "reason"),
     [
         ("import os, sys; print('out of memory', file=sys.stderr, flush=True); os.abort()", "out of memory"),
-        ("import time; time.sleep(600)", "its process was ended, because it gave no output for 1.5 s"),
+        ("import time; time.sleep(600)", "its process was ended, because it printed nothing for 1.5 s"),
         ("", "its process ended with code 0"),
     ],
 )
@@ -265,7 +265,7 @@ def test_a_table_of_names_that_are_not_of_this_program_is_refused_and_nothing_is
     Path("out/batch.csv").write_text(rows.replace("'-o", "-o"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     result = beamline(*given)
-    assert result.exit_code == 5 and f"{name!r} is not a name that this program gives" in result.stderr
+    assert result.exit_code == 5 and f"{name!r} is not a name that this program would give" in result.stderr
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 

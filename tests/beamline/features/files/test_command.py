@@ -153,7 +153,7 @@ def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     assert result.exit_code == 5
     assert (
         "error    checksums       1 of 22 frames are damaged" in result.stdout
-        and ": 9. Look for a good copy" in result.stdout
+        and ": 9. Look for an intact copy" in result.stdout
     )
     events = [json.loads(line) for line in beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}

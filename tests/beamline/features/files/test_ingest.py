@@ -115,7 +115,9 @@ def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
         ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5")
     out = tmp_path / "out.h5"
     why = "No space left on device"
-    assert str(error.value) == f"{out} could not be written ({why}). Check the disk; nothing is left of it."
+    assert (
+        str(error.value) == f"{out} could not be written ({why}). Check the disk; no incomplete file was left behind."
+    )
     assert left(tmp_path) == {"lab.tif"}
 
 

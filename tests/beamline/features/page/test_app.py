@@ -104,8 +104,8 @@ def test_acting_takes_its_own_token_and_our_own_origin(run: Path) -> None:
         assert act(page, "stop%0Aroot%1b%5b2J%0astop,%20asked%20for") == 403
         assert act(page, "stop", X_Act_Token=token, Origin=ours) == 404  # no scan runs there
         assert page.ask("/api/verb/stop", headers={"X-Act-Token": token, "Origin": ours})[0] == 405
-    assert page.log.pop(4).startswith("not done: do what is no verb from 127.0.0.1")
-    assert [line.split(",")[0] for line in page.log] == ["not done: stop from 127.0.0.1"] * 4 + ["stop"]
+    assert page.log.pop(4).startswith("not executed: an unknown command, requested by 127.0.0.1")
+    assert [line.split(",")[0] for line in page.log] == ["not executed: stop"] * 4 + ["stop"]
 
 
 def test_a_choice_reaches_a_scan_that_asks_and_no_other(tmp_path: Path) -> None:

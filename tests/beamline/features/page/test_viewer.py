@@ -69,7 +69,7 @@ def test_a_histogram_counts_each_voxel_once(pair: Served) -> None:
     [
         ("slice/0/0/6", "outside the volume of (6, 8, 10)"),
         ("slice/0/3/0", "outside the volume"),
-        ("slice/2/0/0", "not shown here"),
+        ("slice/2/0/0", "does not show volume 2"),
         ("profile/0/0/0?line=1,2,nan,3", "first row, first column"),
         ("profile/0/0/0", "first row, first column"),
     ],

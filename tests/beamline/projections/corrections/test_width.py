@@ -94,7 +94,7 @@ def test_a_pixel_has_its_area_and_blur() -> None:
     before, after, done = _rays(Width("0.6", "none"), _source(), Selection(binning=2))
     assert (after.width.pixel, after.width.blur, after.skew) == (1, 0.3, 0)
     np.testing.assert_array_equal(after.angles, before.angles)
-    assert done.sentence == "Ray width in the reconstruction: a pixel has its own area and a blur of 0.6 px."
+    assert done.sentence == "Ray width in the reconstruction: each ray has the area of a pixel and a blur of 0.6 px."
 
 
 def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:

@@ -56,11 +56,11 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("frame,pos", "{i},{deg}"), "", "columns are frame, pos; .* FILE::COLUMN"),
         (table("frame,theta", "{i},{deg}"), "::omega", "columns are frame, theta"),
         (table("", "{i},{deg}"), "::2", "its 2 columns have no names"),
-        (table("", "{i},{deg}"), "", "number of a view and its angle.* FILE::COLUMN"),
+        (table("", "{i},{deg}"), "", "number of a projection and its angle.* FILE::COLUMN"),
         (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; give --angles-unit"),
-        ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 holds '\(empty\)'"),
-        ("0 deg\n2 deg", "", "line 1 holds '0 deg'"),
-        ("0.5°\n2.5°", "", "line 1 holds '0.5°'"),
+        ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 contains '\(empty\)'"),
+        ("0 deg\n2 deg", "", "line 1 contains '0 deg'"),
+        ("0.5°\n2.5°", "", "line 1 contains '0.5°'"),
     ],
 )
 def test_a_table_that_may_be_read_otherwise_is_refused(tmp_path: Path, text: str, column: str, message: str) -> None:
@@ -98,13 +98,13 @@ def test_text_is_degrees_and_arrays_are_radians(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "# nothing\n", "0 1\n2 3\n", "zero\n"])
 def test_what_is_no_list_of_angles_is_refused(content: str) -> None:
-    with pytest.raises(DataError, match="degrees a line"):
+    with pytest.raises(DataError, match="degrees per line"):
         parse_angles(content, "a.txt")
 
 
 def test_a_log_may_hold_no_angle_for_darks_and_flats_but_no_other_word() -> None:
     np.testing.assert_array_equal(parse_angles("nan\nNaN\n0\n180\n", "a.txt"), [np.nan, np.nan, 0, np.pi])
-    with pytest.raises(DataError, match=r"a\.txt: line 2 holds 'inf'"):
+    with pytest.raises(DataError, match=r"a\.txt: line 2 contains 'inf'"):
         parse_angles("0\ninf\n", "a.txt")
 
 

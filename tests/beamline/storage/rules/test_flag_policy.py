@@ -50,7 +50,7 @@ def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, sev
 
 
 IN_A_PART = (
-    "Of 18 projections, 4 are flagged in a region, in which rays have half weight (with an alarm: none) "
+    "Of 18 projections, 4 are flagged in a region, in which rays have half weight (with an alarm: weight 0) "
     "(bands 4 alarm)."
 )
 

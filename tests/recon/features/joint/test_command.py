@@ -93,7 +93,9 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
 
 def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path: Path) -> None:
     page = series.with_suffix(".html").read_text(encoding="utf-8")
-    assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
+    assert (
+        "2 volumes at successive times" in page and "Slices at each time" in page and "beamline view series.h5" in page
+    )
     assert "Residual of the projections used" in page and "data:image/png" in page
     done = beamline("recon", str(scan), *ASKED, "--no-report", "-o", str(tmp_path / "s.h5"))
     assert done.exit_code == 0, done.output
@@ -115,7 +117,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: P
     np.testing.assert_array_equal(kept.series.data, held.series.data)
     np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
     assert not kept.ended_early
-    with pytest.raises(api.DataError, match="12 views"):
+    with pytest.raises(api.DataError, match="12 projections"):
         api.reconstruct(scan, replace(method, volumes=4), selection=wanted, say=None)
     part: dict[str, Any] = {"rows": (0, 1), "views": "fixed:12"}
     for output, more in (("other.tif", dict[str, Any]()), ("other.h5", part)):
@@ -148,22 +150,38 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("--volumes", "3", "--follow"), 2, "--volumes does not go with --follow"),
-        (("--volumes", "3", "-m", "fbp"), 2, "--volumes belongs to series; it does not go with --method fbp"),
-        (("--volumes", "3", "--uncertainty"), 2, "error bars belong to one volume"),
-        (("--volumes", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
+        (("--volumes", "3", "--follow"), 2, "--volumes cannot be combined with --follow"),
+        (
+            ("--volumes", "3", "-m", "fbp"),
+            2,
+            "--volumes works only with series; it cannot be combined with --method fbp",
+        ),
+        (("--volumes", "3", "--uncertainty"), 2, "error bars are computed only for a single volume"),
+        (("--volumes", "3", "--roi", "0:1,0:9,0:9"), 2, "a box can be cut only from a single volume"),
         (("--volumes", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--volumes", "1"), 2, "--volumes"),
         (("--moves",), 2, "add --volumes N"),
-        (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K"), 2, "Use --bin, because volumes in time cannot be made in slabs"),
+        (("--volumes", "4", "--no-moves"), 5, "because each volume needs at least 12 projections"),
+        (
+            ("--volumes", "2", "--memory", "100K"),
+            2,
+            "Use --bin, because a time series cannot be reconstructed in slabs",
+        ),
         (
             ("--volumes", "2", "--memory", "300K"),
             2,
-            "Use --rows with 1 row or fewer at a time, or --bin, because volumes in time",
+            "Use --rows with 1 row or fewer at a time, or --bin, because a time series",
         ),
-        (("--volumes", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "because volumes in time cannot be made in slabs"),
+        (
+            ("--volumes", "4", "--dry-run"),
+            5,
+            "4 volumes from 36 projections are too many",
+        ),
+        (
+            ("--volumes", "2", "--memory", "100K", "--dry-run"),
+            2,
+            "because a time series cannot be reconstructed in slabs",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
@@ -182,7 +200,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     done = beamline("recon", str(scan), "--volumes", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels with series, from 36 projections" in done.output
-    assert "not known: series has to be tried" in done.output.splitlines()[-1]
+    assert "not known, because the time of series cannot be predicted" in done.output.splitlines()[-1]
     told = json.loads(beamline("recon", str(scan), "--volumes", "2", "--dry-run", "--json").stdout)
     assert told["seconds"] is None and told["time"] > 1e9  # of the event
     assert not left(tmp_path)

@@ -87,7 +87,7 @@ def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Pa
     table = tmp_path / "poses.csv"
     rows = "\n".join(f"{view},1,0" for view in range(N))
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
-    with pytest.raises(ConfigError, match=r"--calibrate calibrates what .*Give either"):
+    with pytest.raises(ConfigError, match=r"--calibrate determines from the projections what .*Give either"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
     with pytest.raises(ValueError, match="'lean'"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")

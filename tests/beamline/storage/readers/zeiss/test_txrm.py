@@ -155,7 +155,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
     assert not ignored.geometry.shifts.any() and said == []
     with pytest.raises(ConfigError, match="--tilt and --poses both"):
         prepare(path, selection.with_steps(TiltAndLens(1.0)))
-    with pytest.raises(DataError, match=r"copy could not.*Nothing was written"):
+    with pytest.raises(DataError, match=r"copy cannot.*Nothing was written"):
         ingest(path, tmp_path / "copy.h5")
     with open_scan(write_compound(tmp_path / "z.txrm", streams(**{"Alignment__X-Shifts": 0 * back}))) as source:
         assert source.table.shifts is None
