@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-#SBATCH --job-name=splatline
-#SBATCH --cpus-per-task=8
-#SBATCH --mem=32G
-#SBATCH --time=04:00:00
-#SBATCH --signal=B:TERM@120
+# SBATCH --job-name=splatline
+# SBATCH --cpus-per-task=8
+# SBATCH --mem=32G
+# SBATCH --time=04:00:00
+# SBATCH --signal=B:TERM@120
 """Reconstruct many scans on a Slurm cluster: this job runs `beamline batch`, and its workers are jobs of their own.
 
     sbatch docs/install/batch_slurm.py RECIPE DAY SCAN.h5 ...
 
-RECIPE is a recipe of `beamline batch` with a line `memory: SIZE`. Volumes that need more memory are made in slabs, which
-the workers reconstruct. DAY is the folder for the results. Two minutes before the time limit Slurm sends TERM, and the
-batch ends cleanly (exit code 4). Submit the same line again to reconstruct the scans that are left.
+RECIPE is a recipe of `beamline batch` with a line `memory: SIZE`. If a volume needs more memory, the workers make it
+in slabs. DAY is the folder for the results. Two minutes before the time limit Slurm sends TERM, and the batch ends
+cleanly (exit code 4). Submit the same line again to reconstruct the scans that are left.
 
 Needs splatline-cluster and dask-jobqueue. Partition, account and lines for the jobs of the workers are in the
 configuration of dask-jobqueue. The resources of this job are in the lines above.
@@ -82,7 +82,9 @@ def wait_for_worker(jobs: SLURMCluster) -> None:
             return jobs.wait_for_workers(1, timeout=QUEUE_CHECK_S)
         except TimeoutError:
             if not any(job.job_id for job in jobs.workers.values()):
-                sys.exit("Check partition and account in the configuration of dask-jobqueue: sbatch accepted no worker.")
+                sys.exit(
+                    "Check partition and account in the configuration of dask-jobqueue: sbatch accepted no worker."
+                )
 
 
 if __name__ == "__main__":

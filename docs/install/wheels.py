@@ -94,9 +94,8 @@ def closure(
         reached[wheel.name] = wheel
         for extra in {"", *need.extras} - {known for name, known in seen if name == wheel.name}:
             seen.add((wheel.name, extra))
-            queue += [
-                each for each in wheel.needs if each.marker is None or each.marker.evaluate(environment | {"extra": extra})
-            ]  # fmt: skip
+            values = environment | {"extra": extra}
+            queue += [each for each in wheel.needs if each.marker is None or each.marker.evaluate(values)]
     return reached, sorted(set(missing))
 
 
@@ -123,16 +122,21 @@ def fill(folder: Path, python: str, machine: str, glibc: str, extras: Sequence[s
     sources = local_packages(extras)
     pip("wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), *map(str, sources))
     ours = [wheel_of(path) for path in sorted(folder.glob("*.whl"))]
-    wanted = [Requirement(f"{each.name}[{','.join(extras)}]" if each.name == "splatline" else each.name) for each in ours]
+    wanted = [
+        Requirement(f"{each.name}[{','.join(extras)}]" if each.name == "splatline" else each.name) for each in ours
+    ]
     for_target = [word for tag in platforms(machine, glibc) for word in ("--platform", tag)]
     download = [
         "download", "--dest", str(folder), "--find-links", str(folder), "--only-binary", ":all:",
-        "--implementation", "cp", "--python-version", python, *for_target, "--constraint", str(ROOT / "constraints.txt"),
+        "--implementation", "cp", "--python-version", python, *for_target,
+        "--constraint", str(ROOT / "constraints.txt"),
     ]  # fmt: skip
     # torch first, from its own index alone: its build decides whether gigabytes of CUDA follow.
     pip(*download, "--no-deps", "--index-url", torch_index, "torch")
     built = wheel_of(next(folder.glob("torch-*.whl")))
-    if torch_index == PYTORCH + "cpu" and (cuda := [each.name for each in built.needs if each.name.startswith(OF_CUDA)]):
+    if torch_index == PYTORCH + "cpu" and (
+        cuda := [each.name for each in built.needs if each.name.startswith(OF_CUDA)]
+    ):
         sys.exit(
             f"Remove the other places for wheels from pip's configuration: pip found {built.path.name}, which needs "
             f"{len(cuda)} packages of CUDA ({cuda[0]}, ...). Expected the build for processors. If you want CUDA, give "
@@ -161,21 +165,25 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="a new or an empty folder")
     here = ".".join(platform.python_version_tuple()[:2])
-    parser.add_argument("--python", default=here, help="Python of the other computer. Default: of this one, %(default)s.")
+    parser.add_argument(
+        "--python", default=here, help="Python of the other computer. Default: of this one, %(default)s."
+    )
     parser.add_argument("--machine", default=platform.machine(), help="its processor. Default: %(default)s.")
-    parser.add_argument("--glibc", default="2.28", help="its glibc (ldd --version), or an older one. Default: %(default)s.")
+    parser.add_argument(
+        "--glibc", default="2.28", help="its glibc (ldd --version), or an older one. Default: %(default)s."
+    )
     parser.add_argument("--extra", action="append", default=[], help="an extra of docs/releases.md; may be repeated.")
     parser.add_argument(
         "--torch-index", default=PYTORCH + "cpu",
-        help=f"where torch is downloaded from: its build for processors, for CUDA ({PYTORCH}cu130), or your own mirror. "
+        help=f"where torch is downloaded from: its build for processors, for CUDA ({PYTORCH}cu130), or your mirror. "
         "Default: %(default)s.",
     )  # fmt: skip
     given = parser.parse_args(words)
     wheels = fill(given.folder, given.python, given.machine, given.glibc, given.extra, given.torch_index)
     size = sum(each.path.stat().st_size for each in wheels)
     print(
-        f"{len(wheels)} wheels, {size / 1e6:.0f} MB, for Python {given.python} on Linux, {given.machine}. Copy {given.folder}"
-        " to the other computer. There, in a virtual environment:\n"
+        f"{len(wheels)} wheels, {size / 1e6:.0f} MB, for Python {given.python} on Linux, {given.machine}. Copy "
+        f"{given.folder} to the other computer. There, in a virtual environment:\n"
         f"  sha256sum --check --quiet {CHECKSUMS}     (in the folder)\n"
         f"  pip install --no-index --find-links FOLDER --require-hashes -r FOLDER/{REQUIREMENTS}"
     )
