@@ -115,6 +115,7 @@ def test_an_image_has_the_torch_of_the_constraints_and_the_command_as_entry_poin
 
 
 def test_the_files_name_this_version_and_public_addresses_alone() -> None:
+    assert set(re.findall(r"splatline[-/](\d+\.\d+\.\d+)", PAGE)) == {PROJECT["version"]}
     for path in FILES.iterdir():
         if path.is_file():
             text = path.read_text(encoding="utf-8")
