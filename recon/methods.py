@@ -23,9 +23,9 @@ REGISTRY: dict[str, MethodEntry] = {
         lengths=Lengths("steps", (250, 60, 125, 500), (1000, 125, 250, 500, 2000)),
     ),
     "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
-    "fista-tv": MethodEntry("recon.voxels.methods", "FistaTv", lengths=Lengths("iterations", (20, 5), (20, 5, 10, 40))),
+    "fista-tv": MethodEntry("recon.voxels.methods", "FistaTv", lengths=Lengths("iterations", (60, 5), (60, 5, 10, 20))),
     "os-sirt-tv": MethodEntry(
-        "recon.voxels.methods", "OsSirtTv", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
+        "recon.voxels.methods", "OsSirtTv", lengths=Lengths("iterations", (60, 5), (60, 5, 10, 20))
     ),
     "pnp-dct": MethodEntry("recon.voxels.methods", "PnpDct", lengths=Lengths("iterations", (35,), (35, 15, 70))),
     **in_folders("recon.features", "METHODS"),

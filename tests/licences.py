@@ -132,16 +132,16 @@ def page() -> str:
     base = brought(wanted(None))
     parts = [
         "# Licences",
-        "With this page you can see under which licence each package is that comes with splatline.",
-        "splatline itself is BSD-3-Clause. Its wheel holds one file of another project, uPlot 1.6.32 (MIT), together\n"
-        "with its licence. What each package that we ask for is needed for:\n"
-        "[dependencies](decisions/dependencies.md).",
-        "Three libraries have other licences. Wheels of numpy and scipy hold libgfortran, and those of torch hold\n"
-        "libgomp: both are under the GPL, with the exception that lets any program use them. pyusb loads the libusb\n"
-        "of the system (LGPL). A driver for DCAM cameras loads the vendor's library. libusb and the vendor's library\n"
-        "are not part of any wheel of ours.",
-        "`python -m tests.licences` writes this page from the metadata of the packages that are installed, including\n"
-        "the packages that these bring. A test fails if an installed package has no row, or if a package that users\n"
+        "This page lists the licence of each package that is installed together with splatline.",
+        "splatline itself is under BSD-3-Clause. Its wheel contains one file of another project, uPlot 1.6.32 (MIT),\n"
+        "together with its licence. [Dependencies](decisions/dependencies.md) says what splatline needs each\n"
+        "package for.",
+        "Some libraries have other licences than these packages. The wheels of numpy and scipy contain libgfortran,\n"
+        "and those of torch contain libgomp. Both libraries are under the GPL, with an exception that allows any\n"
+        "program to use them. pyusb loads libusb from the system (LGPL). The driver for DCAM cameras loads the\n"
+        "library of the vendor. The wheels of splatline contain neither libusb nor the library of the vendor.",
+        "`python -m tests.licences` writes this page from the metadata of the installed packages, including the\n"
+        "packages that they require. A test fails if an installed package has no row, or if a package that users\n"
         "install is under the GPL. Packages for tests and docs are not listed, because no user needs them.",
         "## Every installation",
         _table(dict.fromkeys(base, ""), base),

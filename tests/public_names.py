@@ -188,18 +188,21 @@ def page() -> str:
     """The page as Markdown."""
     parts = [
         "# Public names",
-        "With this page you can see which Python names you may rely on. The names below, and the parameters that must\n"
-        "be given, stay the same within a major version ([releases](releases.md#what-a-version-promises)). The\n"
-        "parameters that must be given are in brackets; those after a star are given by name. A later version may add\n"
-        "parameters with a default. Any other name may change with any version.",
+        "With this page you can see which Python names you may rely on. The names below and their required parameters\n"
+        "stay the same within a major version ([releases](releases.md#what-a-version-promises)). The required\n"
+        "parameters are in brackets after the name; pass those after a star by keyword. A later version may add\n"
+        "optional parameters. Any name that is not on this page may change with any version.\n\n"
+        "Each entry is a function, a class or a value. The names after the colon are the public fields and methods of\n"
+        "the class; for a reconstruction method, they are its settings.",
         "`python -m tests.public_names` writes this page, and a test compares it with the modules.",
         "## For scripts and notebooks",
         *map(_section, FOR_SCRIPTS),
         "## For plans of bluesky",
         *map(_section, FOR_BLUESKY),
         "## For packages that add devices, formats and methods",
-        "A package registers what it adds under the entry points `splatline.method`, `correction`, `reader`,\n"
-        "`volume_format`, `stage`, `wire`, `camera`, `check` and `effect` ([contributing](contributing.md)).",
+        "A package registers what it adds under entry points: `splatline.method`, `splatline.correction`, and in the\n"
+        "same way `reader`, `volume_format`, `stage`, `wire`, `camera`, `check` and `effect`\n"
+        "([contributing](contributing.md)).",
         *map(_section, FOR_PACKAGES),
     ]
     return "\n\n".join(parts) + "\n"

@@ -139,6 +139,13 @@ def test_monitor(monkeypatch: Patch, capsys: pytest.CaptureFixture[str]) -> None
     measured(roc.test_recall_and_latency, "beam lost, 2 % left", capsys)
 
 
+def test_queue_plan(monkeypatch: Patch, tmp_path: Path) -> None:
+    bench = script("test_queue_plan")
+    small(monkeypatch, bench, SCANS=4, ROUNDS=1)
+    for kind in ("good", "wrong"):
+        measured(bench.test_a_hundred_scans_are_planned_within_a_second, kind, tmp_path)
+
+
 def test_published(monkeypatch: Patch, tmp_path: Path) -> None:
     one, tables = script("test_published"), script("test_published_tables")
     for each in (one, tables):

@@ -109,6 +109,16 @@ SCRIPTS = {
         "docs/python.md", ("from beamline import api",), CONFIGURED,
         "assert (result.frames, result.sample, result.status) == (99, 'cathode-3', 'complete'), result",
     ),
+    "plan": Script(
+        "docs/python.md", ('plan = api.plan(["a.yaml", "tonight.csv", {"config": "b.yaml", "scan.exposure_s": 0.1}])',),
+        CONFIGURED + "from beamline import api\n"
+        "text = Path('my.yaml').read_text()\n"
+        "Path('a.yaml').write_text(text)\n"
+        "Path('b.yaml').write_text(text.replace('mode: fly', 'mode: flyy'))\n"
+        "Path('tonight.csv').write_text('config,sample.name\\na.yaml,one\\n')\n",
+        "assert [scan.valid for scan in plan.scans] == [True, True, False] and 'did you mean fly?' in str(fault)\n"
+        "assert fault.file == 'b.yaml' and plan.needs.duration > 0",
+    ),
     "bluesky": Script(
         "docs/python.md", ("from bluesky import RunEngine, plan_stubs", "from bluesky import plan_stubs, plans"),
         CONFIGURED, "assert len(list(Path('runs').iterdir())) >= 2", "ophyd_async",
@@ -146,7 +156,7 @@ NOT_RUN = {
     ("docs/first_day.md", "beamline scan my.yaml --rehearse --set scan.angles.views=60 --set scan.period_s=0.5"):
     "minutes of frames of the whole detector",
     ("docs/first_day.md", "beamline tune my.yaml                         # counts, saturation, transmission, and the "
-     "exposure to use"): "an instrument",
+     "recommended exposure time"): "an instrument",
     ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, size, free disk; "
      "nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline recon runs/NAME/scan.h5 -m fbp --bin 4 -o quick.h5   # is the axis right, is the "

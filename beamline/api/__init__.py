@@ -17,10 +17,12 @@ from drivers.base.errors import DeviceError
 from recon.base.registry import loaded
 
 if TYPE_CHECKING:
-    from beamline.api.instrument import Instrument, ScanResult, connect, scan
+    from beamline.api.instrument import Instrument, ScanResult, connect, plan, scan
     from beamline.api.reconstruction import ReconResult, monitor, reconstruct, stream, volumes
+    from beamline.plan.needs import ScanNeeds
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
+    from beamline.scan.queue_plan import PlannedScan, QueuePlan, ScanFault
 
 __all__ = [
     "BeamlineError",
@@ -29,9 +31,13 @@ __all__ = [
     "DeviceError",
     "Event",
     "Instrument",
+    "PlannedScan",
+    "QueuePlan",
     "ReconResult",
     "ReferencesError",
     "ScanAborted",
+    "ScanFault",
+    "ScanNeeds",
     "ScanResult",
     "ScanStopped",
     "ScanVerdict",
@@ -39,6 +45,7 @@ __all__ = [
     "StopRequest",
     "connect",
     "monitor",
+    "plan",
     "reconstruct",
     "scan",
     "stream",
@@ -47,9 +54,11 @@ __all__ = [
 ]
 
 _LAZY = {
-    **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan"), "beamline.api.instrument"),
+    **dict.fromkeys(("Instrument", "ScanResult", "connect", "plan", "scan"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reconstruction"),
     **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
+    **dict.fromkeys(("PlannedScan", "QueuePlan", "ScanFault"), "beamline.scan.queue_plan"),
+    "ScanNeeds": "beamline.plan.needs",
     "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }

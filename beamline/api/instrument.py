@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -18,8 +18,11 @@ from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals, to_stderr
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
+from beamline.scan.queue_plan import PlannedScan, QueuePlan
+from beamline.scan.queue_planning import plan_queue
 from beamline.scan.run import run_scan
 from drivers.in_beam import Ask
+from recon.base.registry import loaded
 
 Say = Callable[[str], None]
 
@@ -185,6 +188,47 @@ def scan(
     """
     with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)
+
+
+def plan(
+    scans: Sequence[str | Path | Mapping[str, object] | Generator[Any, Any, Any]], *,
+    set: Mapping[str, object] | None = None, output: str | Path | None = None, rehearse: bool = False,
+    live: bool = True,
+) -> QueuePlan:  # fmt: skip
+    """Plan several scans, as `beamline scan A B --dry-run` does: which can run, how long they take, what they need.
+
+    No device is used. A scan that cannot run does not end the planning of the others. A hundred scans take less than a
+    second, beside the import.
+
+    Args:
+        scans: each a configuration file; a table of scans (.csv); a row of such a table as a mapping, such as
+            {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}; or a plan of bluesky, such as
+            `fly(scan)`, which is followed without running it and cannot be run afterwards.
+        set: values that replace those of all configurations, such as {"scan.angles.views": 90}.
+        output: folder in which the folders of the runs would be created; None: `storage.folder`.
+        rehearse: plan a real configuration with simulated devices.
+        live: False: without live reconstructions, even if `recon.live` is on.
+
+    Returns:
+        `scans` in their order, each with `valid`, `faults` (each with message, file and line) and `needs`: `duration`
+        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what is asked of the `operator`. The plan's own
+        `needs` are the sums of those that can run.
+
+    Raises:
+        ConfigError: an argument of the wrong type. What is wrong with a scan is in its `faults`.
+    """
+    refuse_wrong_arguments(plan, locals())
+    described = list[Path | Mapping[str, object] | PlannedScan]()
+    for each in scans:
+        if isinstance(each, Generator):
+            described += loaded("beamline.bluesky.estimate").scans_of(each)
+        else:
+            described.append(Path(each) if isinstance(each, str) else each)
+    return plan_queue(
+        described, [override_of(key, value) for key, value in (set or {}).items()],
+        place=None if output is None else Path(output), rehearse=rehearse,
+        no_live=None if live else lambda sentence: None,
+    )  # fmt: skip
 
 
 def _of_devices(config: Config) -> Mapping[str, Any]:

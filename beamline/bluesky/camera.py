@@ -250,7 +250,7 @@ class CameraDetector(StandardDetector):
     def __init__(
         self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
     ) -> None:
-        frames = _Frames(config, instrument, runs)
+        frames, self.config, self.runs = _Frames(config, instrument, runs), config, runs or Path(config.storage.folder)
         self._frames, self.kind, self._triggered = frames, frames.kind, None
         self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
         self.add_config_signals(self.kind)

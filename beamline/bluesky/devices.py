@@ -49,7 +49,7 @@ class TomoScan(Device):
         self, config: Config, runs: Path | None = None, name: str = "tomo", instrument: ConnectedDevices | None = None
     ) -> None:
         super().__init__(name)
-        self._config, self._runs, self._instrument = config, runs, instrument
+        self.config, self.runs, self._instrument = config, runs, instrument
         self._stream, self._stop = ScanStream(config, name), StopRequest()
         self._folder: Path | None = None
         self._planned = 0
@@ -103,7 +103,7 @@ class TomoScan(Device):
         """Start the scan. Raises the errors that occur before its file exists; nothing has moved then."""
         self._refuse_second()
         self._stop, self._folder = StopRequest(), None
-        self._stream = await asyncio.to_thread(ScanStream, self._config, self.name)  # which reads files of angles
+        self._stream = await asyncio.to_thread(ScanStream, self.config, self.name)  # which reads files of angles
         self._task = task = asyncio.create_task(asyncio.to_thread(self._scan))
         while self._folder is None and not task.done():
             await asyncio.sleep(POLL)
@@ -142,7 +142,7 @@ class TomoScan(Device):
         return {f"{self.name}-config": {"source": "splatline", "dtype": "string", "shape": []}}
 
     async def read_configuration(self) -> dict[str, Any]:
-        return {f"{self.name}-config": {"value": resolved_yaml(self._config), "timestamp": time.time()}}
+        return {f"{self.name}-config": {"value": resolved_yaml(self.config), "timestamp": time.time()}}
 
     def _refuse_second(self) -> None:
         if self._task is not None and not self._task.done():
@@ -150,7 +150,7 @@ class TomoScan(Device):
 
     def _scan(self) -> RunResult:
         sinks: list[Sink] = [self._stream, self._begun]
-        return run_scan(self._config, self._runs, sinks, self._stop, instrument=self._instrument)
+        return run_scan(self.config, self.runs, sinks, self._stop, instrument=self._instrument)
 
     def _begun(self, event: Event) -> None:
         if isinstance(event, RunStarted):
@@ -162,7 +162,8 @@ class Rotation(Device):
 
     def __init__(self, stage: RotationStage, name: str = "rotation") -> None:
         super().__init__(name)
-        self._stage, self._setpoint = stage, math.degrees(stage.position())
+        self.limits, self.radians = stage.limits, stage.position()
+        self._stage, self._setpoint = stage, math.degrees(self.radians)
         self._one_move, self._ended = threading.Lock(), threading.Event()
 
     @AsyncStatus.wrap

@@ -19,6 +19,7 @@ from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
+from beamline.core.files import TABLE
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from beamline.scan.resume import ResumableRun
     from drivers.in_beam import Ask
 
-TABLE = ".csv"  # suffix of a table of scans
-
 
 @dataclass(frozen=True, eq=False)
 class ScanRequest:
@@ -42,7 +41,10 @@ class ScanRequest:
         click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
     )
     dry: bool = set_by(
-        "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space, and stop. No device is used."
+        "--dry-run",
+        is_flag=True,
+        help="Print the timeline, limits and free disk space, and stop. No device is used. "
+        "With several scans: print which of them can run, all faults, and what they need.",
     )
     overrides: tuple[str, ...] = set_by(set_option)
     rehearse: bool = set_by(

@@ -236,6 +236,12 @@ class DeviceSection(Section):
             taken[port] = f"devices.{name}"
         return self
 
+    @property
+    def by_hand(self) -> frozenset[str]:
+        """Names of the devices that the operator moves when the scan asks."""
+        names = ("shutter", "sample_mover", "filter", "monochromator")
+        return frozenset(name for name in names if getattr(self, name).kind == "manual")
+
     def simulated_or_not(self) -> dict[str, bool]:
         """Each device that can be simulated, and whether it is."""
         stage, shutter = self.stage.simulated, self.shutter.kind

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +31,7 @@ from beamline.config.models import (
 )
 from beamline.config.rehearsal import rehearsal
 from beamline.config.section import Section
-from beamline.config.tree import Tree, explain, override, read
+from beamline.config.tree import Override, Tree, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.installed import config_folder as config_folder
@@ -50,9 +51,20 @@ NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has no
 """For the operator of such a run, where it would decide otherwise."""
 
 
+@dataclass(frozen=True, eq=False)
+class ReadConfig:
+    """A configuration whose values are legal, one by one; the place of each; and what is wrong with them together:
+    place and sentence.
+    """
+
+    config: Config
+    tree: Tree
+    faults: Sequence[tuple[str, str]]
+
+
 def load(
     path: str | Path,
-    overrides: Iterable[str] = (),
+    overrides: Iterable[Override] = (),
     environment: Mapping[str, str] | None = None,
     *,
     rehearse: bool = False,
@@ -72,6 +84,24 @@ def load(
     Raises:
         ConfigError: every fault with file, line, key, what was found and what is allowed. Nothing has been started.
     """
+    found = read_config(path, overrides, environment, rehearse=rehearse, no_live=no_live)
+    _refuse(str(path), found.faults)
+    return found.config
+
+
+def read_config(
+    path: str | Path,
+    overrides: Iterable[Override] = (),
+    environment: Mapping[str, str] | None = None,
+    *,
+    rehearse: bool = False,
+    no_live: Callable[[str], None] | None = None,
+) -> ReadConfig:
+    """Read a configuration as `load` does, which raises its faults, too.
+
+    Raises:
+        ConfigError: every value that is not legal, with its place.
+    """
     path = Path(path)
     tree = _read_file(path, "beamline config init")
     _locate(tree.data, path.parent)
@@ -81,8 +111,10 @@ def load(
         if isinstance(scan, dict) and scan.get("decide") in ("ask", "do"):
             no_live(f"{path}: {NO_DECISIONS.format(scan['decide'])}")
         tree = override(tree, NO_LIVE, {}, takes_text)
-    config = _validated(tree, str(path))
-    return _validated(Tree(rehearsal(config), tree.origins), str(path)) if rehearse else config
+    found = _checked(tree, str(path))
+    if not rehearse or found.faults:
+        return found
+    return _checked(Tree(rehearsal(found.config), tree.origins), str(path))
 
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
@@ -164,22 +196,28 @@ def override_of(key: str, value: object) -> str:
 
 
 def _validated(tree: Tree, name: str) -> Config:
+    found = _checked(tree, name)
+    _refuse(name, found.faults)
+    return found.config
+
+
+def _checked(tree: Tree, name: str) -> ReadConfig:
     _locate(tree.data, Path())
     try:
         config = Config.model_validate(tree.data)
     except ValidationError as error:
         _refuse(name, explain(error, tree, schema()))
         raise
-    _refuse(name, [f"{tree.origin(at)}: {what}" for at, what in faults(config, config_folder())])
-    return config
+    return ReadConfig(config, tree, [(tree.origin(at), what) for at, what in faults(config, config_folder())])
 
 
-def _refuse(path: str, found: Sequence[str]) -> None:
-    if len(found) == 1:
-        raise ConfigError(f"{found[0]}{'' if found[0].endswith('?') else '.'} Nothing was started.") from None
-    if found:
-        lines = "".join(f"\n  {fault}" for fault in found)
-        raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
+def _refuse(path: str, found: Sequence[tuple[str, str]]) -> None:
+    lines = [f"{place}: {fault}" for place, fault in found]
+    if len(lines) == 1:
+        raise ConfigError(f"{lines[0]}{'' if lines[0].endswith('?') else '.'} Nothing was started.", found) from None
+    if lines:
+        whole = "".join(f"\n  {line}" for line in lines)
+        raise ConfigError(f"{path} has {len(lines)} faults, nothing was started:{whole}", found) from None
 
 
 def resolved_yaml(config: Section) -> str:
@@ -204,7 +242,7 @@ def plan_of(config: Config) -> ScanPlan:
     try:
         theta = _angles(scan.angles)
     except (ValueError, OSError) as error:
-        where = scan.angles.path if isinstance(scan.angles, FileAngles) else "scan.angles"
+        where = f"scan.angles.path: {scan.angles.path}" if isinstance(scan.angles, FileAngles) else "scan.angles"
         raise ConfigError(f"{where}: {error}. Nothing was started.") from None
     return ScanPlan(
         angles=np.repeat(theta, scan.frames_per_view),

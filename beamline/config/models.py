@@ -200,6 +200,13 @@ class OpticsSection(Section):
     axis_col: Column | None = setting(
         None, "Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."
     )
+    dose_rate_gy_s: float | None = setting(
+        None,
+        "Dose in Gy that the sample absorbs per second in the open beam. The plan of a scan then states its dose. "
+        "null: not known.",
+        gt=0,
+        le=1e12,
+    )
     light_path: LightPath | None = setting(
         None, "Efficiency from X-ray photons to photoelectrons, for `beamline tune`; null: not known."
     )

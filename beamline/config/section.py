@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -13,6 +14,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import BaseModel, ConfigDict, create_model, model_validator
 
 from recon.base.setting import Setting, settings_of
+
+_types: Callable[..., Mapping[str, Any]] = cache(get_type_hints)
 
 
 def port_problem(port: str) -> str:
@@ -52,13 +55,13 @@ class Section(BaseModel):
 
 def declared(settings: type[Any]) -> dict[str, Any]:
     """Type and default of the key of each field of a driver's settings, for `section_of`."""
-    types = get_type_hints(settings)
+    types = _types(settings)
     return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
     """The driver's settings from a section with the same keys."""
-    types, told = get_type_hints(settings), settings_of(settings).items()
+    types, told = _types(settings), settings_of(settings).items()
     return settings(**{name: _inside(made, types[name], getattr(section, made.key_of(name))) for name, made in told})
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -54,6 +55,14 @@ _Loader.yaml_implicit_resolvers = {
 }
 
 
+class _FastLoader(getattr(yaml, "CSafeLoader", _Loader)):  # type: ignore[misc]
+    """The same by libyaml, twenty times as fast. It also takes what `_Loader` does not (tabs), and says less of faults:
+    text with either is for `_Loader`.
+    """
+
+    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+
 @dataclass(frozen=True)
 class Tree:
     """Plain values, and for each key path its origin ("my.yaml:12", "--set scan.period_s=0.2", ...)."""
@@ -74,6 +83,12 @@ def read(text: str, name: str) -> Tree:
     Raises:
         ConfigError: bad syntax, a key given twice, or a top level that is not a group of keys; with file and line.
     """
+    known = _read(text, name)
+    return Tree(deepcopy(known.data), known.origins)
+
+
+@lru_cache(maxsize=4)  # the rows of a table name the same configuration, and configurations the same scene
+def _read(text: str, name: str) -> Tree:
     data, origins = _parsed(text, name)
     if data is None:
         raise ConfigError(
@@ -98,8 +113,11 @@ def _present_name(path: KeyPath) -> KeyPath:
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
-    with yaml_faults(text, name):
-        node = yaml.compose(text, _Loader)
+    with yaml_faults(text, name) as loader:
+        try:
+            node = yaml.compose(text, loader)
+        except yaml.YAMLError:
+            node = yaml.compose(text, _Loader)
         if node is None:
             return None, origins
         _locate(node, (), name, origins)
@@ -107,25 +125,37 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 
 
 @contextmanager
-def yaml_faults(text: str, name: str) -> Iterator[None]:
-    """A context for reading YAML: raises ConfigError for its faults, and in advance for text that would take longer
-    than a second.
+def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
+    """A context for reading YAML, with the loader to read it by: raises ConfigError for its faults, and in advance for
+    text that would take longer than a second.
     """
-    depth = 0
     if len(text) > _LONGEST or _BRACKETS.search(text):
         raise ConfigError(f"{name}: {_TOO_MUCH}")
     try:
-        for n, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if n > _MOST or depth > _DEEPEST:
-                raise ConfigError(f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}: {_TOO_MUCH}")
-        yield
+        yield _fitting_loader(text, name)
     except RecursionError:
         raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         line, what = _line_and_fault(error, text)
-        place = f"{name}:{line}" if line and "\n" in text else name
-        raise ConfigError(f"{place}: this is not YAML ({what}). Nothing was started.") from None
+        place, fault = f"{name}:{line}" if line and "\n" in text else name, f"this is not YAML ({what})"
+        raise ConfigError(f"{place}: {fault}. Nothing was started.", [(place, fault)]) from None
+
+
+def _fitting_loader(text: str, name: str) -> type[Any]:
+    """The fast loader if the text has no fault. Raises what `yaml_faults` tells."""
+    if "\t" not in text:
+        with suppress(yaml.YAMLError, *YAML_FAULTS):
+            return _refuse_too_much(text, name, _FastLoader)
+    return _refuse_too_much(text, name, _Loader)
+
+
+def _refuse_too_much(text: str, name: str, loader: type[Any]) -> type[Any]:
+    depth = 0
+    for n, event in enumerate(yaml.parse(text, loader)):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if n > _MOST or depth > _DEEPEST:
+            raise ConfigError(f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}: {_TOO_MUCH}")
+    return loader
 
 
 def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
@@ -187,16 +217,19 @@ def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, st
         at, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
         if at in origins:
             full, before = ".".join(map(str, at)), origins[at].rpartition(":")[2]
-            raise ConfigError(
-                f"{name}:{line}: {full} appears twice (also in line {before}); keep one. Nothing was started."
-            )
+            fault = f"{full} appears twice (also in line {before}); keep one"
+            raise ConfigError(f"{name}:{line}: {fault}. Nothing was started.", [(f"{name}:{line}", fault)])
         origins[at] = f"{name}:{line}"
         _locate(child, at, name, origins)
 
 
+Override = str | tuple[str, str]
+"""`section.key=value`, and where it was given if that was not by --set."""
+
+
 def override(
     tree: Tree,
-    overrides: Iterable[str],
+    overrides: Iterable[Override],
     environment: Mapping[str, str],
     is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
 ) -> Tree:
@@ -215,11 +248,12 @@ def override(
     for name, value in sorted(environment.items()):
         if name.startswith(ENVIRONMENT_PREFIX) and "__" in name:
             changes.append((name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value, name))
-    for word in overrides:
+    for given in overrides:
+        word, place = (given, f"--set {given}") if isinstance(given, str) else given
         key, equals, value = word.partition("=")
         if not equals or not key.strip():
-            raise ConfigError(f"--set {word}: expected section.key=value, such as --set scan.period_s=0.2")
-        changes.append((key.strip().split("."), value, f"--set {word}"))
+            raise ConfigError(f"{place}: expected section.key=value, such as --set scan.period_s=0.2")
+        changes.append((key.strip().split("."), value, place))
     data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
         keys = [*map(str, _present_name(tuple(keys[:2]))), *keys[2:]]
@@ -248,11 +282,11 @@ REMOVED = {
 _ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"
 
 
-def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
-    """One line for each fault, with its place, in the order of the model's keys; one fault per key.
+def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[tuple[str, str]]:
+    """Place and message of each fault, in the order of the model's keys; one fault per key.
 
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
     found = faults_of(error.errors(include_url=False), tree.data, schema, former=REMOVED, advice=_ADVICE)
-    return [f"{tree.origin(fault.key)}: {fault.sentence}" for fault in found]
+    return [(tree.origin(fault.key), fault.sentence) for fault in found]

@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,18 @@ class BeamlineError(Exception):
 
 
 class ConfigError(BeamlineError):
-    """Wrong usage or configuration; nothing was started."""
+    """Wrong usage or configuration; nothing was started.
+
+    Args:
+        faults: what is wrong, one by one: the place of the value (`my.yaml:12`), and a sentence without its full stop.
+            Empty if the message says it all.
+    """
 
     exit_code = 2
+
+    def __init__(self, message: str = "", faults: Sequence[tuple[str, str]] = ()) -> None:
+        super().__init__(message)
+        self.faults = tuple(faults)
 
 
 class InstrumentError(BeamlineError):

@@ -306,8 +306,10 @@ class Done(Listed, event="done"):
 
 
 class Failed(Event, event="failed"):
-    """A command has failed. folder: folder of the run."""
+    """A command has failed. folder: folder of the run; more: further values by name, such as the plan of a queue of
+    which a scan cannot run."""
 
     message: str
     exit_code: int | None = None
     folder: Path | None = None
+    more: Any = spread(default_factory=dict)

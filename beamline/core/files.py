@@ -27,6 +27,7 @@ RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
 JOINED = "joined.h5"  # The file of all parts of a run, beside the first one
 CONFIG = "config.resolved.yaml"
+TABLE = ".csv"  # Suffix of a table of scans
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 RECORD = "state.json"  # The state of a run, or of a later part of it, in its folder
 USER_LOG, RECON_LOG = "user.log", "recon.log"

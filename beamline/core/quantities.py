@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from types import MappingProxyType
 
 
@@ -96,6 +97,7 @@ from carbon's edge to tubes of 600 kV, the longest hutches, the longest exposure
 a second, hundreds of turns, and motors and encoders of up to 27 bits."""
 
 
+@cache
 def range_of(name: str) -> PlausibleRange | None:
     """The range of a setting by its name, such as `scan.exposure_s`; None if it has no unit that is known."""
     words = name.rpartition(".")[2].split("_")

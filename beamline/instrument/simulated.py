@@ -6,11 +6,13 @@ It is imported where it is needed, so that an instrument loads no simulator.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from beamline.config.beam import (
@@ -179,12 +181,28 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
             )
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:
-        scene = load_scene(mapping, volumes_beside(folder))
+        phantom = mapping.get("phantom")
+        of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # which may change
+        scene = (_scene.__wrapped__ if of_files else _scene)(_StatedScene(repr(mapping), mapping), folder)
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
         _refuse_unrecordable(config, scene)
     return scene
+
+
+@dataclass(frozen=True)
+class _StatedScene:
+    """The plain values of a scene; those with the same text are the same."""
+
+    text: str
+    mapping: Mapping[str, Any] = field(compare=False)
+
+
+@lru_cache(maxsize=2)
+def _scene(stated: _StatedScene, folder: Path) -> Scene:
+    """The scene, built once for the many scans of a queue that state it."""
+    return load_scene(stated.mapping, volumes_beside(folder))
 
 
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:

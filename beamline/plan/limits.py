@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -62,7 +63,7 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     """
     if angles.size < 2:
         raise ValueError(
-            f"a fly scan needs at least 2 projections, but the plan has {angles.size}. Use scan.mode: step"
+            f"a fly scan needs at least 2 projections, but scan.angles has {angles.size}. Use scan.mode: step"
         )
     scale = Scale.of(to_counts)
     index, step = _lattice(angles, abs(scale.per_count))
@@ -72,8 +73,8 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
         raise ValueError(
             f"views {math.degrees(step):.3g}° apart are {exact:.3g} counts of the stage "
             f"({math.degrees(abs(scale.per_count)):.3g}° each), which gives pulses at whole ones: they would span "
-            f"{whole / exact:.3g} times the angles of the plan. Take fewer views, a wider span (its unit is degrees), "
-            "or a stage with finer counts"
+            f"{whole / exact:.3g} times the angles of the plan. Take fewer views or a wider span in scan.angles (in "
+            "degrees), or a stage with finer counts"
         )
     direction = 1 if scale.per_count > 0 else -1
     first = to_counts(float(angles[0])) - direction * whole * int(index[0])
@@ -107,19 +108,14 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
 
 def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
     """The longest runs of equal differences, one after another; a single count is a run of one."""
-    runs: list[TriggerTrain] = []
-    at = 0
-    while at < counts.size:
-        if at + 1 == counts.size:
-            runs.append(TriggerTrain(int(counts[at]), 0, 1))
-            break
-        interval = int(counts[at + 1] - counts[at])
-        end = at + 1
-        while end + 1 < counts.size and counts[end + 1] - counts[end] == interval:
-            end += 1
-        runs.append(TriggerTrain(int(counts[at]), interval, end - at + 1))
+    steps = np.diff(counts)
+    ends = [*(1 + np.flatnonzero(np.diff(steps))).tolist(), steps.size]  # last count of each stretch of equal steps
+    runs, at = list[TriggerTrain](), 0
+    while at < counts.size - 1:
+        end = ends[bisect(ends, at)]
+        runs.append(TriggerTrain(int(counts[at]), int(steps[at]), end - at + 1))
         at = end + 1
-    return runs
+    return [*runs, TriggerTrain(int(counts[at]), 0, 1)] if at < counts.size else runs
 
 
 MOST_PASSES = 100
@@ -233,13 +229,13 @@ def _timing(facts: PlanFacts) -> Iterator[str]:
     plan, camera, period = facts.plan, facts.camera, facts.views.period
     if plan.exposure > period:
         yield (
-            f"exposure_s {plan.exposure:g} is longer than period_s {period:.4g}; "
+            f"scan.exposure_s {plan.exposure:g} is longer than scan.period_s {period:.4g}; "
             "shorten the exposure or lengthen the period"
         )
     if period < camera.min_period:
         rows, cols = camera.shape
         yield (
-            f"period_s {period:.4g} is below the camera's minimum of {camera.min_period:.6g} s between triggers "
+            f"scan.period_s {period:.4g} is below the camera's minimum of {camera.min_period:.6g} s between triggers "
             f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
             f"{rounded(camera.min_period * MARGIN, up=True):g}, expose shorter or read fewer pixels"
         )
@@ -299,7 +295,7 @@ def _ways_within(facts: PlanFacts) -> Iterator[str]:
     step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the taxi
     if views.taxi and room > 2 * step:
         yield f"set scan.period_s >= {rounded(step / math.sqrt(2 * stage.acceleration * (room - 2 * step)), up=True):g}"
-    yield "narrow the angles"
+    yield "narrow scan.angles"
 
 
 def _rounding(facts: PlanFacts) -> Iterator[str]:

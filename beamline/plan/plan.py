@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import accumulate
 
@@ -158,6 +158,8 @@ class Timeline:
         remarks: facts for the operator that break no limit.
         plan: that it is computed from.
         retake_seconds: for the most views that may be taken again.
+        parts: s of `duration` by what they are spent on: a kind of frames (with the moves before and between them),
+            warm_up of the scintillator, return of the stage.
     """
 
     blocks: tuple[Block, ...]
@@ -172,6 +174,7 @@ class Timeline:
     remarks: tuple[str, ...]
     plan: ScanPlan
     retake_seconds: float = 0.0
+    parts: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
@@ -183,9 +186,25 @@ class Timeline:
         return [0, *accumulate(block.n_to_take for block in self.blocks[:-1])]
 
     @property
+    def in_beam(self) -> float:
+        """s for which the sample is in the beam: from the first move for projections to the last of their frames."""
+        kinds = [block.kind for block in self.blocks if block.n_to_take and block.kind is not FrameKind.DARK]
+        warm = "warm_up" if kinds[:1] == [FrameKind.PROJECTION] else ""
+        return sum(self.parts.get(part, 0.0) for part in ("projection", "offset_view", warm))
+
+    @property
     def views(self) -> Block:
         """The block of projections, which every timeline has."""
         return next(block for block in self.blocks if block.kind is FrameKind.PROJECTION)
+
+
+def summed(*parts: tuple[str, float]) -> dict[str, float]:
+    """Seconds by part: equal parts are added up, and parts of 0 s are left out."""
+    sums = dict[str, float]()
+    for part, seconds in parts:
+        if seconds:
+            sums[part] = sums.get(part, 0.0) + seconds
+    return sums
 
 
 GOLDEN = (math.sqrt(5) - 1) / 2

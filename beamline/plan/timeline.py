@@ -9,7 +9,7 @@ full speed between them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
@@ -30,6 +30,7 @@ from beamline.plan.plan import (
     offset_block,
     retake_block,
     spread_retakes,
+    summed,
 )
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
@@ -65,7 +66,7 @@ def work_out(
     views = next(block for block in blocks if block.kind is FrameKind.PROJECTION)
     speed = views.speed * _half_width(camera, axis_col)
     frame_bytes = math.prod(camera.shape) * BYTES_PER_PIXEL
-    row_bytes = frame_bytes + math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
+    bytes_per_row = row_bytes(camera.shape, preview_bin)
     facts = PlanFacts(
         plan=plan,
         views=views,
@@ -76,14 +77,15 @@ def work_out(
         reach=_reach(views),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
-        total_bytes=row_bytes * sum(block.n_to_take for block in blocks),
-        retake_bytes=row_bytes * plan.retakes,
+        total_bytes=bytes_per_row * sum(block.n_to_take for block in blocks),
+        retake_bytes=bytes_per_row * plan.retakes,
         retake_seconds=_retake_seconds(plan, views, stage, camera),
         free_bytes=free_bytes,
     )
+    parts = _parts(plan, blocks, stage, camera)
     return Timeline(
         blocks=blocks,
-        duration=_duration(plan, blocks, stage, camera),
+        duration=sum(parts.values()),
         frame_bytes=frame_bytes,
         total_bytes=facts.total_bytes,
         step_counts=flight.interval if flight else 0,
@@ -94,7 +96,13 @@ def work_out(
         remarks=tuple(remarks(facts)),
         plan=plan,
         retake_seconds=facts.retake_seconds,
+        parts=parts,
     )
+
+
+def row_bytes(shape: tuple[int, int], preview_bin: int) -> int:
+    """Bytes of a frame of this shape in the file, with its preview."""
+    return math.prod(shape) * BYTES_PER_PIXEL + math.prod(preview_shape(shape, preview_bin)) * BYTES_PER_BLOCK
 
 
 def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight | None, list[str]]:
@@ -107,11 +115,15 @@ def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight |
         return None, [str(error)]
 
 
-def _duration(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: CameraTiming) -> float:
-    """Seconds of all blocks, of the way back to zero, and of the shutter's openings."""
+def _parts(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: CameraTiming) -> Mapping[str, float]:
+    """Seconds of the blocks by kind, of the way back to zero, and of the shutter's openings; without parts of 0 s."""
     *starts, end = _stands(blocks)
-    seconds = sum(block_seconds(b, stage, camera, plan.settle, at) for b, at in zip(blocks, starts, strict=True))
-    return seconds + move_seconds(end, stage.max_speed, stage.acceleration) + plan.warm_up * _openings(blocks)
+    placed = zip(blocks, starts, strict=True)
+    return summed(
+        *((block.kind.name.lower(), block_seconds(block, stage, camera, plan.settle, at)) for block, at in placed),
+        ("return", move_seconds(end, stage.max_speed, stage.acceleration)),
+        ("warm_up", plan.warm_up * _openings(blocks)),
+    )
 
 
 def _openings(blocks: Iterable[Block]) -> int:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from beamline.core.events import json_of
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
 from beamline.core.quantities import doubt, doubt_span
-from beamline.core.text import size
+from beamline.core.text import count, size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import ScanContext
@@ -27,12 +28,14 @@ from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
+from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import hms_text, work_out
 from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
+from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from drivers.orca_quest import PITCH_MM
 from recon.methods import streams
@@ -58,6 +61,10 @@ class DryRun:
     """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
     Of a series of energies it is the first scan; `energies` has what each needs.
+
+    Attributes:
+        disk: an existing folder on the disk of the file.
+        needs: of all scans.
     """
 
     plan: ScanPlan
@@ -65,30 +72,30 @@ class DryRun:
     stage: StageLimits
     camera: CameraTiming
     free_bytes: int
+    needs: ScanNeeds
+    disk: Path
     energies: tuple[EnergyNeeds, ...] = ()
-
-    @property
-    def total_bytes(self) -> int:
-        """Bytes of the files of all scans."""
-        return sum(need.total_bytes for need in self.energies) if self.energies else self.timeline.total_bytes
 
     def lines(self) -> list[str]:
         """Lines of text, without violations: `refuse_violations` states them."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
-        if each := self.energies:
-            seconds = sum(need.duration for need in each)
+        each, needs = self.energies, self.needs
+        if each:
             sentence = (
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one scan like this at each energy: "
-                f"{hms_text(seconds)} and {size(self.total_bytes)} in total (without the moves of the "
+                f"{hms_text(needs.duration)} and {size(needs.total_bytes)} in total (without the moves of the "
                 "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
-        return lines
+        if needs.dose_gy is not None:
+            lines.append(f"{'dose':<10}{needs.dose_gy:.4g} Gy")
+        return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
 
     def data(self) -> Mapping[str, Any]:
         """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
         worked, views = self.timeline, self.timeline.views
         return {
+            **self.needs.data(),
             "remarks": worked.remarks,
             "duration": worked.duration,
             "n_frames": worked.n_frames,
@@ -152,6 +159,7 @@ def dry_run(
     runs: Path | None = None,
     remaining: Remaining = all_of,
     whole: Collection[float | None] = (),
+    locks: Callable[[Path], str] = no_locks,
 ) -> DryRun:
     """Compute the plan of a configuration without devices.
 
@@ -159,6 +167,7 @@ def dry_run(
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
         whole: energies (keV) of a series that were already taken; not all of them.
+        locks: what is wrong with the locks of a folder, as `no_locks` finds out, which writes there.
 
     Raises:
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
@@ -171,23 +180,56 @@ def dry_run(
     there = disk_of(runs or Path(settings.storage.folder))
     free = shutil.disk_usage(there).free
     plans = [remaining(plan_of(one)) for one in each]
+    timelines = [_worked(one, plan, stage, to_counts, camera, free) for one, plan in zip(each, plans, strict=True)]
     worked = [
-        DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
-        for one, plan in zip(each, plans, strict=True)
+        DryRun(plan, timeline, stage, camera, free, _needs(one, timeline), there)
+        for one, plan, timeline in zip(each, plans, timelines, strict=True)
     ]
     worked_plan = worked[0] if settings.scan.energies is None else _of_energies(worked)
-    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, there))
+    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, locks(there)))
+
+
+def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
+    """The needs of a scan at one energy."""
+    rate = config.optics.dose_rate_gy_s
+    return ScanNeeds(
+        timeline.parts,
+        timeline.n_frames,
+        timeline.total_bytes,
+        dose_gy=None if rate is None else rate * timeline.in_beam,
+        volume_seconds=config.recon.seconds if config.recon.live else 0.0,
+        operator=tuple(_requests(config, timeline)),
+    )
+
+
+def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
+    """What the scan will ask the operator to do."""
+    by_hand = config.devices.by_hand
+    kinds = [block.kind for block in timeline.blocks if block.n_to_take]
+    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
+    moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
+    for device, states, request in (
+        ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),
+        ("monochromator", [None, *filter(None, [config.scan.energy])], "set the monochromator"),
+        ("shutter", opened, "open or close the shutter"),
+        ("sample_mover", moved_out, "move the sample out of the beam or back"),
+    ):
+        if device in by_hand and (times := sum(before != after for before, after in pairwise(states))):
+            yield OperatorRequest(request, times)
+    if config.scan.decide == "ask":
+        passes = math.ceil(timeline.plan.n_views / (timeline.plan.pass_views or timeline.plan.n_views))
+        yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
 
 
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the violations of all of them."""
     needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
-    total = replace(each[0], energies=tuple(needs))
+    total = replace(each[0], energies=tuple(needs), needs=all_needs(one.needs for one in each))
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
-    if total.total_bytes * ROOM > total.free_bytes:
+    if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
             f"free some space, choose another storage.folder, or set fewer energies: {len(each)} energies "
-            f"need {size(total.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
+            f"need {size(total.needs.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
@@ -209,9 +251,8 @@ def _worked(
     return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
 
 
-def _lockable(worked: Timeline, folder: Path) -> Timeline:
-    """The plan, with a violation if files in the folder cannot be locked."""
-    no_locking = no_locks(folder)
+def _lockable(worked: Timeline, no_locking: str) -> Timeline:
+    """The plan, with a violation if files in its folder cannot be locked."""
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
 
@@ -281,7 +322,7 @@ def preflight(
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, disk = camera.timing, disk_of(runs)
     free = shutil.disk_usage(disk).free
-    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), disk)
+    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk))
     refuse_violations(timeline)
     ready = ready_scan(config, timeline, settings, timing, _info(config, instrument, plan, timeline), check_stop)
     if instrument.simulated is not None:

@@ -144,7 +144,7 @@ def first_volume(
     `device`: for the direct method and the iterations.
     """
     swept = _swept(geometry, start)
-    sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
+    sweeps = OsSirtTv(iterations=START_SWEEPS, still=0.0)
     quick: Method = sweeps if swept else Fbp("ram-lak" if start == "published" else "hann")
     problem = ReconProblem(Views(without_wild_pixels(projections), geometry), grid, device=device)
     volume = quick.run(problem, RunControl()).volume

@@ -232,7 +232,7 @@ class _Problem:
     def volume(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> Volume:
         data, geometry, weight = self.corrected(moves, views)
         # The weight follows the noise: views held out would judge a sample that still stands in two places.
-        method, projector = OsSirtTv(SWEEPS, momentum=True), Projector(geometry, self.grid)
+        method, projector = OsSirtTv(SWEEPS, still=0.0), Projector(geometry, self.grid)
         return solve(method, projector, data, weight=weight, watch=Watch(on_trial=lambda: True))
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:

@@ -13,8 +13,8 @@ from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid
 from recon.voxels.choice import TRIALS
-from recon.voxels.ordered_fista import USUAL_SWEEPS
 from recon.voxels.projector import Projector
+from recon.voxels.standstill import USUAL_SWEEPS
 
 TRIAL_SWEEPS = 20
 """Sweeps of total variation in the trial of a finish, and of `EarlyTv`: a trial that gets less far than its volume

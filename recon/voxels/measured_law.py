@@ -31,11 +31,12 @@ from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.iterative import Iterating, solve
-from recon.voxels.ordered_fista import MOST_SWEEPS, Subsets, ordered_fista, subsets_of
+from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
+from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem
 
 LEAST_VIEWS = 40

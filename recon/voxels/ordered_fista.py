@@ -11,7 +11,6 @@ Steps are damped where that pays, see `recon.voxels.damping`.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,6 +27,7 @@ from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector
+from recon.voxels.standstill import Standstill
 from recon.voxels.view_weights import angular_weights
 from recon.voxels.voxel_problem import (
     Momentum,
@@ -41,12 +41,6 @@ from recon.voxels.voxel_problem import (
 
 SUBSETS, MANY_SUBSETS = 3, 9
 """Largest number of subsets of sweeps that go to the end, and of sweeps that do not."""
-MOST_SWEEPS, USUAL_SWEEPS = 60, 30
-"""Largest number of sweeps, and the usual number until the volume stands still."""
-ENDED = "ended", "ended_after", "last_change"
-"""Names of the settings that say how the sweeps ended ("still": the volume stood still; "stopped"; "bound": all were
-made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
-_STILL = "still"  # name of the decision whether the volume stands still
 _LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset: see `SUBSETS`
 # Subsets save time and do not change where the damped steps end. With one subset: 45 sweeps of 30 projections instead
 # of 31, and 29 of 180 instead of 23; 0 to 15 % more CPU time. With subsets up to the end: -0.1 to -1.0 dB.
@@ -54,9 +48,6 @@ _LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540  # sweeps, and projections in swee
 _MOST_MOMENTUM = 0.9
 """Largest momentum of damped steps. A larger one adds up the errors of the proximal steps, which make three dual steps
 only: if the air weighs five times as much as the sample, the volume then changes by 1 % in four sweeps, for ever."""
-_MIRRORED = 4
-"""After this many sweeps total variation takes the same differences again, see `TotalVariationProx`. Therefore volumes
-that are compared lie this many sweeps apart."""
 _LEAST_PACE = 0.5
 """Least ratio of the damped step of the coarsest shapes to their step without damping, for which steps are damped. The
 ratio is small if single rays weigh much more than others. There 60 damped sweeps end further from the minimum than 20
@@ -194,7 +185,6 @@ class _Descent:
         self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
         self._slope: Any = None  # cells of the force of the prior (total variation, x >= 0) at the last point
         self._target: Any = None
-        self._before: Any = None
         self.error, self.seen = 0.0, list[F32]()
 
     def renew_target(self) -> None:
@@ -258,18 +248,6 @@ class _Descent:
     def volume(self) -> F32:
         return self._device.numpy(self.x)
 
-    def change(self) -> float:
-        """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""
-        device, change = self._device, math.inf
-        if self._before is None:
-            self._before = device.copy(self.x)
-        else:
-            device.combine(1.0, self.x, -1.0, self._before, self._before)
-            size = device.norm(self.x)
-            change = device.norm(self._before) / size if size > 0 else 0.0
-            device.combine(1.0, self.x, 0.0, self.x, self._before)
-        return change
-
 
 def ordered_fista(
     problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
@@ -299,27 +277,19 @@ def ordered_fista(
     descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
     n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
     first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(_VIEWS_ON_SUBSETS / n_views))
-    change, ended, done = math.inf, "bound", 0
+    standstill = Standstill(problem.decide, still, voxel_device(problem.projector.device), first)
     for k in range(sweeps):
-        done = k + 1
         if k % RENEWED == 0:
             descent.renew_target()
         on_subsets = k < first or not subsets.is_damped
         descent.sweep(weight, on_subsets, by_noise)
         if isinstance(weight, NoiseBalance):
             weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(descent.seen)))
-        going = problem.go_on(done, math.sqrt(descent.error) / scale)
-        if subsets.to_the_end and k >= first and (k - first) % _MIRRORED == 0:
-            change = descent.change()
-            if problem.decide(_STILL, partial(operator.lt, change, still)):
-                ended = "still"
-                break
-        if not going:
-            ended = "stopped"
+        going = problem.go_on(k + 1, math.sqrt(descent.error) / scale)
+        if standstill.ends(descent.x, k + 1, going) if subsets.to_the_end else not going:
             break
-        if done < sweeps:
+        if k + 1 < sweeps:
             descent.go_ahead()
     if subsets.to_the_end:
-        values = ended, done, change
-        problem.decide.settings |= {name: value for name, value in zip(ENDED, values, strict=True) if value != math.inf}
+        standstill.report()
     return descent.volume

@@ -27,18 +27,11 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoice, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
-from recon.voxels.ordered_fista import (
-    MANY_SUBSETS,
-    MOST_SWEEPS,
-    SUBSETS,
-    Pull,
-    Subsets,
-    ordered_fista,
-    subsets_of,
-)
+from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Pull, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import NoiseBalance, noise_of_volume, pnp_dct
 from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
+from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 _WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one

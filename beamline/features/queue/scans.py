@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
 from beamline.cli.options import json_events
-from beamline.cli.scan import TABLE, ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
-from beamline.config.load import Config, load
+from beamline.cli.scan import ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
+from beamline.config.load import Config
 from beamline.core.errors import AlarmError, BeamlineError, ConfigError, ScanStopped, exit_code, user_message
-from beamline.core.events import Done, Event, RunStarted, Sink, StateEntered
-from beamline.core.files import SETTINGS, text_in
+from beamline.core.events import Done, Event, Failed, RunStarted, Sink, StateEntered
 from beamline.core.stop import StopRequest
-from beamline.core.text import aligned, count, size
+from beamline.core.text import aligned
 from beamline.instrument.connect import ask_operator
-from beamline.plan.limits import ROOM
-from beamline.plan.timeline import hms_text
 from beamline.scan.moves import UNSAFE
-from beamline.scan.preflight import DryRun, dry_run
+from beamline.scan.queue_plan import QueuePlan
+from beamline.scan.queue_planning import plan_queue
 from drivers.base.clock import SystemClock
-
-_CONFIG = "config"  # the column with the configuration's file
 
 
 class QueueStatus(StrEnum):
@@ -78,135 +71,6 @@ class QueueError(BeamlineError):
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
         self.exit_code = code
-
-
-def load_queue(
-    files: Sequence[Path],
-    overrides: Sequence[str],
-    *,
-    rehearse: bool = False,
-    no_live: Callable[[str], None] | None = None,
-) -> tuple[Config, ...]:
-    """The scans of these configurations and tables, in their order.
-
-    A table is a CSV file. Its first line names the column `config`, the file of a configuration (relative to the
-    table), and keys of configurations, whose values go before those of the file; an empty cell changes nothing.
-
-    Args:
-        overrides: of all scans, after those of a table.
-        rehearse, no_live: as of `load`.
-
-    Raises:
-        ConfigError: every scan that cannot be, with what is wrong. Nothing was started.
-    """
-    scans, faults = [], []
-    for file in files:
-        try:
-            rows = list(_rows(file)) if file.suffix.lower() == TABLE else [("", file, ())]
-        except ConfigError as error:
-            faults.append(str(error))
-            continue
-        for place, config_file, own in rows:
-            try:
-                scans.append(load(config_file, (*own, *overrides), rehearse=rehearse, no_live=no_live))
-            except ConfigError as error:
-                faults.append(f"{place}{error}")
-    if faults:
-        raise ConfigError(faults[0] if len(faults) == 1 else "".join(["the queue has faults:", *_indented(faults)]))
-    return tuple(scans)
-
-
-def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
-    """Place, configuration and overrides of each line of a table."""
-    try:
-        reader = csv.reader(io.StringIO(text_in(table, SETTINGS), newline=""), strict=True)
-        numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except (OSError, csv.Error) as error:
-        raise ConfigError(f"{table} cannot be read as a table ({error}). Nothing was started.") from None
-    head = numbered[0][1] if numbered else []
-    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
-        raise ConfigError(
-            f"{table} is not a table of scans. Expected a first line with names, such as "
-            "config,sample.name,scan.exposure_s, each only once, then one line per scan. Nothing was started."
-        )
-    for number, row in numbered[1:]:
-        if not any(row):
-            continue
-        cells = dict(zip(head, row, strict=False))
-        if len(row) > len(head) or not cells.get(_CONFIG):
-            raise ConfigError(
-                f"{table}, line {number}: {','.join(row)!r} has {count(len(row), 'cell')}; expected {len(head)}, with "
-                f"a file under {_CONFIG}. Nothing was started."
-            )
-        own = tuple(f"{key}={value}" for key, value in cells.items() if key != _CONFIG and value)
-        yield f"{table}, line {number}: ", table.parent / cells[_CONFIG], own
-
-
-@dataclass(frozen=True, eq=False)
-class QueueNeeds:
-    """Needs of the scans of a queue, computed without devices.
-
-    Attributes:
-        scans: by name.
-        duration: s for all, without changing samples.
-        total_bytes: of the files of all.
-        free_bytes: of the fullest disk.
-    """
-
-    scans: Sequence[tuple[str, DryRun]]
-    duration: float
-    total_bytes: int
-    free_bytes: int
-
-    def lines(self) -> list[str]:
-        """A line for each scan, and the sum."""
-        rows = [
-            (name, str((len(worked.energies) or 1) * worked.timeline.n_frames), size(worked.total_bytes),
-             hms_text(_seconds(worked)))
-            for name, worked in self.scans
-        ]  # fmt: skip
-        total = f"{size(self.total_bytes)} of {size(self.free_bytes)} free, {hms_text(self.duration)}"
-        return [
-            aligned([("scan", "frames", "size", "time"), *rows]),
-            "",
-            f"{count(len(self.scans), 'scan')}: {total}, plus the time between them",
-        ]
-
-    def data(self) -> Mapping[str, Any]:
-        """The needs for programs: s and bytes of each scan and of all."""
-        each = [{**worked.data(), "sample": name, "duration": _seconds(worked)} for name, worked in self.scans]
-        totals = {"duration": self.duration, "total_bytes": self.total_bytes, "free_bytes": self.free_bytes}
-        return {"scans": each, **totals}
-
-    def refuse_impossible(self) -> None:
-        """Raise ConfigError for scans that violate a limit, or do not fit on the disk together. Nothing was started."""
-        faults = [f"{name}: {text}" for name, worked in self.scans for text in worked.timeline.violations]
-        if not faults and self.total_bytes * ROOM > self.free_bytes:
-            faults.append(
-                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} plus a tenth, but the disk has "
-                f"{size(self.free_bytes)} free. Free some space, or choose another storage.folder"
-            )
-        if faults:
-            raise ConfigError(
-                "".join(["Nothing was started, because some of the scans cannot run:", *_indented(faults)])
-            )
-
-
-def queue_needs(queue: Sequence[Config], place: Path | None) -> QueueNeeds:
-    """Compute the needs of a queue without devices; `place` as in `run_scan`.
-
-    Raises:
-        ConfigError: of the first scan that cannot be worked out, with its name.
-    """
-    scans = []
-    for config in queue:
-        try:
-            scans.append((config.sample.name, dry_run(config, place)))
-        except ConfigError as error:
-            raise ConfigError(f"{config.sample.name}: {error}") from error
-    needs = [(_seconds(worked), worked.total_bytes, worked.free_bytes) for _, worked in scans]
-    seconds, sizes, free = zip(*needs, strict=True)
-    return QueueNeeds(scans, sum(seconds), sum(sizes), min(free))
 
 
 def run_queue(
@@ -266,28 +130,23 @@ def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
         )
 
 
-def _indented(lines: Sequence[str]) -> list[str]:
-    return [f"\n  {line}" for line in lines]
-
-
-def _seconds(worked: DryRun) -> float:
-    return sum(need.duration for need in worked.energies) if worked.energies else worked.timeline.duration
-
-
 def take_all(request: ScanRequest) -> None:
-    """Run the scans of a queue, or compute their needs, and print the outcome of each."""
+    """Plan the scans of a queue, then run them, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
-        queue = load_queue(request.files, request.overrides, rehearse=request.rehearse, no_live=request.unless_live)
-        needs = queue_needs(queue, request.output)
+        plan = plan_queue(
+            request.files, request.overrides, place=request.output, rehearse=request.rehearse,
+            no_live=request.unless_live,
+        )  # fmt: skip
+        for scan in plan.scans:
+            for sentence in scan.warnings:
+                click.echo(f"Warning: {scan.source}: {sentence}", err=True)
         if request.dry:
-            if not request.as_json:
-                click.echo("\n".join(needs.lines()))
-            needs.refuse_impossible()
-            json_sink(Done(needs.data(), time=SystemClock().now()))
+            _show(plan, json_sink, request.as_json)
             return
-        needs.refuse_impossible()
+        plan.refuse_impossible()
         if request.wait and not sys.stdin.isatty():
             raise click.UsageError("--wait needs a terminal, because it asks before each scan. Nothing was started.")
+        queue = [scan.config for scan in plan.scans if scan.config is not None]
         outcomes = run_queue(
             queue, partial(_take_next, request, len(queue), json_sink), stop_on_failure=request.stop_on_failure
         )
@@ -295,6 +154,18 @@ def take_all(request: ScanRequest) -> None:
         if not request.as_json:
             click.echo("\n".join(summary(outcomes)))
         raise_unless_complete(outcomes)
+
+
+def _show(plan: QueuePlan, json_sink: Sink, as_json: bool) -> None:
+    """Print the plan. Raises ConfigError if a scan cannot run; the event of the error then has the plan, too."""
+    if not as_json:
+        click.echo("\n".join(plan.lines()))
+    try:
+        plan.refuse_impossible()
+    except ConfigError as error:
+        json_sink(Failed(str(error), exit_code(error), more=plan.data(), time=SystemClock().now()))
+        raise
+    json_sink(Done(plan.data(), time=SystemClock().now()))
 
 
 def _take_next(

@@ -4,7 +4,7 @@ from recon.base.registry import Lengths, MethodEntry
 
 METHODS = {
     "discrete": MethodEntry(
-        "recon.features.discrete.methods", "Discrete", lengths=Lengths("iterations", (16, 8), (16, 8))
+        "recon.features.discrete.methods", "Discrete", lengths=Lengths("iterations", (60, 10), (60, 10))
     )
 }
 CANDIDATES = {"discrete": 1.5}

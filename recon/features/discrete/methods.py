@@ -22,18 +22,11 @@ from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabili
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.methods import QUALITIES, EarlyTv, FistaTv
-from recon.voxels.ordered_fista import (
-    MANY_SUBSETS,
-    MOST_SWEEPS,
-    SUBSETS,
-    USUAL_SWEEPS,
-    Subsets,
-    ordered_fista,
-    subsets_of,
-)
+from recon.voxels.methods import EarlyTv, FistaTv
+from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
+from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, with_quality
 from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
@@ -86,8 +79,7 @@ class Discrete(VoxelMethod):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """As of `FistaTv`."""
-        still, longer = QUALITIES[quality]
-        return replace(self, still=still * self.still, iterations=longer * self.iterations)
+        return with_quality(self, quality)
 
     def refit(self, share: float) -> VoxelMethod:
         """`EarlyTv` with `share` times the number of iterations for which the error bars are calibrated."""

@@ -9,7 +9,7 @@ import pytest
 
 from beamline import api
 
-FUNCTIONS = (api.connect, api.scan, api.monitor, api.stream, api.volumes, api.reconstruct)
+FUNCTIONS = (api.connect, api.scan, api.plan, api.monitor, api.stream, api.volumes, api.reconstruct)
 
 
 @pytest.mark.parametrize("call", FUNCTIONS, ids=lambda call: call.__name__)

@@ -93,6 +93,27 @@ def test_a_rehearsal_says_what_the_scan_takes(tmp_path: Path) -> None:
     assert f"At the instrument the scan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
 
 
+def test_2_a_dry_run_of_several_scans_states_the_faults_of_all_and_plans_the_others(tmp_path: Path) -> None:
+    table = tmp_path / "day.csv"
+    table.write_text(f"config,sample.name,scan.period_s\n{SIMULATED},a,\n{SIMULATED},b,0.01\nnone.yaml,c,\n", "utf-8")
+    result = CliRunner().invoke(main, ["scan", str(table), "--dry-run", "-o", str(tmp_path / "runs")])
+    assert result.exit_code == 2 and not (tmp_path / "runs").exists()
+    assert [line.split()[:3] for line in result.stdout.splitlines()[1:4]] == [
+        ["a", f"{table}:2", "yes"], ["b", f"{table}:3", "no"], ["-", f"{table}:4", "no"],
+    ]  # fmt: skip
+    assert f"  {table}:3: scan.period_s 0.01 is below the camera's minimum" in result.stderr
+    assert "none.yaml does not exist" in result.stderr and "2 scans of 3 cannot run" in result.stderr
+    as_json = CliRunner().invoke(main, ["scan", str(table), "--dry-run", "--json", "-o", str(tmp_path / "runs")])
+    (line,) = as_json.stdout.splitlines()
+    event = json.loads(line)
+    assert (as_json.exit_code, event["event"], event["exit_code"], event["valid"]) == (2, "failed", 2, False)
+    assert [scan["valid"] for scan in event["scans"]] == [True, False, False]
+    assert {fault["file"] for fault in event["scans"][1]["faults"]} == {str(table), SIMULATED}
+    assert event["duration"] == event["scans"][0]["duration"] == sum(event["parts"].values())
+    started = CliRunner().invoke(main, ["scan", str(table), "-o", str(tmp_path / "runs")])
+    assert started.exit_code == 2 and "cannot run" in started.stderr and not (tmp_path / "runs").exists()
+
+
 @pytest.mark.slow
 def test_several_scans_are_taken_in_turn_and_ctrl_c_ends_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, FakeInstrument())

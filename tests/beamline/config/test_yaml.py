@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from beamline.config import tree
+from beamline.config.load import config_folder
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
 from beamline.scenes.scene_file import open_scene
@@ -49,6 +51,41 @@ def test_overrides_scenes_and_recipes_are_read_alike(tmp_path: Path) -> None:
     assert "it.yaml:1: this is not YAML (the { of this line is never closed)" in said
     path.write_text("a: " + 100 * "[")
     assert "more than settings may have" in beamline("recon", "scan.h5", "--config", path).stderr
+
+
+def test_both_loaders_read_the_same_values_and_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = [path.read_text("utf-8") for path in config_folder().rglob("*.yaml")]
+    texts += [
+        "a: [1, 2.5, .nan, 2024-02-30, 0x10, 012, yes, ~]\nb: |\n  x\n  y\nc: 'it''s'\n",
+        "a: {b: &x [1], c: *x}\n",
+    ]
+    fast = [read(text, "my.yaml") for text in texts]
+    monkeypatch.setattr(tree, "_FastLoader", tree._Loader)
+    tree._read.cache_clear()
+    assert repr([read(text, "my.yaml") for text in texts]) == repr(fast)
+
+
+@pytest.mark.parametrize("text", ["a:\t1\n", "a: [1,\t2]\n", "\ta: 1\n", "a: {b: 1,\nc", "a: *none\n"])
+def test_what_one_loader_takes_and_the_other_does_not_has_the_fault_of_the_strict_one(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said() -> str:
+        try:
+            return repr(read(text, "my.yaml"))
+        except ConfigError as error:
+            return str(error)
+
+    both = said()
+    monkeypatch.setattr(tree, "_FastLoader", tree._Loader)
+    tree._read.cache_clear()
+    assert said() == both
+
+
+def test_what_is_read_again_is_as_it_was_read_first() -> None:
+    first = read("a: {b: [1]}\n", "my.yaml")
+    first.data["a"]["b"].append(2)
+    assert read("a: {b: [1]}\n", "my.yaml").data == {"a": {"b": [1]}}
+    assert read("a: {b: [1]}\n", "other.yaml").origin(("a",)) == "other.yaml:1"
 
 
 def test_dates_aliases_and_long_texts_of_a_person_are_read() -> None:

@@ -71,6 +71,10 @@ def test_a_fly_scan_worked_by_hand() -> None:
     references = (10 + 20 + 20 - 3) * 0.051  # one period less than frames in each block, and ...
     tails = 4 * 0.0506  # ... the last exposure and readout of every block
     assert timeline.duration == pytest.approx(pass_and_moves + references + tails)
+    assert timeline.parts["dark"] == pytest.approx(9 * 0.051 + 0.0506)
+    assert timeline.parts["flat"] == pytest.approx(2 * (19 * 0.051 + 0.0506))
+    assert timeline.parts["return"] == pytest.approx(180 / 30 + 0.5)
+    assert timeline.in_beam == timeline.parts["projection"] and sum(timeline.parts.values()) == timeline.duration
     assert timeline.violations == ()
 
 
@@ -203,7 +207,7 @@ def test_no_violation_means_that_nothing_is_broken(
 
 VIOLATIONS = {
     "period below the camera's": ({"period": 0.0505}, "period_s 0.0505 is below the camera's minimum of 0.051 s"),
-    "exposure over period": ({"exposure": 0.2}, "exposure_s 0.2 is longer than period_s 0.1"),
+    "exposure over period": ({"exposure": 0.2}, "scan.exposure_s 0.2 is longer than scan.period_s 0.1"),
     "speed": (
         {"angles": angles.fixed(40, 90 * DEG)},
         "needs 45°/s, the stage turns at most 30°/s; set scan.period_s >= 0.15",
@@ -229,6 +233,9 @@ def test_violations_have_values_and_advice(changes: dict[str, Any], sentence: st
     (violation,) = timeline.violations
     assert sentence in violation
     assert ";" in violation or ". " in violation  # what to do follows
+    assert re.search(
+        r"\b(scan|devices|optics|storage)\.\w+", violation
+    )  # by the first key, the plan of a queue finds the line
     # Broken plans are still worked out, so that the operator sees all of it at once.
     assert timeline.n_frames > 0
     assert timeline.duration > 0

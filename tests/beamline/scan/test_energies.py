@@ -156,7 +156,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     )  # each begins later in angle
     rest = dry_run(load(config), whole=ENERGIES[:3])
     assert [need.kev for need in rest.energies] == [ENERGIES[3]]
-    assert rest.total_bytes == one["total_bytes"]  # the disk needs no room for those that were taken
+    assert rest.needs.total_bytes == one["total_bytes"]  # the disk needs no room for those that were taken
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")
     assert "energies  4, 8.32 to 8.352 keV, one scan like this at each energy" in told.stdout
     assert told.exit_code == 0 and not (tmp_path / "none").exists()

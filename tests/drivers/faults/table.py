@@ -307,8 +307,8 @@ OF_MOTION = (
         ("drivers/stages/zaber/test_stage.py", "test_a_slip_between_two_moves_is_told_once_by_the_next"),
     ),
     FaultElsewhere(
-        'step scan: moved after it had arrived (another program, the panel, a hunting servo, a "done" that comes '
-        "too early)",
+        'step scan: the stage moved after it had arrived (another program, the panel, a hunting servo, a "done" that '
+        "comes too early)",
         "its frame was exposed while the stage was not at its",
         ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
     ),

@@ -59,7 +59,7 @@ def test_rows_of_a_slab_see_what_whole_views_see(
             recon.Cgls(iterations=4),
             recon.AsdPocs(iterations=3),
             recon.OsSirtTv(iterations=12),
-            recon.OsSirtTv(iterations=8, tv_weight=0.01, momentum=True),
+            recon.OsSirtTv(iterations=8, tv_weight=0.01),
             recon.FistaTv(iterations=6, tv_weight=2e-3),
         ],
         3,

@@ -14,8 +14,9 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import CPU
-from recon.voxels.ordered_fista import ENDED, MOST_SWEEPS, Subsets, ordered_fista, subsets_of
+from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
 from recon.voxels.projector import Projector
+from recon.voxels.standstill import ENDED, MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights, largest_eigenvalue
 
 F32 = NDArray[np.float32]

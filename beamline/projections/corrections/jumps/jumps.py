@@ -200,5 +200,5 @@ def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     band = _band(source, selection)
     views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
-    work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
+    work = OsSirtTv(iterations=SWEEPS).memory(views, Grid.matching(views), weighted=True)
     return copy + max(at_once_memory(source, band, n), work)

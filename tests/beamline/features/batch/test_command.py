@@ -275,7 +275,7 @@ def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_
     """It would go on in the folder of the next call."""
     Path("recipe.yaml").write_text("method: sirt\niterations: 10000000\naxis: 19.5\n")
     process = psutil.Popen([*COMMAND, "batch", "scan.h5", "--config", "recipe.yaml", "-o", "out"])
-    wait_until(lambda: any(Path("out").glob(".*.partial/stderr.txt")))
+    wait_until(lambda: any(Path("out").glob(".*.partial/stderr.txt")) and process.children(recursive=True))
     children = process.children(recursive=True)
     process.kill()
     process.wait()

@@ -1,4 +1,4 @@
-"""A queue of scans: what is read from a table, which scans start, and the summary at the end."""
+"""A queue of scans: which scans start, that none starts twice, and the summary at the end."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from beamline.config.load import Config, config_folder
-from beamline.core.errors import AlarmError, ConfigError, DataError, ScanStopped
+from beamline.config.load import Config, config_folder, load
+from beamline.core.errors import AlarmError, DataError, ScanStopped
 from beamline.core.events import RunStarted, StateEntered
 from beamline.core.stop import StopRequest
 from beamline.features.queue.scans import (
@@ -15,8 +15,6 @@ from beamline.features.queue.scans import (
     QueueStatus,
     RunNotes,
     Taken,
-    load_queue,
-    queue_needs,
     raise_unless_complete,
     run_queue,
     summary,
@@ -28,50 +26,7 @@ SIMULATED = config_folder() / "simulated.yaml"
 
 @pytest.fixture(scope="module")
 def queue() -> tuple[Config, ...]:
-    return tuple(load_queue([SIMULATED], [f"sample.name={name}"])[0] for name in ("one", "two", "three"))
-
-
-def table(folder: Path, *lines: str) -> Path:
-    path = folder / "day.csv"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
-
-
-def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path) -> None:
-    (tmp_path / "own.yaml").write_text(SIMULATED.read_text("utf-8"), encoding="utf-8")
-    lines = "config, sample.name,scan.exposure_s", "own.yaml,a,", "", f"{SIMULATED},b,0.02"
-    scans = load_queue([table(tmp_path, *lines), SIMULATED], ["scan.angles.views=60"])
-    named = [(config.sample.name, config.scan.exposure_s) for config in scans]
-    assert named == [
-        ("a", 0.05),
-        ("b", 0.02),
-        ("battery", 0.05),
-    ]
-    assert {config.scan.angles.views for config in scans} == {60}  # type: ignore[union-attr]
-    needs = queue_needs(scans, tmp_path)
-    worked = [each.timeline for _, each in needs.scans]
-    assert needs.duration == pytest.approx(sum(each.duration for each in worked))
-    assert needs.total_bytes == sum(each.total_bytes for each in worked) and len(needs.data()["scans"]) == 3
-    assert "3 scans" in needs.lines()[-1]
-    with pytest.raises(ConfigError, match=r"a: .*\n.*b: "):
-        queue_needs(load_queue([tmp_path / "day.csv"], ["scan.period_s=0.001"]), tmp_path).refuse_impossible()
-
-
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (("sample.name", "a"), "is not a table of scans"),
-        (("config,x",), "is not a table of scans"),
-        (("config,config", "a.yaml,b.yaml"), "is not a table of scans"),
-        (("config,sample.name", ",a"), "line 2: ',a' has 2 cells; expected 2, with a file"),
-        (("config,sample.name", "a.yaml,b,c"), "line 2: 'a.yaml,b,c' has 3 cells"),
-        (("config", "none.yaml", "gone.yaml"), r"line 2: .*none.yaml(.|\n)*line 3: .*gone.yaml"),
-        (("config,scan.modd", f"{SIMULATED},1"), "line 2: .*did you mean mode"),
-    ],
-)
-def test_a_wrong_table_is_refused_with_its_lines(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        load_queue([table(tmp_path, *lines)], ())
+    return tuple(load(SIMULATED, [f"sample.name={name}"]) for name in ("one", "two", "three"))
 
 
 def test_a_failure_does_not_keep_the_next_from_its_turn(queue: tuple[Config, ...], tmp_path: Path) -> None:

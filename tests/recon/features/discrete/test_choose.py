@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.features.discrete.choose import PULLS, MaterialTrial
-from recon.voxels.ordered_fista import USUAL_SWEEPS
+from recon.voxels.standstill import USUAL_SWEEPS
 from recon.voxels.trial import TrialSettings
 
 F32 = NDArray[np.float32]

@@ -1,0 +1,116 @@
+"""Estimate of a plan of bluesky: its messages are followed without a RunEngine, so that no device does anything."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from bluesky import Msg
+
+from beamline.bluesky.camera import CameraDetector, ShownFrames
+from beamline.bluesky.devices import Rotation, TomoScan
+from beamline.config.load import camera_settings
+from beamline.core.errors import ConfigError
+from beamline.core.text import degrees
+from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
+from beamline.plan.timeline import move_seconds, row_bytes
+from beamline.scan.preflight import disk_of
+from beamline.scan.queue_plan import PlannedScan, ScanFault
+from beamline.scan.queue_planning import plan_of_config
+from drivers.base.protocols import TriggerSource
+
+MOST = 1_000_000
+"""Messages after which a plan counts as one without an end."""
+_DONE = SimpleNamespace(done=True, success=True, exception=lambda timeout=None: None)
+"""What a plan gets for a message that a RunEngine answers with a status."""
+
+
+@dataclass
+class _Messages:
+    """What the messages of a plan need besides whole scans: moves of the stage, waits, and frames of the camera."""
+
+    needs: list[ScanNeeds] = field(default_factory=list)
+    faults: list[ScanFault] = field(default_factory=list)
+    sample: str = ""
+    disk: Path | None = None
+    places: dict[Rotation, float] = field(default_factory=dict)
+    values: dict[int, Any] = field(default_factory=dict)  # last one that was set or prepared, by the id of its device
+
+    def take(self, message: Msg) -> Any:
+        """Add a message, and return what a plan expects in reply."""
+        told: Any = message.args[0] if message.args else None
+        match message.command, message.obj:
+            case "set", Rotation() as stage:
+                self._move(stage, math.radians(float(told)))
+            case "set" | "prepare", device:
+                self.values[id(device)] = told
+            case "trigger" | "kickoff", CameraDetector() as camera:
+                self._expose(camera)
+            case "sleep", _:
+                self.needs.append(ScanNeeds({"wait": float(told)}))
+            case "input" | "pause", _:
+                self.needs.append(ScanNeeds(operator=(OperatorRequest("answer the plan, or resume it", 1),)))
+            case "locate", Rotation() as stage:
+                at = math.degrees(self.places.get(stage, stage.radians))
+                return {"setpoint": at, "readback": at}
+            case "kickoff" | "complete" | "wait", _:
+                pass
+            case _:
+                return None
+        return _DONE
+
+    def _move(self, stage: Rotation, target: float) -> None:
+        limits, at = stage.limits, self.places.get(stage, stage.radians)
+        self.places[stage] = target
+        self.needs.append(ScanNeeds({"move": move_seconds(target - at, limits.max_speed, limits.acceleration)}))
+        if not limits.low <= target <= limits.high:
+            reach = f"{degrees(limits.low)} ... {degrees(limits.high)}"
+            self.faults.append(
+                ScanFault(f"the plan moves {stage.name} to {degrees(target)}, the limits of the stage are {reach}")
+            )
+
+    def _expose(self, camera: CameraDetector) -> None:
+        """Add the frames of a trigger, as many as the camera was prepared for last."""
+        config, asked = camera.config, self.values.get(id(camera))
+        exposure = getattr(asked, "livetime", 0.0) or config.scan.exposure_s
+        timing = config.devices.camera.timing_of(camera_settings(config, exposure, TriggerSource.SOFTWARE))
+        n = getattr(asked, "number_of_exposures", 1)
+        apart = max(timing.min_period, exposure + getattr(asked, "deadtime", 0.0))
+        kind = ShownFrames(self.values.get(id(camera.kind), ShownFrames.PROJECTION))
+        size = row_bytes(timing.shape, config.storage.preview_bin)
+        self.needs.append(ScanNeeds({kind.value: n * apart}, n, n * size))
+        self.sample, self.disk = config.sample.name, disk_of(camera.runs)
+
+
+def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
+    """The scans that a plan of bluesky starts, in order; and after them, as one scan, what its other messages need.
+
+    The plan gets no measured value: one that reads a device and decides by the value cannot be followed, and has that
+    fault. Moves count one after the other. The plan is used up.
+    """
+    source, scans, others = f"plan {getattr(plan, '__name__', '')}".rstrip(), list[PlannedScan](), _Messages()
+    reply = None
+    try:
+        for _ in range(MOST):
+            message = plan.send(reply)
+            if message.command == "kickoff" and isinstance(message.obj, TomoScan):
+                planned = plan_of_config(message.obj.config, message.obj.runs, source)
+                scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))  # it makes no volume
+            reply = others.take(message)
+        others.faults.append(ScanFault(f"the plan does not end within {MOST} messages"))
+    except StopIteration:
+        pass
+    except ConfigError as error:
+        others.faults.append(ScanFault(str(error)))
+    except Exception as error:  # of the plan, which got no measured values
+        what = f"{type(error).__name__}: {error}"
+        others.faults.append(ScanFault(f"the plan cannot be followed without running it ({what})"))
+    if others.needs or others.faults:
+        rest = f"{source}, other messages" if scans else source
+        needs = all_needs(others.needs)
+        scans.append(PlannedScan(rest, others.sample, tuple(others.faults), needs=needs, disk=others.disk))
+    return tuple(scans)

@@ -1,0 +1,154 @@
+"""Planning of a queue: reads configurations and tables of several scans, and finds out what is wrong with each."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from beamline.config.load import Config, ReadConfig, override_of, read_config
+from beamline.config.tree import Override
+from beamline.core.errors import ConfigError, DataError, user_message
+from beamline.core.files import SETTINGS, TABLE, text_in
+from beamline.core.text import count
+from beamline.scan.preflight import doubts, dry_run
+from beamline.scan.queue_plan import PlannedScan, QueuePlan, ScanFault, queue_of
+from beamline.storage.writer_lock import no_locks
+
+_CONFIG = "config"  # the column with the configuration's file
+_NOTHING = " Nothing was started."
+_KEY = re.compile(rf"\b(?:{'|'.join(Config.model_fields)})(?:\.[a-z]\w*)+")
+
+_Described = tuple[str, Path, Sequence[Override]]
+"""A scan: its source, the file of its configuration, and overrides."""
+
+
+def plan_queue(
+    scans: Iterable[Path | Mapping[str, object] | PlannedScan],
+    overrides: Sequence[Override] = (),
+    *,
+    place: Path | None = None,
+    rehearse: bool = False,
+    no_live: Callable[[str], None] | None = None,
+) -> QueuePlan:
+    """Plan several scans without devices. A scan that cannot run does not end the planning of the others.
+
+    Args:
+        scans: files of configurations, tables of scans, rows of such tables as mappings, and scans that were planned
+            already. A table is a CSV file. Its first line names the column `config`, the file of a configuration
+            (relative to the table), and keys of configurations, whose values go before those of the file; an empty cell
+            changes nothing.
+        overrides: of all scans, after those of a table.
+        place: folder in which the folders of the runs would be created; None: the configured ones.
+        rehearse, no_live: as of `load`.
+    """
+    locks = cache(no_locks)  # once a folder: on a network disk it takes a while
+
+    def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
+        try:
+            found = read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+        except (ConfigError, DataError, OSError) as error:
+            return PlannedScan(source, faults=_faults_of(error, str(file)))
+        return plan_of_config(found.config, place, source, found, locks)
+
+    described = (scan for each in scans for scan in _described(each))
+    return queue_of(scan if isinstance(scan, PlannedScan) else planned(*scan) for scan in described)
+
+
+def _described(scan: Path | Mapping[str, object] | PlannedScan) -> Iterator[_Described | PlannedScan]:
+    """The scans of a file, a table or a row; those that are not described as expected are planned with that fault."""
+    if isinstance(scan, PlannedScan):
+        yield scan
+        return
+    if isinstance(scan, Path):
+        yield from _rows(scan) if scan.suffix.lower() == TABLE else [(str(scan), scan, ())]
+        return
+    source = str(scan.get(_CONFIG, "a mapping"))
+    try:
+        if not isinstance(file := scan.get(_CONFIG), str | Path):
+            raise ConfigError(
+                f"the mapping {dict(scan)} names no configuration; expected its file under {_CONFIG!r}.{_NOTHING}"
+            )
+        yield source, Path(file), [override_of(key, value) for key, value in scan.items() if key != _CONFIG]
+    except ConfigError as error:
+        yield PlannedScan(source, faults=_faults_of(error))
+
+
+def _rows(table: Path) -> Iterator[_Described | PlannedScan]:
+    """The scan of each line of a table."""
+    try:
+        reader = csv.reader(io.StringIO(text_in(table, SETTINGS), newline=""), strict=True)
+        numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except (OSError, csv.Error) as error:
+        yield PlannedScan(str(table), faults=(ScanFault(f"{table} cannot be read as a table ({error})", str(table)),))
+        return
+    head = numbered[0][1] if numbered else []
+    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
+        fault = (
+            f"{table} is not a table of scans. Expected a first line with names, such as "
+            "config,sample.name,scan.exposure_s, each only once, then one line per scan"
+        )
+        yield PlannedScan(str(table), faults=(ScanFault(fault, str(table)),))
+        return
+    for number, row in numbered[1:]:
+        if not any(row):
+            continue
+        cells, place = dict(zip(head, row, strict=False)), f"{table}:{number}"
+        if len(row) > len(head) or not cells.get(_CONFIG):
+            fault = (
+                f"{','.join(row)!r} has {count(len(row), 'cell')}; expected {len(head)}, with a file under {_CONFIG}"
+            )
+            yield PlannedScan(place, faults=(ScanFault(fault, str(table), number),))
+            continue
+        own = [(f"{key}={value}", place) for key, value in cells.items() if key != _CONFIG and value]
+        yield place, table.parent / cells[_CONFIG], own
+
+
+def plan_of_config(
+    config: Config,
+    place: Path | None,
+    source: str,
+    read: ReadConfig | None = None,
+    locks: Callable[[Path], str] = no_locks,
+) -> PlannedScan:
+    """The planned scan of a configuration.
+
+    Args:
+        place, source: as in `plan_queue` and `PlannedScan`.
+        read: the configuration with its places, and with what is wrong with it; None: nothing is known to be.
+        locks: as in `dry_run`.
+    """
+    faults = [] if read is None else [_placed_at(at, sentence) for at, sentence in read.faults]
+    planned = PlannedScan(source, config.sample.name, config=config)
+    try:
+        unusual = doubts(config)
+        worked = dry_run(config, place, locks=locks)
+    except (ConfigError, DataError, OSError) as error:  # which the faults of the values may have caused
+        return replace(planned, faults=tuple(faults or [_named_in(read, fault) for fault in _faults_of(error)]))
+    warnings = [warning for warning in unusual if all(warning not in fault.message for fault in faults)]
+    faults += [_named_in(read, ScanFault(sentence)) for sentence in worked.timeline.violations]
+    planned = replace(planned, faults=tuple(faults), warnings=tuple(warnings))
+    return replace(planned, needs=worked.needs, disk=worked.disk, worked=worked)
+
+
+def _faults_of(error: Exception, file: str | None = None) -> tuple[ScanFault, ...]:
+    if isinstance(error, ConfigError) and error.faults:
+        return tuple(_placed_at(place, sentence) for place, sentence in error.faults)
+    return (ScanFault(user_message(error).removesuffix(_NOTHING).removesuffix("."), file),)
+
+
+def _placed_at(place: str, sentence: str) -> ScanFault:
+    """The fault of a value by its place: file:line, or an option or a variable."""
+    file, _, line = place.rpartition(":")
+    is_file = line.isdecimal() and not place.startswith("--")
+    return ScanFault(sentence, file, int(line)) if is_file else ScanFault(f"{place}: {sentence}")
+
+
+def _named_in(read: ReadConfig | None, fault: ScanFault) -> ScanFault:
+    """The fault with the place of the first key that its sentence names."""
+    key = _KEY.search(fault.message)
+    return fault if read is None or key is None else _placed_at(read.tree.origin((*key[0].split("."),)), fault.message)

@@ -1,0 +1,81 @@
+"""Whether iterations end because the volume stands still, and what the settings of a volume say about their end."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+from recon.base.choices import Quality
+from recon.base.decisions import Decisions
+from recon.voxels.devices import CPU, VoxelDevice
+
+MOST_SWEEPS, USUAL_SWEEPS = 60, 30
+"""Largest number of sweeps, and the usual number until the volume stands still."""
+ENDED = "ended", "ended_after", "last_change"
+"""Names of the settings that say how the sweeps ended ("still": the volume stood still; "stopped"; "bound": all were
+made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
+MIRRORED = 4
+"""After this many sweeps total variation takes the same differences again, see `TotalVariationProx`. Therefore volumes
+that are compared lie this many sweeps apart."""
+_STILL = "still"  # name of the decision whether the volume stands still
+_QUALITIES: dict[Quality, tuple[float, int]] = {"preview": (4.0, 1), "standard": (1.0, 1), "best": (0.25, 4)}
+# factors on the change of a volume that stands still, and on the largest number of iterations
+
+MethodT = TypeVar("MethodT")
+
+
+class Standstill:
+    """Decides after each sweep whether the sweeps end.
+
+    The volume stands still if four sweeps together change it by less than `still` of its norm. Memory: one volume.
+
+    Args:
+        still: share of the norm of the volume; 0: all sweeps are made.
+        first: number of sweeps after which the volume is compared for the first time with a later one.
+    """
+
+    def __init__(self, decide: Decisions, still: float, device: VoxelDevice[Any] = CPU, first: int = 0) -> None:
+        self._decide, self._still, self._device, self._first = decide, still, device, first
+        self._before: Any = None
+        self._change, self._ended, self._done = math.inf, "bound", 0
+
+    def ends(self, x: Any, done: int, going: bool) -> bool:
+        """Whether the sweeps end with the volume x [y, x, z] after `done` of them; `going`: they were not stopped."""
+        self._done = done
+        since = done - 1 - self._first
+        if since >= 0 and since % MIRRORED == 0:
+            self._change = self._change_of(x)
+            if self._decide(_STILL, partial(operator.lt, self._change, self._still)):
+                self._ended = "still"
+                return True
+        if not going:
+            self._ended = "stopped"
+        return not going
+
+    def report(self) -> None:
+        """Put the settings `ENDED` into the record of the volume."""
+        values = self._ended, self._done, self._change
+        self._decide.settings |= {name: value for name, value in zip(ENDED, values, strict=True) if value != math.inf}
+
+    def _change_of(self, x: Any) -> float:
+        """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""
+        device = self._device
+        if self._before is None:
+            self._before = device.copy(x)
+            return math.inf
+        device.combine(1.0, x, -1.0, self._before, self._before)
+        size = device.norm(x)
+        change = device.norm(self._before) / size if size > 0 else 0.0
+        device.combine(1.0, x, 0.0, x, self._before)
+        return change
+
+
+def with_quality(method: MethodT, quality: Quality) -> MethodT:
+    """The method, which has `still` and `iterations`, with an end nearer to the minimum, or further from it."""
+    still, longer = _QUALITIES[quality]
+    settings: Any = method
+    made: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
+    return made

@@ -1,0 +1,80 @@
+"""Benchmark of where methods end: what 200 further iterations change, and dB against the number of iterations.
+
+python -m tests.bench.ends [--columns 192] [--views 30 45 90 180] [--photons 1e4] [--scene packed] [--methods NAME ...]
+
+It prints a table with a row for each method and number of projections: how many iterations the default made, its PSNR,
+the PSNR after 200 more with the same weights, and the PSNR after some smaller numbers of iterations. Scenes, noise and
+PSNR are those of tests.bench.first_users.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import recon
+from recon.auto import method_named
+from recon.base.method import Method
+from tests.bench.first_users import Cell, judged, noisy
+from tests.bench.first_users_scenes import scene_of
+
+METHODS = ["fista-tv", "discrete", "os-sirt-tv", "pnp-dct", "asd-pocs", "sirt"]
+MORE = 200
+SHARES = 0.25, 0.5
+"""Parts of the default's number of iterations whose volumes are judged, too."""
+OF_WEIGHT = {"tv_weight_chosen": "tv_weight"}
+"""Settings of the result that say what was chosen, and the settings of the method that state it."""
+
+
+def stated(method: Method, settings: dict[str, Any], iterations: int) -> Method:
+    """The method with the weights that it chose, which makes so many iterations, and does not end before."""
+    changes: dict[str, Any] = {"iterations": iterations}
+    changes |= {mine: settings[name] for name, mine in OF_WEIGHT.items() if name in settings and hasattr(method, mine)}
+    if hasattr(method, "still"):
+        changes["still"] = 0.0
+    return replace(method, **changes)  # type: ignore[type-var]
+
+
+def row(cell: Cell, name: str) -> str:
+    scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views, cell.packing)
+    views, rows = noisy(cell, scene), range(cell.rows)
+    method = method_named(name)
+    begin = time.process_time()
+    default = recon.reconstruct(views, scene.geometry, method=method)
+    seconds = time.process_time() - begin
+    made = int(default.settings.get("ended_after", default.settings["iterations"]))
+    decibels = judged(default.volume.data, scene, rows)[0]
+    line = [name, str(cell.views), str(made), default.settings.get("ended", "schedule"), f"{decibels:.2f}"]
+    for iterations in (made + MORE, *(max(1, round(share * made)) for share in SHARES)):
+        with_weight = stated(method, default.settings, iterations)
+        volume = recon.reconstruct(views, scene.geometry, method=with_weight).volume.data
+        line.append(f"{judged(volume, scene, rows)[0]:.2f}")
+    return "| " + " | ".join([*line, f"{seconds:.1f}"]) + " |"
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="packed")
+    parser.add_argument("--columns", type=int, default=192)
+    parser.add_argument("--views", type=int, nargs="+", default=[30, 45, 90, 180])
+    parser.add_argument("--photons", type=float, default=1e4)
+    parser.add_argument("--packing", type=int, default=0)
+    parser.add_argument(
+        "--methods", nargs="+", default=["fista-tv", "discrete", "os-sirt-tv", "pnp-dct", "asd-pocs", "sirt"]
+    )
+    asked = parser.parse_args(arguments)
+    warnings.simplefilter("ignore")
+    print("| method | projections | iterations | how it ended | PSNR (dB) | 200 iterations more (dB) "
+          "| a quarter of them (dB) | half of them (dB) | CPU (s) |\n" + "|---" * 9 + "|")  # fmt: skip
+    for views in asked.views:
+        cell = Cell(asked.scene, asked.columns, views, 1.0, asked.photons, 0, asked.packing)
+        for name in asked.methods:
+            print(row(cell, name), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
