@@ -102,8 +102,8 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
-_ALLOWED_IN_RECIPES = ("angles", "angle-rows", "darks", "flats", "scanner-file")
-"""Options about the data of one scan that are allowed in a recipe, in which they apply to all scans."""
+_ALLOWED_IN_RECIPES = ("angles", "angle-rows", "darks", "flats", "scanner-file", "cluster")
+"""Options of one call that are allowed in a recipe, in which they apply to all scans of a batch."""
 
 
 def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
