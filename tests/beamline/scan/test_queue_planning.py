@@ -108,7 +108,7 @@ def test_a_file_of_angles_that_is_wrong_has_the_line_that_names_it(tmp_path: Pat
     (fault,) = plan_queue([tmp_path / "a.yaml"], place=tmp_path).scans[0].faults
     angles = tmp_path / "angles.txt"
     assert fault.message.startswith(
-        f"scan.angles.path: {angles}: line 3 holds 'x'; expected one angle in degrees a line"
+        f"scan.angles.path: {angles}: line 3 contains 'x'; expected one angle in degrees per line"
     )
     assert (fault.file, fault.line) == (str(tmp_path / "a.yaml"), 19)
 
