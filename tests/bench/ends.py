@@ -13,6 +13,7 @@ import argparse
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +31,7 @@ OF_WEIGHT = {"tv_weight_chosen": "tv_weight"}
 """Settings of the result that say what was chosen, and the settings of the method that state it."""
 
 
-def stated(method: Method, settings: dict[str, Any], iterations: int) -> Method:
+def stated(method: Method, settings: Mapping[str, Any], iterations: int) -> Method:
     """The method with the weights that it chose, which makes so many iterations, and does not end before."""
     changes: dict[str, Any] = {"iterations": iterations}
     changes |= {mine: settings[name] for name, mine in OF_WEIGHT.items() if name in settings and hasattr(method, mine)}
@@ -47,8 +48,9 @@ def row(cell: Cell, name: str) -> str:
     default = recon.reconstruct(views, scene.geometry, method=method)
     seconds = time.process_time() - begin
     made = int(default.settings.get("ended_after", default.settings["iterations"]))
+    ended = str(default.settings.get("ended", "schedule"))
     decibels = judged(default.volume.data, scene, rows)[0]
-    line = [name, str(cell.views), str(made), default.settings.get("ended", "schedule"), f"{decibels:.2f}"]
+    line = [name, str(cell.views), str(made), ended, f"{decibels:.2f}"]
     for iterations in (made + MORE, *(max(1, round(share * made)) for share in SHARES)):
         with_weight = stated(method, default.settings, iterations)
         volume = recon.reconstruct(views, scene.geometry, method=with_weight).volume.data
