@@ -33,7 +33,7 @@ from recon.voxels.beyond_field import run_on_extended_grid
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LOOKED_AT, _LARGEST = 2**16, 1e15  # values; of line integrals, whose true ones end at about 15
+_LOOKED_AT, _LARGEST = 2**16, 1e15  # values in the sample; largest line integral (true ones end at about 15)
 
 
 def reconstruct(
@@ -50,27 +50,28 @@ def reconstruct(
     """Reconstruct a volume from line integrals.
 
     Args:
-        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
-            finite, or masked, are filled from their neighbours and weigh nothing. Or what was counted, where photons
-            are few. The method is then given line integrals and weights that carry the likelihood of the counts, see
-            `recon.prep.counts.line_integrals`; `use.weights` multiply them.
+        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
+        masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
+        `Counts` instead. The method then gets line integrals with weights that represent the likelihood of the counts,
+        see `recon.prep.counts.line_integrals`; they are multiplied by `use.weights`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
-        grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
-            small box holds what the whole volume holds there.
-        seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.
-        device: that the method computes on, "cpu" or "cuda" (the current CUDA device).
-        use: weights of the rays and views held out; None: equal weights, all views used.
-        control: how to watch, end and continue the reconstruction.
+        grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
+        projections see, so a smaller box is identical to that part of the whole volume.
+        seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
+        of threads.
+        device: where the method computes: "cpu" or "cuda" (the current CUDA device).
+        use: weights of the rays, and held-out projections; None: equal weights, and all projections are used.
+        control: how to follow, stop and resume the reconstruction.
 
     Raises:
-        ValueError: an unknown method, shapes that disagree, views from one side only, an axis outside the detector,
-            data without matter, a negative seed, or views, views held out, a device or a checkpoint that the method
-            does not take.
+        ValueError: the method is unknown, shapes do not match, all projections are from one side, the axis is outside
+        the detector, the projections show no material, the seed is negative, or the method cannot use the projections,
+        the held-out projections, the device or the checkpoint.
 
     Warns:
-        UserWarning: projections are not finite where weights do not leave them out, angles look like degrees,
-            projections like counts or transmission, or like -1 times line integrals.
+        UserWarning: values with a weight are not finite, angles look like degrees, or the projections look like counts,
+        like transmission or like line integrals of the wrong sign.
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())
@@ -85,7 +86,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if not chosen.allow_negative:  # a method with that setting may be asked for such voxels
+    if not chosen.allow_negative:  # a method with that setting can make such voxels
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
@@ -98,7 +99,7 @@ def reconstruct(
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
-    """Warn of values that are not finite, except those that weights leave out."""
+    """Warn if values are not finite, except those with weight 0."""
     lost = sum(
         int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
         for at, view in enumerate(data)
@@ -106,8 +107,8 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | R
     )
     if 0 < lost < data.size:
         warnings.warn(
-            f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
-            "and weigh nothing. If you know which they are, give them the weight 0 in DataUse(weights)",
+            f"{lost} of {data.size} values of the projections are not finite. They are filled from their neighbours "
+            "and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 
