@@ -313,7 +313,7 @@ def test_misuse_is_named() -> None:
         solve(Sirt(), projector, views[..., 1:])
     with pytest.raises(ValueError, match="iterations must be"):
         solve(Sirt(0), projector, views)
-    with pytest.raises(ValueError, match="zero everywhere"):
+    with pytest.raises(ValueError, match="all projections are zero"):
         solve(Sirt(), projector, np.zeros_like(views))
     with pytest.raises(ValueError, match="not all zero"):
         solve(Sirt(), projector, views, weight=np.zeros_like(views))
