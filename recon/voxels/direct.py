@@ -139,9 +139,9 @@ def _by_slabs(
     require_views(geometry, projections)
     if geometry.climbs:  # each voxel would lack the projections that do not see it
         raise ValueError(
-            "use an iterative method (fista-tv, sirt): the projections move along the rotation axis by "
-            f"{np.ptp(geometry.shifts[:, 1])} of {geometry.detector_shape[0]} rows. Direct methods support this only "
-            "for a parallel beam without roll and tilt"
+            f"use an iterative method (fista-tv, sirt): the projections move by {np.ptp(geometry.shifts[:, 1]):.4g} "
+            f"of {geometry.detector_shape[0]} rows along the rotation axis. Direct methods support this only for a "
+            "parallel beam without roll and tilt"
         )
     if (reach := float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))) >= geometry.sod:
         raise ValueError(
@@ -245,9 +245,9 @@ def posed_direct(
     """Reconstruct rolled and tilted projections [view, row, col]; arguments, result and errors as for `fbp` and `fdk`.
 
     There are two differences. The ramp filter acts perpendicular to the rotation axis, which on a rolled detector is
-    not the direction of the rows. Each voxel reads the filtered projections where its own ray meets the detector, so that
-    no projection is resampled. A tilted projection has the weight cos(tilt). The extrapolation beyond an edge is smooth
-    from row to row. In the weights of columns that are measured twice, rolled and tilted projections count as straight.
+    not the direction of the rows. Each voxel reads the filtered projections where its own ray meets the detector, so
+    that no projection is resampled. A tilted projection has the weight cos(tilt). The extrapolation beyond an edge is
+    smooth from row to row. In the weights of columns that are measured twice, rolled and tilted projections count as straight.
     """
     if geometry.centres.any():
         raise ValueError(
