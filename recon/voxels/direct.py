@@ -247,7 +247,8 @@ def posed_direct(
     There are two differences. The ramp filter acts perpendicular to the rotation axis, which on a rolled detector is
     not the direction of the rows. Each voxel reads the filtered projections where its own ray meets the detector, so
     that no projection is resampled. A tilted projection has the weight cos(tilt). The extrapolation beyond an edge is
-    smooth from row to row. In the weights of columns that are measured twice, rolled and tilted projections count as straight.
+    smooth from row to row. In the weights of columns that are measured twice, rolled and tilted projections count as
+    straight.
     """
     if geometry.centres.any():
         raise ValueError(

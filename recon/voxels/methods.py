@@ -46,24 +46,24 @@ from recon.voxels.voxel_problem import (
 )
 
 QUALITIES: dict[Quality, tuple[float, int]] = {"preview": (4.0, 1), "standard": (1.0, 1), "best": (0.25, 4)}
-"""Factors on the change of a volume that stands still, and on the largest number of iterations."""
+"""Factors of the presets on `still`, and on the largest number of iterations."""
 
 
 @dataclass(frozen=True)
 class FistaTv(VoxelMethod):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
 
-    The iterations end when the volume stands still: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
+    The iterations end when the volume has converged: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
     and 2 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
         tv_weight: None: μ follows from held-out projections, or from the noise of the data, see `choose_weight`. A
-            number: the threshold of one step of FISTA in density units, μ = tv_weight x density unit x ||A||².
+            number: the threshold of one FISTA step in density units, μ = tv_weight x density unit x ||A||².
         subsets: largest number of subsets in the first iterations, with one step each.
         tv_steps: dual steps of total variation in each step.
-        still: the volume stands still if four iterations together change it by less than this share of its norm; 0: all
-            iterations are made.
+        still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
+            all iterations are made.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -89,7 +89,7 @@ class FistaTv(VoxelMethod):
 
     @property
     def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume stands still."""
+        """Usual number of iterations until the volume has converged."""
         return min(self.iterations, USUAL_SWEEPS)
 
     def refit(self, share: float) -> VoxelMethod:
@@ -98,12 +98,12 @@ class FistaTv(VoxelMethod):
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The method that ends nearer to the minimum, or further from it."""
+        """The method that ends nearer to the minimum (or, for a preview, farther from it)."""
         still, longer = QUALITIES[quality]
         return replace(self, still=still * self.still, iterations=longer * self.iterations)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best weight. If the method has a weight of its own: the prediction of its volume."""
+        """The prediction with the best weight. If `tv_weight` is given, the prediction of its own volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
@@ -138,7 +138,7 @@ class FistaTv(VoxelMethod):
 
 @dataclass(frozen=True)
 class EarlyTv(FistaTv):
-    """`FistaTv` with a fixed number of iterations on subsets, which end before the volume stands still.
+    """`FistaTv` with a fixed number of iterations on subsets, which end before the volume has converged.
 
     It is for volumes that are only compared with each other.
     """
@@ -151,18 +151,19 @@ class EarlyTv(FistaTv):
 
 @dataclass(frozen=True)
 class OsSirtTv(VoxelMethod):
-    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes and 3 times the
-    projections.
+    """Each iteration is one of ordered-subset SIRT, followed by a proximal step of total variation.
 
-    It is for views of very few photons (10 to 30 a pixel: up to 2 dB ahead), and with `momentum` for a quick volume.
-    Of a cone its weight follows the noise: 2.3 dB behind FISTA-TV on a thorax, whose weight views held out choose.
+    Use it for very few photons (10 to 30 per pixel: up to 2 dB better than FISTA-TV), or with `momentum` for a quick
+    volume. For a cone its weight follows the noise: on a thorax it is 2.3 dB behind FISTA-TV, whose weight is chosen by
+    held-out projections. Memory: 6 volumes and 3 times the projections.
 
     Attributes:
-        tv_weight: threshold of that step in density units; None: by views held out or by the noise, see
-            `choose_weight`.
-        momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
-            167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
-            -0.1 and -1.0 dB: noise comes in sooner, too.
+        tv_weight: threshold of the proximal step in density units; None: chosen by held-out projections or from the
+            noise, see `choose_weight`.
+        momentum: True: continue each iteration along the last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med.
+            Imaging 34, 167), which gives a volume quickly and needs two more volumes of memory. After 10 iterations it
+            gains 4.2 dB (battery) and 2.1 dB (walnut); after 40 it loses 0.1 and 1.0 dB, because noise also comes in
+            sooner.
     """
 
     name: ClassVar[str] = "os-sirt-tv"
@@ -200,7 +201,7 @@ class OsSirtTv(VoxelMethod):
                 threshold = float(mu * problem.decide("pace", lambda: sweeps.pace))
                 prox(x, threshold)
             else:
-                # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
+                # The unit follows the volume, because the volume is blurred and fainter after the first iterations.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
             prox.turn()
             if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == self.iterations:
@@ -218,11 +219,13 @@ class OsSirtTv(VoxelMethod):
 
 @dataclass(frozen=True)
 class PnpDct(VoxelMethod):
-    """Steps towards the views, and patches of 4 x 4 x 4 voxels with few cosine coefficients, in turn; see
-    `recon.voxels.priors`. The first volume is that of FISTA-TV, unless one is given. Memory: as `FistaTv`.
+    """Alternates steps towards the projections with a denoiser of patches of 4 x 4 x 4 voxels (PnP-DCT).
+
+    The denoiser keeps few cosine coefficients of each patch, see `recon.voxels.priors`. The first volume is that of
+    FISTA-TV, unless one is given. Memory: as for `FistaTv`.
 
     Attributes:
-        iterations: steps towards the views, five between two thresholds.
+        iterations: steps towards the projections, five for each threshold.
         patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
             `choose_patches`, or the noise sets it.
     """
@@ -242,23 +245,23 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
+        """Iterations for the weight of total variation and a first volume, and steps with four thresholds."""
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
     def trial_steps(self) -> int:
-        """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
+        """Steps with patches in a test reconstruction: as many as for the volume, but at most the usual number."""
         return min(self.iterations, PnpDct.iterations)
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """None: the steps are a schedule."""
+        """None, because the number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best threshold; with one of its own that of the method's volume.
+        """The prediction with the best threshold. If `patch_threshold` is given, the prediction of its own volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.wide`.
+        If the sample is wider than the field of view, it is not tried after simpler methods, see `Trial.wide`.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(
@@ -278,7 +281,7 @@ class PnpDct(VoxelMethod):
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not first.going:
             return x
-        for name in ENDED:  # of the first volume; patches follow
+        for name in ENDED:  # of the first volume; patches follow it
             problem.decide.settings.pop(name, None)
         share = self.patch_threshold
         if share is None:
@@ -291,7 +294,8 @@ class PnpDct(VoxelMethod):
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape
         patches = 4 * scratch_values((ny, nx, nz)) + bytes_of(self.buffers, geometry, grid, weighted)
-        # Beside the first volume, trials make total variation of copies of the views: where rows are few, of all.
+        # In addition to the first volume, tests make volumes from copies of the projections (of all if there are few
+        # rows).
         trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
         first = FistaTv().memory(geometry, grid, weighted) + trials
         return max(first, patches)
