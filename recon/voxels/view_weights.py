@@ -267,9 +267,8 @@ class Wedge(NamedTuple):
 
     @property
     def rays(self) -> tuple[float, float]:
-        """Directions of the first and the last ray in degrees from x towards y.
-
-        Rays are perpendicular to the columns' axis.
+        """Directions of the first and the last ray in degrees from x towards y, at right angles to u of their
+        projection.
         """
         first = (math.degrees(self.first) + 90) % 180
         return first, first + math.degrees(self.size)
