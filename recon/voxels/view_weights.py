@@ -232,9 +232,13 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     order, beta, cells = _arc(geometry.angles)
     lacking = missing_arc(geometry)
     if lacking > 0:
-        need = f"a gap: another {np.rad2deg(lacking):.4g} degrees are needed" if lacking < math.inf else "several gaps"
+        need = (
+            f"another {np.rad2deg(lacking):.4g} degrees are"
+            if lacking < math.inf
+            else "angles without several gaps are"
+        )
         raise ValueError(
-            f"use an iterative method (fista-tv, sirt): the angles leave {need}, or no projection sees some rays of "
+            f"use an iterative method (fista-tv, sirt): for FDK {need} needed, because no projection sees some rays of "
             "the field of view. FDK needs a full circle, or a short scan of 180 degrees plus the fan angle"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]

@@ -265,7 +265,7 @@ def test_misfits_are_named() -> None:
     near = Geometry.cone([0.1, np.pi / 4], (3, 48), 1.0, 1.02 * 4 * np.sqrt(2), 40.0)
     with pytest.raises(ValueError, match="half a voxel beyond"):  # which has weight in rays, behind the source
         Projector(near, Grid((1, 8, 8)))
-    with pytest.raises(ValueError, match=r"volume has shape \(3, 2, 2\)"):
+    with pytest.raises(ValueError, match=r"volume must have the shape .* got \(3, 2, 2\)"):
         Projector(geometry, volume.grid).forward(np.zeros((3, 2, 2), np.float32))
 
 
