@@ -271,9 +271,7 @@ class Wedge(NamedTuple):
 
     @property
     def rays(self) -> tuple[float, float]:
-        """Directions of the first and the last ray in degrees from x towards y, at right angles to u of their
-        projection.
-        """
+        """Directions of the first and the last ray in degrees from x towards y, each at right angles to u."""
         first = (math.degrees(self.first) + 90) % 180
         return first, first + math.degrees(self.size)
 

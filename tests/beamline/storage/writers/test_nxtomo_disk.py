@@ -53,7 +53,7 @@ def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
     append(writer, *frames[:3])
     with monkeypatch.context() as patch:
         patch.setattr(h5py.Dataset, "resize", Mock(side_effect=OSError(28, "No space left on device")))
-        with pytest.raises(DataError, match=r"Could not store the end of a pass in .*s\.h5.*No space left.*first 3 frames"):
+        with pytest.raises(DataError, match=r"store the end of a pass in .*s\.h5.*No space left.*first 3 frames"):
             writer.end_pass()
     writer.add_decision({"choice": "next"})  # nothing more is written
     writer.close()
