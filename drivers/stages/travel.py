@@ -164,7 +164,7 @@ class Travel:
             reply=reply,
             expected=f"to be at {aim}" if aim else "",
             advice="Allow more time, or stop it",
-            state=f"It was not stopped, and is at {self.degrees(counts)}",
+            state=f"It was left moving, and is at {self.degrees(counts)}",
         )
 
     def not_stopped(self, timeout: float, counts: int, request: str) -> DeviceTimeout:

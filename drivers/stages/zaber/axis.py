@@ -54,7 +54,7 @@ FAULTS = {
 """Flags of faults; the motor driver may be off."""
 ENDINGS = {
     "WL": Meaning(
-        "it reached a limit switch at an unexpected position",
+        "reached a limit switch at an unexpected position",
         "Check travel limits and cables, then search the reference",
     ),
     "WV": Meaning("supply voltage out of range", "Check the power supply"),
@@ -306,7 +306,7 @@ class ZaberAxis:
                 request=words,
                 reply=reply.raw,
                 advice="Check the configuration against the device, and that no other program controls it",
-                state="The current move continues" if reply.busy else "The request has moved nothing",
+                state="The current move continues" if reply.busy else "Nothing has moved because of this request",
             )
         return reply
 

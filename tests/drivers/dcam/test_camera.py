@@ -237,7 +237,7 @@ def test_an_index_too_high_is_said(world: World) -> None:
 
 def test_a_camera_that_refuses_its_first_setting_is_let_go(world: World) -> None:
     world.fault("refuse", 0x00100110)
-    with pytest.raises(DeviceRefused, match="refuses TRIGGERSOURCE"):
+    with pytest.raises(DeviceRefused, match="rejects TRIGGERSOURCE"):
         world.connect()
     assert world.live == 0
 

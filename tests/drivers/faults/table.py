@@ -180,7 +180,7 @@ MOTION: tuple[MotionFault, ...] = (
         "limit switch",
         lambda rig: rig.block(switch_at=BETWEEN),
         {"pm16c": "limit", "pi_gcs": "positive limit switch", "zaber": r"limit error \(FE\)"},
-        flags={"zaber": r"limit error \(FE\), it reached a limit switch at an unexpected position \(WL\)"},
+        flags={"zaber": r"limit error \(FE\), reached a limit switch at an unexpected position \(WL\)"},
     ),
     MotionFault(
         "stopped by somebody else",

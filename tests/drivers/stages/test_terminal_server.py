@@ -51,7 +51,7 @@ class Server:
         return data
 
 
-TELNET = ("the server uses Telnet", "raw TCP: no Telnet")
+TELNET = ("the server uses Telnet", "raw TCP, without Telnet")
 FOREIGN = {
     "negotiates": ({"first": NEGOTIATION}, TELNET),
     "echoes": ({"first": NEGOTIATION[:6]}, TELNET),

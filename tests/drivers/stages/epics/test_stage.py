@@ -172,6 +172,6 @@ def test_a_disabled_record_that_takes_no_value_is_named() -> None:
     stage = _stage(url, clock)
     record.write(".DISP", 1)
     stage.start_move(math.radians(20), SPEED)
-    with pytest.raises(DeviceError, match=r"0\.0000 deg, 0 counts: DISP is 1:"):
+    with pytest.raises(DeviceError, match=r"0\.0000 deg, 0 counts: DISP is 1,"):
         stage.wait(60)
     stage.close()

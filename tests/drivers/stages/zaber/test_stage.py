@@ -122,7 +122,7 @@ SLIPS = [
     ("WS", "stalled and recovered"),
     ("WM", "displaced while at rest"),
     ("NC", "moved by its knob"),
-    ("WL", "it reached a limit switch at an unexpected position"),
+    ("WL", "reached a limit switch at an unexpected position"),
 ]
 
 
