@@ -118,9 +118,9 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     some = some[np.isfinite(some)]
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
-            f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0, -log of the transmission: change the sign. For differences of views, set "
-            "allow_negative in methods that keep no voxel below 0",
+            "change the sign of the projections: most of their values are below 0 (mean "
+            f"{some.mean(dtype=np.float64):.4g}), but line integrals of material, -log of the transmission, are above "
+            "0. If the projections are differences, set allow_negative in methods that clip voxels at 0",
             stacklevel=3,
         )
 
@@ -129,30 +129,30 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
     if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
-            f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
-            "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
-            "for it. Give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate of sharp "
-            "edges",
+            "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp edges. "
+            f"In all projections the rotation axis is tilted along the beam by {math.degrees(lean):.3g} degrees or "
+            "more, so no projection measures structure along the axis, such as the faces of a plate, and held-out "
+            "projections choose too small a weight",
             stacklevel=3,
         )
 
 
 def _refuse_geometry(geometry: Geometry) -> None:
-    """Raise ValueError for views from one side only, and for an axis outside the detector."""
-    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
-    # A cone's, and those that look down on the rotation axis, differ up to the whole turn.
+    """Raise ValueError if all projections are from one side, or if the axis is outside the detector."""
+    # Parallel projections 180° apart contain the same rays, so |sin| of the angle between two shows whether they
+    # differ. Projections of a cone, and those with a tilt along the beam, differ up to 360°.
     turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
     if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(
-            f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "
-            "determine a volume; give at least two, at different angles"
+            "give projections at two or more different angles, because one direction does not determine a volume; "
+            f"got {geometry.n_views} projections from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
         )
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)
 
 
 def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunControl) -> None:
-    """Raises ValueError for arguments that the method would silently ignore."""
+    """Raise ValueError for arguments that the method would silently ignore."""
     wanted = {
         f"device {device!r}": ("device", device != "cpu"),
         "held_out": ("held_out", len(use.held_out) > 0),
@@ -163,11 +163,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
     foreign = [(what, taken) for what, (taken, given) in wanted.items() if given and taken not in method.takes]
     if foreign:
         owners = ", ".join(f"{what} (of {', '.join(accepting(taken))})" for what, taken in foreign)
-        raise ValueError(f"method {method.name!r} has no option {owners}: leave that out, or choose another method")
+        raise ValueError(
+            f"method {method.name!r} has no option {owners}: leave the option out, or choose another method"
+        )
 
 
 def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
-    """Line integrals, and their weights times the given ones."""
+    """Line integrals of the counts, and their weights multiplied by the given weights."""
     require_views(geometry, counts.counts, "counts")
     if use.weights is not None:
         require_views(geometry, use.weights, "weights")
@@ -181,13 +183,14 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     if given.dtype.kind not in "fiub":
         raise ValueError(f"projections must be real numbers, got {given.dtype}")
     require_views(geometry, given)
-    with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
+    with np.errstate(over="ignore"):  # values outside the range of float32 count as not finite
         data = np.ascontiguousarray(given, np.float32)
     some = np.abs(some_values(data, _LOOKED_AT))
     some = some[np.isfinite(some)]
     if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
         raise ValueError(
-            f"one in ten line integrals is above {most:.3g}; up to {_LARGEST:g} are computed with, since float32 holds "
-            "no sums of the squares of larger ones. Divide them by a constant: the volume is then smaller by it"
+            "divide the line integrals by a constant (the volume is then divided by the same constant): one in ten "
+            f"is above {most:.3g}, and the largest possible value is {_LARGEST:g}, because sums of squares would "
+            "exceed the range of float32"
         )
     return data

@@ -108,7 +108,7 @@ class Properties:
                 request=error.request,
                 reply=codes.error_name(error.code),
                 expected="an ORCA-Quest, or a camera with the same properties",
-                advice="Check that index names the right camera, and its firmware",
+                advice="Check that index is the number of the right camera, and check its firmware",
                 state=_STATE,
             ) from error
 

@@ -139,7 +139,7 @@ class Ring:
                 problem,
                 request="dcambuf_lockframe",
                 expected="whole rows of 16-bit pixels",
-                advice=f"{RUNTIME}, and that no other program sets the camera",
+                advice=f"{RUNTIME}, and that no other program changes the camera's settings",
                 state=f"{self._next} frames of this run were taken earlier",
             )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)

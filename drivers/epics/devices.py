@@ -65,10 +65,12 @@ class ShutterPvs(CheckedSettings):
         "Process variable that closes the shutter; null: open_pv is used for both values.",
         problem=url_problem,
     )
-    open_value: float | str = setting(1.0, "Written to open_pv to open it: a number, a text or a label.")
+    open_value: float | str = setting(
+        1.0, "Value that is written to open_pv to open the shutter: a number, a text or a label."
+    )
     close_value: float | str = setting(0.0)
     status_open: float | str = setting(
-        1.0, "Its value or label while the shutter is open; any other value counts as closed."
+        1.0, "Value or label of the status while the shutter is open; any other value counts as closed."
     )
     timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
     travel: float = setting(10.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
@@ -204,14 +206,20 @@ class MonochromatorPvs(CheckedSettings):
     )
     status_pv: str = setting(doc="Process variable with the energy itself.", problem=url_problem)
     stop_pv: str | None = setting(
-        None, "Process variable that stops it if 1 is written; null: it cannot be stopped.", problem=url_problem
+        None,
+        "Process variable that stops the monochromator if 1 is written to it; null: it cannot be stopped.",
+        problem=url_problem,
     )
     unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
     tolerance: float = setting(
         0.5, "Largest allowed difference between the energy and the requested energy.", unit="ev", gt=0, le=1e4
     )
     settle: float = setting(
-        1.0, "How long it must stay within tolerance_ev before a move counts as finished.", unit="s", ge=0, le=1e6
+        1.0,
+        "Time for which the energy must stay within tolerance_ev before a move counts as finished.",
+        unit="s",
+        ge=0,
+        le=1e6,
     )
     timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
     travel: float = setting(60.0, "Longest time of a move.", unit="s", gt=0, le=1e6)

@@ -133,7 +133,7 @@ class SerialLine:
             raise DeviceError(
                 device,
                 f"the transcript {str(transcript)!r} cannot be written: {problem}",
-                advice="Name a file in an existing folder, or no file",
+                advice="Give a file in an existing folder, or no file",
                 state="Nothing was sent",
             ) from problem
         try:
@@ -277,7 +277,7 @@ class SerialLine:
                 "it sends data continuously without a request",
                 request=request,
                 expected="a silent line before the next request",
-                advice="Check the baud rate and that the port is this device's",
+                advice="Check the baud rate, and that this port belongs to the device",
                 state=state,
             )
 

@@ -122,7 +122,7 @@ class Travel:
         return DeviceRefused(
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
-            expected=f"one or more, not closer than {self.limits.pulse_spacing:g} s at full speed, which are "
+            expected=f"one or more pulses, at least {self.limits.pulse_spacing:g} s apart at full speed, which is "
             f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
             state="This train is not armed and nothing was sent for it; the stage is where the last move ended",
@@ -151,7 +151,7 @@ class Travel:
                 self.name,
                 f"the controller itself is limited to {self.degrees(low)} to {self.degrees(high)}",
                 expected=f"room for the configured {self.span}",
-                advice=f"Narrow low and high in the configuration, or {advice}",
+                advice=f"Narrow low_deg and high_deg in the configuration, or {advice}",
                 state="Nothing has moved",
             )
 

@@ -89,7 +89,10 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
         ValueError: the beam is a cone, in which a shift of the sample changes more than the position of the image.
     """
     if geometry.is_cone:
-        raise ValueError("shifts cannot correct projections of a cone beam, because they differ by more than shifts")
+        raise ValueError(
+            "displacements can be corrected only in a parallel beam; in a cone beam a displaced sample changes more "
+            "than the position of its image"
+        )
     x, y, z, turn, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)
     across, down = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch

@@ -158,7 +158,8 @@ class PiGcsStage(LineStage):
             reply=str(code),
             expected="an axis at rest",
             advice=f"{advice(code)}. Frames since then may have been taken at another angle",
-            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(self._axis.counts())}",
+            state="Nothing has moved because of this request; the stage is at "
+            f"{self._travel.degrees(self._axis.counts())}",
         )
 
     def _send_stop(self, hard: bool) -> str:
@@ -200,5 +201,5 @@ class PiGcsStage(LineStage):
             if code in EVENTS
             else "Find what stopped it (limit switch, person) before you move it again",
             state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts"
-            + ("" if status.homed else ", which do not count from the reference"),
+            + ("" if status.homed else ", which are not counted from the reference"),
         )

@@ -129,8 +129,8 @@ class ZaberSettings(Wiring, StageFigures):
         if speed < 1 or steepest < 1:
             raise ValueError(
                 f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² "
-                f"are native values of {speed} and {steepest}; the controller's smallest are 1, "
-                f"{math.degrees(1e4 / per_radian):g} deg/s² for the latter"
+                f"are the native values {speed} and {steepest}, but both must be 1 or more. The smallest acceleration "
+                f"is {math.degrees(1e4 / per_radian):g} deg/s²"
             )
         return speed, steepest
 

@@ -197,7 +197,7 @@ class ZaberStage(LineStage):
             reply=status.raw,
             expected="a stage at rest",
             advice=f"{fault.advice}. Frames since then may have been taken at another angle",
-            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(status.counts)}",
+            state=f"Nothing has moved because of this request; the stage is at {self._travel.degrees(status.counts)}",
         )
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:

@@ -179,7 +179,7 @@ class Jump(PoseEffect, Anomaly):
 
     def __post_init__(self) -> None:
         if not (any(self.shift_um) or self.turn_deg):
-            raise ValueError("shift_um or turn_deg must not be 0")
+            raise ValueError("at least one of shift_um and turn_deg must be other than 0")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         if shot.view < self.view:
