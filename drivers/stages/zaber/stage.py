@@ -20,8 +20,8 @@ from drivers.stages.zaber.axis import INTERRUPTED, LOST, SLIPPED, WHOLE, ZaberAx
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (
-    "Firmware without `schedule` needs toggle. Firmware whose actions cannot enable triggers needs "
-    "chained: false, and room for one step before the first pulse"
+    "For firmware without `schedule`, set toggle: true. For firmware whose actions cannot enable triggers, set "
+    "chained: false and leave room for one step before the first pulse"
 )
 
 
