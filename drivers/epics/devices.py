@@ -175,7 +175,7 @@ class PvFilter(_PvDevice):
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
-                advice="Check where it is, and whether this computer has write access",
+                advice="Check its position, and whether this computer has write access",
             )
 
     def remember_place(self) -> Callable[[], str]:
@@ -275,7 +275,7 @@ class PvMonochromator(_PvDevice):
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
-            advice="Check where it is, and whether this computer has write access",
+            advice="Check its position, and whether this computer has write access",
         )
 
     def stop(self) -> None:
