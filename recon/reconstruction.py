@@ -145,7 +145,7 @@ def _refuse_geometry(geometry: Geometry) -> None:
     if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(
             "give projections at two or more different angles, because one direction does not determine a volume; "
-            f"got {geometry.n_views} projections from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
+            f"got {geometry.n_views} from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
         )
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)
