@@ -36,7 +36,7 @@ def test_a_full_disk_is_named_and_earlier_rows_stay(
     full = Mock(side_effect=OSError(28, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
-        with pytest.raises(DataError, match=r"Could not store the frame in .*s\.h5.*No space left.*are free.*first 1 frames"):
+        with pytest.raises(DataError, match=r"store the frame in .*s\.h5.*No space left.*are free.*first 1 frames"):
             append(writer, frames[1])
     with pytest.raises(DataError, match="earlier write failed"):
         append(writer, frames[1])
