@@ -165,8 +165,8 @@ def _renumbered(numbers: Iterable[int], words: bool = True) -> list[Any]:
         ([*range(0, 5), *range(0, 5), *range(0, 20), *range(0, 5)], True, ""),
         ([(65515 + i - 1) % 65535 + 1 for i in range(35)], False, ""),
         ([(65515 + i) % 65536 for i in range(35)], True, ""),
-        ([5 * i + 5 for i in range(35)], False, "rise by 5: a plugin averages 5 frames"),
-        ([5 * i + 5 for i in range(35)], True, "rise by 5: a plugin averages 5 frames"),
+        ([5 * i + 5 for i in range(35)], False, "rise by 5, because a plugin averages 5 frames"),
+        ([5 * i + 5 for i in range(35)], True, "rise by 5, because a plugin averages 5 frames"),
     ],
 )
 def test_numbers_of_acquisitions_of_16_bits_and_of_a_plugin_that_averages(

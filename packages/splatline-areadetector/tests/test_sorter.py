@@ -267,7 +267,7 @@ def test_a_plugin_that_averages_is_said_and_each_frame_is_a_projection() -> None
     sorter = Sorter(BLOCKS)
     decided = sort(sorter, [Seen(5 * (i + 1), phase) for i, phase in enumerate(phases)])
     assert triggers(decided) == {15 + 5 * i: i for i in range(5)} and sorter.complete
-    assert "rise by 5: a plugin averages 5 frames" in notes(decided)
+    assert "rise by 5, because a plugin averages 5 frames" in notes(decided)
     decided = sort(Sorter([PlannedBlock(VIEW, 9)]), seen((5, 10, 20, 25, 30, 35, 37, 40), VIEWS))
     assert triggers(decided) == {5 * i + 5: i for i in (0, 1, 3, 4, 5, 6, 7)} and isinstance(decided[6][1], Unknown)
     for numbers, lost in (((1, 3, 5, 7, 9), True), ((1, 3, 5, 6, 9), False)):  # the plugin dropped frames, or none
@@ -281,7 +281,7 @@ def test_a_step_learned_from_frames_of_which_every_second_was_lost_is_revised() 
     assert all(triggers(decided)[i] == i - 1 for i in range(12, 21))
     assert "From frame 12 on, numbers rise by 1 instead of 2" in notes(
         decided
-    ) and "up to 11: they may have a wrong" in notes(decided)
+    ) and "up to 11, because they may have a wrong" in notes(decided)
     sorter = Sorter([PlannedBlock(FLAT, 4), PlannedBlock(VIEW, 20)])
     decided = sort(sorter, seen([*range(1, 12, 2), *range(12, 25)], BY_ORDER))
     assert {i: i - 5 for i in range(12, 25)}.items() <= triggers(decided).items() and sorter.complete
