@@ -107,5 +107,5 @@ def test_views_without_matter_are_refused() -> None:
     for empty in (range(VIEWS), range(1, VIEWS, 3)):
         some = views.copy()
         some[list(empty)] = 0
-        with pytest.raises((AxisError, ValueError), match=r"no matter|zero"):
+        with pytest.raises((AxisError, ValueError), match=r"no material|zero"):
             axis_by_views(some, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=29.2))
