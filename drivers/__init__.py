@@ -2,4 +2,4 @@
 
 from pkgutil import extend_path
 
-__path__ = extend_path(__path__, __name__)  # a lab's folder drivers/ without __init__.py adds its modules
+__path__ = extend_path(__path__, __name__)  # another folder drivers/ without __init__.py on the path adds its modules

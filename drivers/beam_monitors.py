@@ -28,11 +28,11 @@ class ElectrometerQuery:
     """Query of an electrometer, and the form of its reply.
 
     Attributes:
-        query: command that asks for a reading; it must have no side effects, since it is also the line's probe (see
-            `SerialLine`).
+        query: command that asks for a reading. It must have no side effects, because it is also the probe of the line
+            (see `SerialLine`).
         pattern: regular expression that every reply contains; any other reply counts as a disturbed line.
         setup: commands without a reply, sent once before the first query.
-        line_end: of commands and replies.
+        line_end: line end of commands and replies.
     """
 
     query: str = QUERY
@@ -52,7 +52,7 @@ class SerialSource:
         timeout, baudrate, transcript: see `SerialLine`.
 
     Raises:
-        DeviceError: the port does not open. DeviceRefused: an empty query.
+        DeviceError: the port does not open. DeviceRefused: the query is empty.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class SerialSource:
         self._line.close()
 
 
-MOST_BYTES = 1 << 20  # Bytes of a page that are read at most; the number must stand within them
+MOST_BYTES = 1 << 20  # largest number of bytes read from a page; the number must be in them
 _PIECE = 1 << 14
 
 
@@ -105,10 +105,10 @@ class PageSource:
 
     Args:
         url: http://..., https://... or file:///...
-        timeout: s, for the whole page and for each wait on the network.
+        timeout: time limit in s for the whole page, and for each wait on the network.
 
     Raises:
-        DeviceRefused: the URL is of another kind.
+        DeviceRefused: the URL is not of one of these kinds.
     """
 
     def __init__(self, url: str, clock: Clock, *, timeout: float = 2.0, name: str = "beam monitor") -> None:
@@ -119,7 +119,7 @@ class PageSource:
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
     def text(self) -> str:
-        """The text of the page, at most MOST_BYTES of it. Raises DeviceTimeout, DeviceError."""
+        """The text of the page, at most its first MOST_BYTES bytes. Raises DeviceTimeout, DeviceError."""
         deadline = self._clock.now() + self._timeout
         try:
             with self._opener.open(self.request, timeout=self._timeout) as page:
@@ -129,7 +129,7 @@ class PageSource:
                 while len(data) < MOST_BYTES and (piece := getattr(page, "read1", page.read)(_PIECE)):
                     data += piece
                     if self._clock.now() > deadline:
-                        raise TimeoutError("the page is longer than a page of a beam monitor can be")
+                        raise TimeoutError("the page is too long for the page of a beam monitor")
         except urllib.error.HTTPError as error:
             error.close()
             raise self._error(DeviceError, f"the server answered {error.code} {error.reason}") from error
@@ -143,11 +143,11 @@ class PageSource:
             raise self._error(DeviceError, f"the page cannot be read ({error or type(error).__name__})") from error
         try:
             return data.decode(charset, errors="replace")
-        except LookupError:  # a charset unknown to Python: digits are ASCII in nearly every charset
+        except LookupError:  # Python does not know the charset; digits are ASCII in nearly every charset
             return data.decode("ascii", errors="replace")
 
     def close(self) -> None:
-        """Does nothing: no connection stays open between readings."""
+        """Does nothing, because no connection stays open between readings."""
 
     def _error(self, kind: type[DeviceError], problem: str) -> DeviceError:
         return kind(
@@ -175,7 +175,7 @@ def url_problem(url: str) -> str:
 OVERFLOW = 9.9e37
 """SCPI instruments send 9.9e37 for "over range" and 9.91e37 for "not a number" (SCPI-99, section 7.2.1)."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_SHOWN = 200  # Characters of the text that an error shows
+_SHOWN = 200  # largest number of characters of the text in an error
 
 
 class TextSource(Protocol):
@@ -195,11 +195,11 @@ class TextBeamMonitor:
 
     Args:
         pattern: regular expression, searched in the text; its first group is the number.
-        unit: of the reading, written to the file.
+        unit: unit of the reading, written to the file.
         scale: factor from the number to `unit`.
 
     Raises:
-        DeviceRefused: a pattern without a group, or a scale that is 0 or not finite.
+        DeviceRefused: the pattern has no group, or the scale is 0 or not finite.
     """
 
     def __init__(
@@ -221,7 +221,10 @@ class TextBeamMonitor:
         self._pattern = re.compile(pattern)
 
     def reading(self) -> BeamReading:
-        """Read the source once. Raises DeviceTimeout, or DeviceError if there is no number, or it is over range."""
+        """Read the source once.
+
+        Raises DeviceTimeout, or DeviceError if the text contains no number or one that is over range.
+        """
         text = self._source.text()
         time = self._clock.now()
         match = self._pattern.search(text)

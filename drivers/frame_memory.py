@@ -1,5 +1,5 @@
-"""FrameMemory: memory for frames that is used again, because new memory for each frame would cost more time than
-copying its pixels.
+"""FrameMemory: memory for frames that is reused, because new memory for each frame takes longer than copying its
+pixels.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 class FrameMemory:
     """Allocates memory for frames, and reuses it when the frame and all its parts are released.
 
-    It keeps as many buffers as there were frames at one time. May be used from any thread.
+    It keeps as many buffers as there were frames at the same time. It can be used from any thread.
     """
 
     def __init__(self) -> None:
@@ -24,24 +24,25 @@ class FrameMemory:
     def prepare(self, n: int, shape: tuple[int, int]) -> None:
         """Allocate memory for `n` frames of a shape, with all pages present.
 
-        It replaces the kept buffers. Further frames allocate memory when they come.
+        This replaces the kept buffers. Further frames allocate memory when they arrive.
 
         Raises:
-            MemoryError: there is too little.
+            MemoryError: there is too little memory.
         """
         self._bytes = 2 * shape[0] * shape[1]
         self._free = deque()
-        self._free.extend(bytearray(b"\1") * self._bytes for _ in range(n))  # written, so that the system gives it
+        # written, so that the system really allocates it
+        self._free.extend(bytearray(b"\1") * self._bytes for _ in range(n))
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.uint16]:
         """An array uint16 [row, col] of arbitrary content, in memory that no other frame uses."""
         wanted = 2 * shape[0] * shape[1]
-        if wanted != self._bytes:  # frames of another size return to the list that is dropped here
+        if wanted != self._bytes:  # buffers of another size return to the old list, which is dropped here
             self._free, self._bytes = deque(), wanted
         try:
             memory = self._free.pop()
         except IndexError:
             memory = bytearray(wanted)
-        whole = np.frombuffer(memory, "<u2")  # every view holds the bytearray, also views of views
+        whole = np.frombuffer(memory, "<u2")  # every numpy view keeps the bytearray alive, also views of views
         weakref.finalize(whole, self._free.append, memory).atexit = False
         return whole.reshape(shape)

@@ -1,5 +1,5 @@
-"""Devices that move in the beam by means of another device: a stage with named positions, a shutter on a digital
-output; and devices moved by hand.
+"""Devices in the beam that another device moves (a stage with named positions, a digital output) or the operator by
+hand.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, RotationStage
 
-POLL = 0.05  # s between looks at a motor that moves
-MARGIN = 10.0  # s beyond twice the time of a move after which it has failed
+POLL = 0.05  # s between two reads while a motor moves
+MARGIN = 10.0  # s; a move has failed after twice its expected time plus this
 INSIDE, OUTSIDE = "into the beam", "out of the beam"
 
 
@@ -25,7 +25,7 @@ class StagePlaces:
     Attributes:
         places: rad of the stage.
         speed: rad/s.
-        failed: how an error begins; the name of the place ends its sentence.
+        failed: beginning of the error sentence; the name of the place is added at its end.
     """
 
     places: Mapping[str, float]
@@ -34,9 +34,10 @@ class StagePlaces:
 
 
 class PlacedStage:
-    """A stage that goes to named places. Implements `drivers.base.protocols.Filter` and `Watchable`.
+    """A stage that moves to named places. Implements `drivers.base.protocols.Filter` and `Watchable`.
 
-    Each call asks the stage where it is, since a person may have moved it, and moves unless it stands there.
+    Each call reads the position of the stage, because a person may have moved it, and moves the stage only if it is
+    elsewhere.
     """
 
     def __init__(self, stage: RotationStage, places: StagePlaces, clock: Clock, name: str = "filter") -> None:
@@ -45,7 +46,10 @@ class PlacedStage:
         self._check: Callable[[], None] = lambda: None
 
     def watch(self, check: Callable[[], None]) -> None:
-        """Call `check` repeatedly during every move from now on; its exception stops the stage and ends the move."""
+        """From now on, call `check` repeatedly during every move.
+
+        An exception from `check` stops the stage and ends the move.
+        """
         self._check = check
 
     def place(self) -> str | None:
@@ -53,7 +57,7 @@ class PlacedStage:
         return next((name for name in self._places.places if self._is_at(name)), None)
 
     def put(self, place: str, beside: float = 0.0) -> None:
-        """Move to a place, or `beside` radians next to it. Raises DeviceError if the stage did not arrive."""
+        """Move to a place, or `beside` radians away from it. Raises DeviceError if the stage did not arrive."""
         stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
         try:
             if self._stands_at(target):
@@ -95,14 +99,14 @@ class PlacedStage:
         return self._stands_at(self._places.places[place])
 
     def _stands_at(self, angle: float) -> bool:
-        """Within the tolerance that the stage's own moves arrive with."""
+        """Whether the stage is at this angle, within the tolerance of its own moves."""
         stage = self._stage
         away = stage.to_counts(stage.position()) - stage.to_counts(angle)
         return abs(away) <= stage.limits.tolerance and not stage.moving()
 
 
 class StageSampleMover:
-    """Implements `drivers.base.protocols.SampleMover` by a stage with the places INSIDE and OUTSIDE."""
+    """Implements `drivers.base.protocols.SampleMover` with a stage that has the places INSIDE and OUTSIDE."""
 
     def __init__(self, motor: PlacedStage, rad_per_mm: float = math.nan) -> None:
         self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
@@ -122,18 +126,19 @@ NOT_KNOWN = "It is not known whether the shutter is open: check it before anybod
 
 
 class OutputShutter:
-    """Implements `drivers.base.protocols.Shutter` on a controller's output.
+    """Implements `drivers.base.protocols.Shutter` with a digital output of a controller.
 
-    Reading back checks the output, not the blade: only the beam shows whether the shutter moved. `close` always sends
-    its command, even if the shutter is known to be closed.
+    Reading back checks the output and not the blade. Only the beam shows whether the shutter moved. `close` always
+    sends its command, even if the shutter is known to be closed.
 
     Args:
         output: the line that drives the shutter.
-        open_high: a high line opens the shutter. With False a low line does, and so does a controller without power.
-        settle: travel time of the blade, s; `open` and `close` wait for it.
+        open_high: True: a high line opens the shutter. False: a low line opens it, and so does a controller without
+            power.
+        settle: travel time of the blade in s; `open` and `close` wait for it.
 
     Raises:
-        DeviceRefused: a settling time that is negative or not finite.
+        DeviceRefused: the settling time is negative or not finite.
     """
 
     by_hand = False
@@ -145,19 +150,19 @@ class OutputShutter:
         if not (math.isfinite(settle) and settle >= 0):
             raise DeviceRefused(name, f"the settling time of {settle} s is not valid", expected="0 or more seconds")
         self._output, self._clock, self._open_high, self._settle = output, clock, open_high, settle
-        self._open: bool | None = None  # level last sent; None before the first command, and after a failure
+        self._open: bool | None = None  # the last level sent; None before the first command and after a failure
 
     def open(self) -> None:
-        """Open and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
+        """Open, and wait for the blade. Raises DeviceError if the output rejects the level or does not keep it."""
         if self._open is None or not self.is_open():
             self._put(True)
 
     def close(self) -> None:
-        """Close and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
+        """Close, and wait for the blade. Raises DeviceError if the output rejects the level or does not keep it."""
         self._put(False)
 
     def is_open(self) -> bool:
-        """True if the output holds the open level; without read-back, whether `open` was the last command sent.
+        """True if the output has the level for "open"; without read-back, True if `open` was the last command sent.
 
         False before the first command. Raises DeviceError.
         """
@@ -197,13 +202,16 @@ class OutputShutter:
 
 
 Ask = Callable[[str], None]
-"""Shows the operator a request and returns once it is confirmed; raises the caller's own error otherwise."""
+"""Function that shows the operator a request and returns when it is confirmed.
+
+Otherwise it raises the caller's error.
+"""
 
 
 class _Manual:
-    """A device that the operator moves; `_state` is what he has confirmed last.
+    """A device that the operator moves; `_state` is the state that the operator confirmed last.
 
-    None: not known, as while the operator is asked, and after a request that was not confirmed.
+    None: the state is not known, for example while the operator is asked, or after a request that was not confirmed.
     """
 
     _name = ""
@@ -213,7 +221,7 @@ class _Manual:
         self._state: Any = None
 
     def _bring(self, state: object, request: str) -> None:
-        """Ask for a state, unless it is the present one."""
+        """Ask the operator for a state, unless it is the present state."""
         if self._state != state:
             self._state = None
             self._ask(request)
@@ -223,7 +231,7 @@ class _Manual:
 class ManualShutter(_Manual):
     """Implements `drivers.base.protocols.Shutter` by asking the operator.
 
-    The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
+    The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later calls ask only
     if the state changes.
     """
 
@@ -237,7 +245,10 @@ class ManualShutter(_Manual):
         self._bring(False, "Close the beam shutter.")
 
     def is_open(self) -> bool:
-        """The state last confirmed; False before the first confirmation, the safe assumption for a measurement."""
+        """The state that was confirmed last.
+
+        False before the first confirmation, which is the safe assumption for a measurement.
+        """
         return self._state is True
 
 
@@ -257,13 +268,13 @@ class ManualSampleMover(_Manual):
         if aside:
             advice = "Configure a stage that moves it (devices.sample_mover)."
             raise DeviceError(
-                "sample mover", f"the sample cannot be moved {aside:g} mm sideways by hand", advice=advice
+                "sample mover", f"the operator cannot move the sample {aside:g} mm sideways by hand", advice=advice
             )
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 
 class ManualFilter(_Manual):
-    """Implements `drivers.base.protocols.Filter` by asking the operator; which one is in at the start is not known."""
+    """Implements `drivers.base.protocols.Filter` by asking the operator. The filter at the start is not known."""
 
     _name = "filter"
 
@@ -276,7 +287,10 @@ class ManualFilter(_Manual):
 
 
 class ManualMonochromator(_Manual):
-    """Implements `drivers.base.protocols.Monochromator` by asking the operator; the first energy is not known."""
+    """Implements `drivers.base.protocols.Monochromator` by asking the operator.
+
+    The energy at the start is not known.
+    """
 
     _name = "monochromator"
 

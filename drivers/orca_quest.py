@@ -1,10 +1,9 @@
-"""ORCA-Quest: limits of its settings and its timing from the data sheet, for planning without a camera, and its
-options.
+"""ORCA-Quest: limits of its settings, its timing from the data sheet (for planning without a camera), and its options.
 
 C15550-20UP (ORCA-Quest): limits and line times from the vendor's property table. C15550-22UP (ORCA-Quest 2) has the
-same sensor. Its line time in ultra quiet follows from 25.4 full frames per second. No public source states that of
-photon number resolving; the same is assumed. The values of a connected camera take precedence. Two rows are read
-together in one line time, so row r starts r / 2 line times after row 0.
+same sensor. Its line time in ultra quiet mode follows from 25.4 full frames per second. No public source states the
+line time for photon number resolving; it is assumed to be the same. The values of a connected camera take precedence.
+Two rows are read together in one line time, so row r starts r / 2 line times after row 0.
 """
 
 from __future__ import annotations
@@ -27,24 +26,30 @@ ROI_STEP = 4
 BINNINGS = (1, 2, 4)
 MODEL = "C15550-20UP"
 LINE_TIME = MappingProxyType({"standard": 7.2e-6, "ultra_quiet": 172.8e-6, "photon_number": 172.8e-6})
-"""s for two rows; also the shortest exposure. Photon number resolving reads as slowly as ultra quiet."""
+"""Line time in s, for two rows; also the shortest exposure. Photon number resolving is as slow as ultra quiet."""
 LINE_TIMES = MappingProxyType(
     {MODEL: LINE_TIME, "C15550-22UP": {"standard": 7.2e-6, "ultra_quiet": 34.0e-6, "photon_number": 34.0e-6}}
 )
-"""By model."""
+"""Line times for each model."""
 MAX_EXPOSURE = 1800.0
 FRAME_OVERHEAD_LINES = 5
-"""Line times between two frames: with the 1152 lines of a frame they give the standard mode's 120 frames/s."""
+"""Number of line times between two frames.
+
+With the 1152 lines of a frame, they give the 120 frames/s of the standard mode.
+"""
 LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpress": 4096 * 2304 * 2 * 120.04})
-"""Computed from the full-frame 16-bit frame rates of the two interfaces."""
+"""Transfer rates, computed from the full-frame 16-bit frame rates of the two interfaces."""
 
 QE_NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
 QE = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.40, 0.33, 0.30, 0.20, 0.09)
-"""Quantum efficiency of ORCA-Quest 2 at QE_NM, off the catalogue's figure: 600 to 800 nm may be 0.1 to 0.15 too low."""
+"""Quantum efficiency of ORCA-Quest 2 at QE_NM, read off the catalogue's figure.
+
+At 600 to 800 nm it may be 0.1 to 0.15 too low.
+"""
 
 
 def quantum_efficiency(wavelength_nm: float) -> float:
-    """Photoelectrons a photon of light, linear between the points of the curve."""
+    """Photoelectrons per photon of light, linear between the points of the curve."""
     return float(np.interp(wavelength_nm, QE_NM, QE))
 
 
@@ -54,11 +59,11 @@ class LightPath:
 
     Attributes:
         absorbed: share of the X-ray photons that the screen stops.
-        light: photons of light that one of these makes: its keV times the screen's yield.
+        light: photons of light per stopped X-ray photon: its energy in keV times the yield of the screen.
         aperture: numerical aperture of the objective on the side of the screen.
-        index: of refraction of the screen.
-        transmission: of lenses, mirror and windows together.
-        wavelength_nm: of the light.
+        index: refractive index of the screen.
+        transmission: transmission of lenses, mirror and windows together.
+        wavelength_nm: wavelength of the light.
     """
 
     absorbed: float
@@ -78,26 +83,26 @@ class LightPath:
 
     @property
     def collected(self) -> float:
-        """Share of the light that the objective takes: a cone out of the screen, on one side."""
+        """Share of the light that the objective collects: a cone on one side of the screen."""
         return (1 - math.sqrt(1 - (self.aperture / self.index) ** 2)) / 2
 
     @property
     def electrons(self) -> float:
-        """Photoelectrons of an X-ray photon that the screen stops."""
+        """Photoelectrons per X-ray photon that the screen stops."""
         return self.light * self.collected * self.transmission * quantum_efficiency(self.wavelength_nm)
 
     def x_rays_per_count(self, gain: float) -> float:
-        """X-ray photons at the screen that make a count.
+        """Number of X-ray photons at the screen per count.
 
         Args:
-            gain: counts of a photoelectron as photon transfer finds it. Of `electrons` that come together, the variance
+            gain: counts per photoelectron as measured by photon transfer. If `electrons` arrive together, the variance
                 is 1 + electrons times that of single ones.
         """
         return (1 + self.electrons) / (gain * self.absorbed * self.electrons)
 
 
 def refusal(settings: CameraSettings, model: str = MODEL) -> str:
-    """Reason for which the camera would refuse the settings, with the legal values; "" if it takes them."""
+    """Why the camera would reject the settings, with the legal values; "" if it accepts them."""
     if settings.readout not in LINE_TIME:
         return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:
@@ -117,12 +122,12 @@ def refusal(settings: CameraSettings, model: str = MODEL) -> str:
 
 
 def timing(settings: CameraSettings, link: str = "usb3", model: str = MODEL) -> CameraTiming:
-    """Frame shape and timing under external or software triggers: readout does not overlap the next exposure.
+    """Frame shape and timing with external or software triggers. The readout does not overlap the next exposure.
 
     The shortest period is exposure + readout, or the transfer time of a frame if that is longer.
 
     Raises:
-        ValueError: the camera would refuse the settings.
+        ValueError: the camera would reject the settings.
     """
     if problem := refusal(settings, model):
         raise ValueError(problem)
@@ -143,8 +148,9 @@ def timing(settings: CameraSettings, link: str = "usb3", model: str = MODEL) -> 
 class TriggerActive(StrEnum):
     """How an external pulse controls the exposure.
 
-    EDGE starts an exposure of the set length. LEVEL exposes for as long as the pulse lasts. SYNC_READOUT ends one
-    exposure and starts the next without dead time: the first pulse only starts one, so n pulses give n - 1 frames.
+    EDGE: the pulse starts an exposure of the set length. LEVEL: the exposure lasts as long as the pulse. SYNC_READOUT:
+    a pulse ends one exposure and starts the next without dead time. The first pulse only starts an exposure, so n
+    pulses give n - 1 frames.
     """
 
     EDGE = "edge"
@@ -153,7 +159,7 @@ class TriggerActive(StrEnum):
 
 
 class TriggerMode(StrEnum):
-    """NORMAL: one frame a pulse. START: the first pulse starts a free run, later pulses have no effect."""
+    """NORMAL: one frame per pulse. START: the first pulse starts a free run, and later pulses have no effect."""
 
     NORMAL = "normal"
     START = "start"
@@ -169,8 +175,8 @@ class TriggerPolarity(StrEnum):
 class GlobalExposure(StrEnum):
     """Time at which the rows start to expose after a pulse.
 
-    DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all at once; since they are read one after the other,
-    later rows are exposed for longer unless the light is shut off.
+    DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all together. Because rows are read one after the
+    other, later rows are then exposed longer, unless the light is shut off.
     """
 
     DELAYED = "delayed"
@@ -178,7 +184,7 @@ class GlobalExposure(StrEnum):
 
 
 class HotPixelMode(StrEnum):
-    """Sensitivity of the camera's own correction of hot pixels."""
+    """Sensitivity of the camera's built-in correction of hot pixels."""
 
     MINIMUM = "minimum"
     STANDARD = "standard"
@@ -189,18 +195,18 @@ class HotPixelMode(StrEnum):
 class DcamOptions(CheckedSettings):
     """Options of a `DcamCamera`.
 
-    trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of
+    trigger_active, _mode, _times and _delay apply to external triggers. A software trigger always gives one frame with
     the set exposure. With LEVEL or SYNC_READOUT the pulses set the exposure. The exposure in CameraSettings must still
-    equal their length (or distance), since the time of the first frame of a run is computed from it.
+    equal their length (or distance), because the time of the first frame of a run is computed from it.
 
     Raises:
-        ValueError: a number outside its range.
+        ValueError: a number is outside its range.
     """
 
     trigger_active: TriggerActive = setting(
         TriggerActive.EDGE,
-        "edge: a pulse starts an exposure of exposure_s. level: the exposure lasts as long as the pulse; "
-        "set exposure_s to that. sync_readout: a pulse ends an exposure and starts the next; n pulses "
+        "edge: a pulse starts an exposure of exposure_s. level: the exposure lasts as long as the pulse; set "
+        "exposure_s to the length of the pulse. sync_readout: a pulse ends an exposure and starts the next; n pulses "
         "give n - 1 frames, so fly scans do not allow it.",
     )
     trigger_mode: TriggerMode = setting(

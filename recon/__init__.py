@@ -1,7 +1,7 @@
-"""Tomographic reconstruction of splatline, arrays in, arrays out: `recon.correct`, `find_axis`, `reconstruct`.
+"""Tomographic reconstruction of splatline, from arrays to arrays: `recon.correct`, `find_axis`, `reconstruct`.
 
-The values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and numba on
-first use: a program that only plans a scan starts quickly.
+The classes of values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and
+numba at their first use, so that a program that only plans a scan starts quickly.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from recon.base.volume import Grid, Volume
 from recon.compiled import use_compiled_kernels
 from recon.methods import REGISTRY
 
-__path__ = extend_path(__path__, __name__)  # a lab's folder recon/ without __init__.py adds its modules
-use_compiled_kernels()  # before numba is imported, which happens where something is computed
+__path__ = extend_path(__path__, __name__)  # another folder recon/ without __init__.py on the path adds its modules
+use_compiled_kernels()  # before numba is imported, which happens when something is computed
 
-# libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
+# libgomp reads this when torch or numba load it. Without it, idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 

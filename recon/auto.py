@@ -1,4 +1,4 @@
-"""Auto: the method that predicts views held out best, chosen on a part of the scan."""
+"""Auto: chooses the method that predicts held-out projections best, on a part of the scan."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Auto(Method):
 
     The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows hold
     little material, the part is all rows at half the resolution. One of eight projections is held out. Test
-    reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md has
+    reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md gives the
     reasons.
 
     Attributes:
@@ -60,7 +60,7 @@ class Auto(Method):
         """The result of the chosen method, with the reason for the choice.
 
         Raises:
-            ValueError: no candidate takes these views or data.
+            ValueError: no candidate can use these projections.
         """
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
@@ -70,25 +70,25 @@ class Auto(Method):
         return replace(result, settings=settings, method=chosen.name, chosen=choice.reason)
 
     def _made(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> tuple[Method, Reconstruction]:
-        """The candidate that is chosen, and what it makes: without a choice the last one whose library loads."""
+        """The chosen candidate and its result. If none was chosen, the last candidate whose library can be loaded."""
         chosen = self.candidates[-1 if choice.at is None else choice.at]
         try:
             return chosen, chosen.run(replace(problem, device=chosen.device_of(problem)), control)
         except LibraryError as error:
             if choice.at is not None or len(self.candidates) == 1:
                 raise
-            warnings.warn(f"{chosen.name} is left out: {error}", stacklevel=2)
+            warnings.warn(f"{chosen.name} is not tried: {error}", stacklevel=2)
             return replace(self, candidates=self.candidates[:-1])._made(choice, problem, control)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> TrialChoice:
-        """Which candidate predicts views held out.
+        """Choose the candidate that predicts the held-out projections best.
 
         Raises:
-            ValueError: no candidate takes these views or data.
+            ValueError: no candidate can use these projections.
         """
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
-            raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
+            raise ValueError("all projections are zero, so there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
             return TrialChoice(f"{problem.geometry.n_views} projections are too few to hold any out")
         trial = _trial(problem, "", control, self.candidates)
@@ -111,7 +111,8 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """A preview has no costly candidates; the best needs no minimum gain, and ends no fit that is behind."""
+        """With "preview", only the first two candidates are tried. With "best", any gain is enough, and no test of a
+        fit ends early."""
         if quality == "preview":
             return replace(self, candidates=self.candidates[:2])
         return replace(self, least_gain=0.0) if quality == "best" else self
@@ -124,8 +125,8 @@ class Auto(Method):
 
 
 def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates: tuple[Method, ...]) -> Trial | None:
-    """The trial of a problem; None: nothing can be held out there."""
-    # In a slab only slices are counted.
+    """The test reconstructions of a problem; None: no projections of it can be held out."""
+    # In a slab, progress counts only slices.
     told = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(_sweeps(each) for each in candidates)
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
@@ -135,12 +136,12 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
 
 
 def _sweeps(method: Method) -> int:
-    """Sweeps of a trial, of a method that has no trials of its own those of its volume."""
+    """Iterations of the test reconstructions of a method; for a method without any, those of its volume."""
     return method.trial_sweeps or (method.iterations if isinstance(method, VoxelMethod) else 0)
 
 
 def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:
-    """The problem with 2 x 2 pixels joined, or itself where these are few; and in words which."""
+    """The problem binned 2 x 2, or not binned if its detector is small; and a text that says which of the two."""
     if min(problem.geometry.detector_shape) < _SMALLEST:
         return problem, "all rows"
     views = Views(problem.views.masked().data, problem.geometry).binned(2)
@@ -151,6 +152,6 @@ def method_named(name: str) -> Method:
     """The method of this name with its default settings; "auto": `Auto`.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: the name is unknown.
     """
     return Auto() if name == AUTO else by_name(name)()

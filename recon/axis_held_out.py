@@ -1,4 +1,4 @@
-"""axis_by_views: the rotation axis that predicts unseen views best; for a cone beam, whose opposite views differ."""
+"""axis_by_views: finds the rotation axis that predicts held-out projections best; for cone beams."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import predicted_views
 from recon.voxels.methods import EarlyTv
 
-COLS = 128  # Columns that show the axis to 0.05 of their pixels; more cost time
-VIEWS = 90  # Views that are enough
+COLS = 128  # columns; enough to find the axis to 0.05 of their pixels. More take longer
+VIEWS = 90  # projections that suffice
 _LEAST_VIEWS = 12
-_ONE_IN = 3  # views held out
-_WIDEST = 0.1875  # of the columns to either side of the start
+_ONE_IN = 3  # share of held-out projections: one in three
+_WIDEST = 0.1875  # largest distance from the start, as a share of the columns
 _TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the same axis
-_WIDER = 2.0  # A box this wide takes the matter around the field. In the field alone it would hide the axis.
-_STEPS = 8  # of the parabola's middle towards its vertex, at most
-_WHOLE = 0.999  # of a binned pixel that the beam reaches
-_SHADOWED = 3  # times the sweeps: matter that half of the views see takes longer, and draws the axis away till then
-_CLEAR = 0.1  # of the typical residual that the best axis has to take away
+_WIDER = 2.0  # width of the box, in fields of view, that holds the sample outside the field of view
+_STEPS = 8  # most moves of the parabola's middle towards its vertex
+_WHOLE = 0.999  # share of a binned pixel that must have measured something
+_SHADOWED = 3  # factor on the iterations: material in half of the projections converges late and shifts the axis
+_CLEAR = 0.1  # share by which the best axis must lower the typical residual
 
 
 def axis_by_views(
@@ -63,7 +63,9 @@ def axis_by_views(
     """
     check_arguments(axis_by_views, locals())
     if geometry.n_views < _LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {_LEAST_VIEWS} are needed")
+        raise ValueError(
+            f"{geometry.n_views} projections are too few to hold some out; at least {_LEAST_VIEWS} are needed"
+        )
     warn_of_other_quantity(projections)
     data, known = projections, projections
     if lit is not None:
@@ -75,8 +77,8 @@ def axis_by_views(
         tried.append(column)
         progress(len(tried))
 
-    # 32 columns are enough to come within half a coarse pixel. On fine pixels another grid would move the residual
-    # more than a small step of the axis does.
+    # 32 columns are enough to come within half a coarse pixel. On fine pixels, a change of the grid would change the
+    # residual more than a small step of the axis.
     coarse = _Residuals.of(data, geometry, lit, (32, 32), 3 * longer, width, ask)
     fine = _Residuals.of(data, geometry, lit, (COLS, 8), 6 * longer, width, ask)
     best, typical = _coarse_optimum(coarse, geometry)
@@ -96,12 +98,13 @@ def axis_by_views(
 
 @dataclass(eq=False)
 class _Residuals:
-    """The share of unseen views that a volume leaves, for an axis in columns of the data; each is made once.
+    """The residual of the held-out projections for a position of the axis, in columns of the data; computed once.
 
     Attributes:
-        data, geometry, lit: of binned views.
-        bin: columns of the data in a pixel; `axis_col`: the axis in columns of the data, of this geometry.
-        grid: of all candidates; None: each its own.
+        data, geometry, lit: the binned projections, their geometry, and the pixels that measured something.
+        bin: number of columns of the data in a binned pixel.
+        axis_col: position of the axis in this geometry, in columns of the data.
+        grid: the grid for all candidates; None: each candidate has its own.
     """
 
     data: F32
@@ -120,7 +123,7 @@ class _Residuals:
         cls, data: F32, geometry: Geometry, lit: NDArray[np.bool_] | None, size: tuple[int, int], sweeps: int,
         width: float, ask: Callable[[float], None],
     ) -> _Residuals:  # fmt: skip
-        """Residuals of views binned to about `size` (columns, rows), of the rows about that of the axis."""
+        """Residuals of projections binned to about `size` (columns, rows), from the rows around `axis_row`."""
         rows, axis_col = geometry.detector_shape[0], geometry.axis_col
         binning = max(1, min(rows, geometry.detector_shape[1] // size[0]))
         if (height := size[1] * binning) < rows:
@@ -150,7 +153,7 @@ class _Residuals:
             matter = _norm(measured)
             if matter == 0:
                 raise AxisError(
-                    "the held-out views show no matter, so that the axis cannot be determined; give the axis"
+                    "give the axis, because it cannot be determined: the held-out projections show no material"
                 )
             self.found[axis_col] = _norm(measured - images * lit) / matter
             self.ask(axis_col)
@@ -158,7 +161,7 @@ class _Residuals:
 
 
 def _coarse_optimum(residual: _Residuals, geometry: Geometry) -> tuple[float, float]:
-    """The best column to half a coarse pixel, and the residual of a typical one."""
+    """The best column, within half a coarse pixel, and the median residual of the columns tried."""
     cols, start = geometry.detector_shape[1], geometry.axis_col
     step = _WIDEST / 3 * cols
     best = min((start + n * step for n in range(-3, 4)), key=residual)
@@ -168,8 +171,8 @@ def _coarse_optimum(residual: _Residuals, geometry: Geometry) -> tuple[float, fl
         best = min((best, best - step, best + step), key=residual)
     if abs(best - start) > _WIDEST * cols:
         raise AxisError(
-            f"no rotation axis within {_WIDEST * cols:.0f} columns of column {start:.1f}: views held out agree best "
-            f"with column {best:.1f}, at the edge of the search; give the axis"
+            f"give the axis: none was found within {_WIDEST * cols:.0f} columns of column {start:.1f}. The held-out "
+            f"projections agree best with column {best:.1f}, at the edge of the search"
         )
     return best, typical
 
@@ -179,7 +182,7 @@ def _norm(values: F32) -> float:
 
 
 def _vertex(residual: _Residuals, middle: float, half: float) -> float | None:
-    """The vertex of the parabola through three squared residuals; None where they have no minimum."""
+    """The vertex of the parabola through three squared residuals; None if the parabola has no minimum."""
     below, here, above = (residual(middle + n * half) ** 2 for n in (-1, 0, 1))
     bend = below - 2 * here + above
     return middle + half * 0.5 * (below - above) / bend if bend > 0 else None

@@ -1,4 +1,4 @@
-"""error_bars: the standard deviation of each voxel, from two refits that trust every other view more, and less."""
+"""error_bars: the standard deviation of each voxel, from two refits with different weights of the projections."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.projector import Projector
 
-HALO = 8  # Slices beside a slab, at least, that its error bars need
+HALO = 8  # smallest number of slices on each side of a slab that its error bars need
 LEAST_VIEWS = 8
 
-_EXTRA = 0.5  # half of the views weigh so much more, the others so much less
-_SHARE = 0.2  # of a method's iterations, in each of two refits: both take half the time of its iterations
-_WINDOW = 7  # voxels, a side: variances are averaged over it; one squared difference has a relative deviation of 1.4
-_CLASSES = 4  # of the gradient, which are averaged apart: edges move more than what lies beside them
-_EDGE = 0.7  # voxels, the blur before the gradient
-_SAMPLED = 2**20  # voxels that give the limits of the classes
+_EXTRA = 0.5  # one half of the projections weighs this much more, the other half this much less
+_SHARE = 0.2  # share of a method's iterations in each of the two refits
+_WINDOW = 7  # side in voxels of the cube over which variances are averaged; a single one is uncertain by a factor 1.4
+_CLASSES = 4  # classes of the gradient, averaged separately, because edges vary more than their surroundings
+_EDGE = 0.7  # voxels; standard deviation of the blur before the gradient
+_SAMPLED = 2**20  # number of voxels from which the limits of the classes are computed
 _OF_RUN = ("units", "weight", "balance", "strength", "threshold")  # decisions of the run that a refit follows
-_LIMITS = "limits"  # the decision of the first slab's error bars that tells them from the run's
+_LIMITS = "limits"  # name of a decision that only error bars make; tells them from decisions of the run
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ErrorBars:
 
     Attributes:
         deviation: float32 [z, y, x], 1/mm.
-        decided: what the error bars of other slabs of the same volume follow.
+        decided: decisions that the error bars of the other slabs of this volume must use, too.
     """
 
     deviation: F32
@@ -52,46 +52,51 @@ class ErrorBars:
 def error_bars(
     method: Method, problem: ReconProblem, volume: Volume, decided: Mapping[str, Sequence[Any]], control: RunControl
 ) -> ErrorBars | None:
-    """The standard deviation of each voxel of `volume`, made by `method` from the views of `problem`.
+    """The standard deviation of each voxel of `volume`, which `method` made from the projections of `problem`.
 
-    The views, in the order of their angles, are parted into two halves, every other view in each. An iterative method
-    goes on from the volume twice, for fewer iterations: one half weighs 1.5 and the other 0.5, then the reverse.
-    Half the difference, divided by 0.5, has the variance of the noise. That is a jackknife of two groups, by weights
-    (Shao & Tu 1995, The Jackknife and Bootstrap, 2.3). What both refits have in common cancels: how far the volume is
-    from convergence. The volume of a fit is refitted by the method on voxels that made it, or that refined it. FBP is
-    linear: half the difference of the FBPs of both halves is FBP of the views with alternating signs.
+    The projections, in the order of their angles, are divided into two halves, with every other projection in each. An
+    iterative method continues from the volume twice, with fewer iterations. In the first refit, one half weighs 1.5 and
+    the other 0.5; in the second refit it is the reverse. Half the difference of the refits, divided by 0.5, has the
+    variance of the noise. This is a jackknife of two groups, by weights (Shao & Tu 1995, The Jackknife and Bootstrap,
+    2.3). Incomplete convergence is the same in both refits and cancels. For a fit, the voxel method that made or
+    refined the volume makes the refits. FBP is linear: half the difference of the FBPs of both halves is the FBP of the
+    projections with alternating signs.
 
-    One squared difference is a poor variance. It is averaged over 7³ voxels, in four classes of the gradient apart.
-    Noise is one part of the error, and the blur and the smoothing of the method are the other, which no refit shows.
-    So the result is √((a s)² + (b g)²), where s is the deviation by the refits and g the change of the volume from
-    voxel to voxel. `Method.error_bars` has a and b. They were chosen on simulated scans, so that about 68 %
-    of the true voxels are within one deviation (docs/error_bars.md).
+    A single squared difference is a poor estimate of the variance. So it is averaged over 7³ voxels, separately in four
+    classes of the gradient. Noise is one part of the error. The other part is the blur and the smoothing of the method,
+    which refits do not show. So the result is √((a s)² + (b g)²), where s is the deviation by the refits and g the
+    change of the volume from voxel to voxel. `Method.error_bars` has a and b. They were chosen on simulated scans, so
+    that about 68 % of the true voxels are within one deviation (docs/error_bars.md).
 
     Args:
-        method: that made the volume; no choice of methods.
-        decided: decisions of the run, or `ErrorBars.decided` of another slab.
-        control: gets each sweep, and is asked after it whether to stop.
+        method: the method that made the volume; not one that chooses among methods.
+        decided: the decisions of the run, or `ErrorBars.decided` of another slab.
+        control: is told the progress after each iteration, and may then stop the computation.
 
     Returns:
-        None where `control` ended it.
+        None if `control` stopped it.
 
     Raises:
-        ValueError: a method without calibrated error bars, fewer than eight views, or a fit without a finish.
+        ValueError: error bars of the method are not calibrated, there are fewer than eight projections, or the fit
+        has no voxel refinement.
     """
     geometry = problem.geometry
     if method.error_bars is None:
         known = ", ".join(names_where(lambda each: each.error_bars))
-        raise ValueError(f"the error bars of {method.name} are not calibrated; those of these methods are: {known}")
+        raise ValueError(
+            f"the error bars of {method.name} are not calibrated. Use one of the methods with calibrated error bars: "
+            f"{known}"
+        )
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
-            f"error bars split the views into two halves: at least {LEAST_VIEWS} views are needed, "
-            f"got {geometry.n_views}"
+            f"error bars need at least {LEAST_VIEWS} projections, because they compare two halves of them; got "
+            f"{geometry.n_views}"
         )
     method = method_on_voxels(method, decided)
     factors = method.error_bars
     assert factors is not None
     made: Mapping[str, Sequence[Any]] = {}
-    classes = 1  # the noise of FBP knows no edges
+    classes = 1  # the noise of FBP does not depend on edges
     if not isinstance(method, VoxelMethod):
         difference = _alternating(method, problem)
     else:
@@ -111,15 +116,15 @@ def error_bars(
 
 
 def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Method:
-    """The method whose refits show the noise: for a fit, the one that made its volume or the last steps of its finish.
+    """The method whose refits show the noise; for a fit, the voxel method that made or last refined its volume.
 
     Raises:
-        ValueError: a fit without a finish.
+        ValueError: the fit has no voxel refinement.
     """
     if not isinstance(method, Fit):
         return method
     if "weight" not in decided:
-        raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
+        raise ValueError(f"error bars of {method.name} need its voxel refinement, and this run had none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
     return pull_methods(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
@@ -134,7 +139,7 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
 
 
 def alternating(geometry: Geometry) -> F32:
-    """[view]: 1 and -1 alternating in the order of the angles."""
+    """Signs [view]: 1 and -1 alternating in the order of the angles."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     signs = np.empty(order.size, np.float32)
     signs[order] = 1 - 2 * (np.arange(order.size) % 2)
@@ -142,7 +147,7 @@ def alternating(geometry: Geometry) -> F32:
 
 
 def _alternating(method: Method, problem: ReconProblem) -> F32:
-    """Half the difference of the FBPs of both halves of the views."""
+    """Half the difference of the FBPs of both halves of the projections."""
     signed = problem.views.masked().data * alternating(problem.geometry)[:, None, None]
     return direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
 
@@ -154,7 +159,7 @@ def _refitted(
     decided: Mapping[str, Sequence[Any]],
     control: RunControl,
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
-    """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
+    """Half the difference of two refits, divided by the extra weight, and their decisions; None: it was stopped."""
     refit = method.refit(_SHARE)
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
@@ -187,7 +192,7 @@ def _refitted(
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:
-    """The decisions of a run that refits follow; a weight that changed along the run stays the last one."""
+    """The decisions of a run that refits use. If a weight changed during the run, they use its last value."""
     kept = {name: list(decided[name]) for name in _OF_RUN if name in decided}
     return {name: sweeps * made[-1:] if name == "balance" else made for name, made in kept.items()}
 
@@ -209,7 +214,7 @@ def _limits(gradient: F32, classes: int) -> list[float]:
 
 
 def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:
-    """The mean of the squares over a window, of the voxels between the same limits of the gradient alone."""
+    """The mean of the squares over a window, only over voxels whose gradient is in the same class."""
     if not limits:
         out = uniform_filter(squares, _WINDOW)
     else:
@@ -218,4 +223,4 @@ def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:
             here = classes == k
             total = uniform_filter(np.where(here, squares, np.float32(0)), _WINDOW)
             np.divide(total, uniform_filter(here.astype(np.float32), _WINDOW), out=out, where=here)
-    return np.maximum(out, 0, out=out)  # sums that run along a line end a little below zero
+    return np.maximum(out, 0, out=out)  # rounding errors of the running sums may be below zero

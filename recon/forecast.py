@@ -1,4 +1,4 @@
-"""forecast: seconds of a reconstruction, from a few iterations that are timed on a part of its views and voxels."""
+"""forecast: the expected duration of a reconstruction, from a few timed iterations on a part of the scan."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.priors import STEPS
 
 VOXELS = 2**20
-"""Of the part that is timed: as many as caches of a processor do not hold several times."""
+"""Number of voxels in the timed part: so many that they do not fit into the caches of a processor several times."""
 
-_ROWS, _VIEWS = 48, 128  # of the part, at most
-_ITERATIONS, _PATCH_STEPS, _FIT_STEPS = 4, 2 * STEPS, 12  # that are timed; of the first one only its end is known
+_ROWS, _VIEWS = 48, 128  # largest numbers of rows and projections in the timed part
+_ITERATIONS, _PATCH_STEPS, _FIT_STEPS = 4, 2 * STEPS, 12  # timed ones; of the first one only the end is known
 _LEAST_COLS = 32
-_NOISE = np.float32(0.01)  # of views, whose weight of total variation is else 0
-_RENDER = 1 / 3  # of a view's share in a step of a fit, which renders it and goes back for the gradient
+_NOISE = np.float32(0.01)  # noise of the projections; without it the weight of total variation would be 0
+_RENDER = 1 / 3  # rendering a projection, as a share of a fit step, which also computes the gradient
 
 
 class Forecast(NamedTuple):
-    """Seconds of a reconstruction.
+    """Expected duration of a reconstruction in seconds.
 
     Attributes:
-        choice_seconds: of the trials that choose a method or the weight of a prior.
-        volumes: after them, by the name of the method whose volume it may become; the data decide among them.
+        choice_seconds: duration of the test reconstructions that choose a method or the weight of a prior.
+        volumes: duration of the volume after them, by the name of each method that may be chosen.
     """
 
     choice_seconds: float
@@ -59,7 +59,7 @@ class Forecast(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """Timing of a run: seconds beside its iterations, seconds of each iteration, and the number planned."""
+    """Timing of a run: seconds outside its iterations, seconds of each iteration, and the planned number."""
 
     fixed: float
     each: float
@@ -74,21 +74,21 @@ class Pace(NamedTuple):
 
 
 def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Forecast | None:
-    """Seconds that a method takes for these views and voxels; None: it makes several volumes, and must be tried.
+    """Expected duration of a method for these projections and voxels; None: unknown, because it makes several volumes.
 
-    Kernels are compiled before, by `recon.warm_up`.
+    Call `recon.warm_up` first, so that the kernels are compiled before they are timed.
 
     Args:
-        now: s; of a clock of processor time, those of a machine on which nothing else runs.
+        now: the clock in s. With a clock of processor time, the result holds for a machine on which nothing else runs.
 
     Raises:
-        ValueError: the method does not take the views.
+        ValueError: the method cannot use the projections.
     """
     return None if isinstance(method, Series) else Timing(geometry, grid, now).of(method)
 
 
 class Timing:
-    """Iterations of methods for some views and voxels, timed on a part of these as each is asked for."""
+    """Durations of methods for given projections and voxels, timed on a part of them at the first request."""
 
     def __init__(self, geometry: Geometry, grid: Grid, now: Clock, voxels: int = VOXELS) -> None:
         self._geometry, self._grid, self._now, self._voxels = geometry, grid, now, voxels
@@ -99,7 +99,7 @@ class Timing:
         self._paces, self._known = dict[str, Pace](), dict[str, Forecast]()
 
     def of(self, method: Method) -> Forecast:
-        """The forecast of a method, see `forecast`."""
+        """The expected duration of a method, see `forecast`."""
         if (key := repr(method)) not in self._known:
             self._known[key] = self._of(method)
         return self._known[key]
@@ -116,7 +116,7 @@ class Timing:
         return Forecast(self.trial_seconds(method), {method.name: self.pace(method).total})
 
     def direct_seconds(self, method: Method) -> float:
-        """Seconds of a direct method, whose kernels depend on the number of columns."""
+        """Expected seconds of a direct method, timed with all columns, because its kernels depend on their number."""
         straight = self._geometry.is_straight and not self._geometry.is_cone
         part = part_of(self._geometry, self._grid, None) if straight else self._part
         begin = self._now()
@@ -124,7 +124,7 @@ class Timing:
         return (self._now() - begin) * _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
 
     def pace(self, method: Method, of_trial: bool = False) -> Pace:
-        """Forecast of an iterative method in all voxels, at the speed of a part of them, or of the rows of a trial."""
+        """Expected timing of an iterative method in all voxels, from a part of them or from the rows of a test."""
         key = f"{of_trial} {method!r}"
         if key not in self._paces:
             part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
@@ -133,7 +133,8 @@ class Timing:
             if isinstance(method, VoxelMethod):
                 pace = pace._replace(planned=min(pace.planned, method.usual_sweeps))
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
-            # Steps that are not over all views take as long whatever their number, by samples along rays.
+            # A step that does not use all projections costs the same for any number of them: it grows with the samples
+            # along a ray.
             along = max(self._grid.shape) / max(part.grid.shape)
             self._paces[key] = pace.scaled(scale, scale if on_voxels else along)
         return self._paces[key]
@@ -143,7 +144,7 @@ class Timing:
         return self.pace(FistaTv())
 
     def trial_seconds(self, method: Method) -> float:
-        """Seconds of the trials that choose its prior."""
+        """Expected seconds of the test reconstructions that choose its prior."""
         sweeps = method.trial_sweeps
         if not (self._trial_share and sweeps):
             return 0.0
@@ -154,7 +155,7 @@ class Timing:
         return self._trial_share * sweeps * smooth
 
     def fit_pace(self, method: Fit) -> Pace:
-        """Forecast of a fit without its finish."""
+        """Expected timing of a fit without its voxel refinement."""
         field = Grid.for_fit(self._geometry, self._grid)
         given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
         usual = count_for(field, self._geometry.is_cone)
@@ -165,7 +166,7 @@ class Timing:
         here = count_for(Grid.for_fit(part.geometry, part.grid), part.geometry.is_cone)
         some, short = max(1, round(here * count / usual)), cast(Any, method)
         short = replace(short, gaussians=some, finish=0, fit=replace(method.fit, joined_pixels=joined))
-        grown = ((1 + growth(method.fit)) / 2) ** (1 / 3)  # Gaussians are added as it goes on
+        grown = ((1 + growth(method.fit)) / 2) ** (1 / 3)  # Gaussians are added during the fit
         covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), some)
         return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
@@ -183,11 +184,11 @@ class Timing:
         return Forecast(choice, {method.name: pace.total + finish})
 
     def _rendered(self, method: Fit) -> float:
-        """Seconds to render all views of a fit, for its finish."""
+        """Expected seconds to render all projections of a fit, for its voxel refinement."""
         return 2 * _RENDER * self._geometry.n_views * self.fit_pace(method).each / method.fit.views_per_step
 
     def _of_choice(self, candidates: tuple[Method, ...]) -> Forecast:
-        """Forecast of a method that tries others, whose priors are sought once for all."""
+        """Expected duration of a method that tries others. The search for their prior is done once for all of them."""
         each = [self.of(candidate) for candidate in candidates]
         if not self._trial_share:
             return each[-1]
@@ -196,7 +197,7 @@ class Timing:
         return Forecast(choice, volumes)
 
     def _tried(self, method: Method) -> float:
-        """Seconds of a method's own volume in a trial of all rows, beside the search for priors."""
+        """Expected seconds of a method's volume in a test with all rows, without the search for priors."""
         if isinstance(method, Fit) and method.finish is None:
             pace = self.fit_pace(method)
             first = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
@@ -205,10 +206,10 @@ class Timing:
 
 
 def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:
-    """Some noisy views of a cylinder on some rows and columns, and the grid that matches them.
+    """Noisy projections of a cylinder with some of the rows and columns, and the grid that matches them.
 
     Args:
-        voxels: of the grid, about; None: all columns of all views, as direct methods need, which take them together.
+        voxels: approximate number of voxels; None: all columns of all projections, which direct methods need together.
     """
     rows, cols = geometry.detector_shape
     height = min(rows, most_rows)
@@ -218,7 +219,7 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
     views = geometry.select(slice(None, None, each)).rows(first, first + height)
     views = replace(views, detector_shape=(height, width), axis_col=(width - 1) / 2)
     box = Grid.matching(views)
-    wider = grid.shape[1] / Grid.matching(geometry).shape[1]  # a sample that goes on beyond the field
+    wider = grid.shape[1] / Grid.matching(geometry).shape[1]  # a sample that continues outside the field of view
     nz, ny, nx = box.shape
     box = replace(box, shape=(nz, round(wider * ny), round(wider * nx)))
     across = np.arange(width) - (width - 1) / 2
@@ -229,17 +230,17 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
 
 
 def _work(geometry: Geometry, grid: Grid) -> float:
-    """Proportional to that of a projection."""
+    """A number proportional to the work of projecting the volume once."""
     return float(geometry.n_views * math.prod(grid.shape))
 
 
 def _covered(voxels: float, gaussians: float) -> float:
-    """A figure in proportion to the pixels that Gaussians as wide as their distances cover in a view."""
+    """A number proportional to the pixels that Gaussians as wide as their distances cover in a projection."""
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
 def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> Pace:
-    """The pace of the iterations from `after` to `last`, without trials."""
+    """The timing of the iterations from `after` to `last`, without test reconstructions."""
     reached: list[tuple[int, float]] = []
     planned = last
 

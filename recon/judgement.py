@@ -1,4 +1,4 @@
-"""Judgement: what a volume is worth by its views and, where there is one, by a truth."""
+"""Judgement: how good a volume is, judged by its projections and, if known, by the ground truth."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from recon.voxels.matter_checks import (
 from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
 from recon.voxels.residuals import SquaresLeft, left_by_volume
 
-_VIEWS = 16  # of those used, at most, that the residual is taken from: what it costs
-_ODD_VIEWS_WORK = 1.5  # the time of `odd_views`, in projections of all rays
-_REGIONS, _REGION = 2**21, 12  # voxels at most of regions (`metrics.sampled`); bytes of a voxel
+_VIEWS = 16  # largest number of used projections in the residual; limits the time
+_ODD_VIEWS_WORK = 1.5  # duration of `odd_views`, in units of projecting the volume once
+_REGIONS, _REGION = 2**21, 12  # largest number of voxels in the regions (`metrics.sampled`); bytes per voxel
 
 
 class Aspect(Flag):
-    """What a volume is judged by, beside a truth.
+    """What a volume is judged by, in addition to a ground truth.
 
-    RESIDUAL: what it leaves of up to 16 views used, and of all views held out. STRAY: mass where views show nothing.
-    FIT, with RESIDUAL: of a volume fitted to its views, what it hides or leaves unexplained: whether a uniform volume
-    does as well, structure left in the views, and views that do not fit.
+    RESIDUAL: the residual in up to 16 of the projections used, and in all held-out projections. STRAY: mass where the
+    projections show no material. FIT (with RESIDUAL), for a volume fitted to its projections: whether a uniform volume
+    predicts them as well, structure in the residual, and projections that do not fit.
     """
 
     RESIDUAL, STRAY, FIT = auto(), auto(), auto()
 
 
 class TimeLeft(NamedTuple):
-    """A clock, and whether a number of further seconds may be taken."""
+    """A clock, and a function that says whether a number of further seconds may be used."""
 
     now: Clock = lambda: 0.0
     leaves: Callable[[float], bool] = lambda seconds: True
@@ -57,18 +57,18 @@ _ALWAYS = TimeLeft()
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a volume is worth.
+    """How good a volume is.
 
     Attributes:
-        figures: of merit, by name: psnr, ssim3d, nrmse by a truth; residual, residual_held_out, unexplained, stray by
-            views.
-        held_out: what the volume leaves of the views held out; None if none is.
-        along_rows: what the volume and a uniform one leave, as of `left_by_volume`; None: not compared.
-        unexplained: structure that the volume leaves in the views; None where that is not known.
-        stray: mass where views show nothing; None where it was not looked for.
-        odd_views: with a part that the volume does not explain.
-        skipped: looks for which there was no time.
-        seconds_of_views: to project all views, about.
+        figures: figures of merit by name: psnr, ssim3d and nrmse from the ground truth; residual, residual_held_out,
+            unexplained and stray from the projections.
+        held_out: residual in the held-out projections; None if there are none.
+        along_rows: residuals of the volume and of a uniform volume, see `left_by_volume`; None: not compared.
+        unexplained: structure in the residual of the projections; None: not known.
+        stray: mass where the projections show no material; None: not computed.
+        odd_views: projections with a part that the volume does not explain.
+        skipped: checks for which there was no time.
+        seconds_of_views: approximate seconds to compute all projections.
     """
 
     figures: Mapping[str, float]
@@ -92,15 +92,15 @@ def judge(
     time: TimeLeft = _ALWAYS,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Judgement:
-    """Judge a volume by the views it was made of, those held out, and the true volume.
+    """Judge a volume by the projections it was made from, the held-out projections and the true volume.
 
     Args:
-        seed: of the signs of views by which noise is told from structure.
-        time: looks that would take longer than it leaves are skipped, those for stray mass and odd views.
-        progress: how many of how many views were compared.
+        seed: seed of the random signs of projections that separate noise from structure.
+        time: the checks for stray mass and for odd projections are skipped if they would exceed this time.
+        progress: function that takes the number of projections compared so far, and their total number.
 
     Raises:
-        ValueError: the views are zero everywhere.
+        ValueError: all projections are zero.
     """
     figures = {} if truth is None else by_truth(truth.data, volume.data)
     along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
@@ -123,10 +123,10 @@ def judge(
         return enough
 
     work = stray_mass_share(views.geometry, volume.grid)
-    if Aspect.STRAY in aspects and has_time(work, "the look for mass where views show nothing"):
+    if Aspect.STRAY in aspects and has_time(work, "the check for mass where projections show no material"):
         stray = stray_mass(volume, views)
         figures |= {} if stray is None else {"stray": stray.share}
-    if fitted and has_time(_ODD_VIEWS_WORK, "the look for views that do not fit the volume"):
+    if fitted and has_time(_ODD_VIEWS_WORK, "the check for projections that do not fit the volume"):
         odd = odd_views(volume, views, progress)
     return Judgement(figures, unseen, along_rows, structure, stray, odd, tuple(skipped), seconds)
 
@@ -139,15 +139,16 @@ def judge_memory(geometry: Geometry, *, fitted: bool) -> int:
 
 
 def by_truth(truth: F32, volume: F32) -> dict[str, float]:
-    """The figures of a volume by the true one, [z, y, x] each."""
+    """The figures of merit of a volume from the true volume, both [z, y, x]."""
     of = {"psnr": metrics.psnr, "ssim3d": metrics.ssim3d, "nrmse": metrics.nrmse}
     return {name: float(figure(truth, volume)) for name, figure in of.items()}
 
 
 def contrast(reference: Volume, volumes: Mapping[str, Volume], seed: int) -> dict[str, dict[str, float]]:
-    """SNR and CNR of each volume in the dense and the empty regions of one reference, without their rims.
+    """SNR and CNR of each volume in the dense and the empty regions of one reference, without the edges of the regions.
 
-    Regions of each volume itself would be others. Empty if the reference has no such regions.
+    All volumes use the regions of the reference, because each volume by itself would give different regions. The result
+    is empty if the reference has no such regions.
     """
     regions = regions_of(reference, seed)
     return {} if regions is None else {name: contrast_in(regions, each) for name, each in volumes.items()}

@@ -1,6 +1,6 @@
-"""The registry of reconstruction methods: one line a method, here or in the folder of its feature.
+"""The registry of reconstruction methods: one line for each method, here or in the folder of its feature.
 
-A line says where the method's class is, so that its name is known without loading its libraries.
+A line says where the class of the method is. So the names are known without loading the libraries of the methods.
 """
 
 from __future__ import annotations
@@ -39,26 +39,28 @@ CANDIDATES = tuple(sorted(_CANDIDATES, key=lambda name: _CANDIDATES[name]))
 DEFAULT = "r2"  # The default method
 
 IN_TIME = next((name for name, entry in REGISTRY.items() if entry.several == "times"), None)
-"""The method of volumes in time; None: this installation has none."""
+"""Name of the method that makes volumes at several times; None: this installation has none."""
 
 BASELINE = "fbp"  # Reports compare all methods with this one
 
 
 def _made(name: str, method: type[Method]) -> MethodEntry:
-    """The line of another package's method."""
+    """The registry's line for a method of another package."""
     if not issubclass(method, Method):
-        raise ValueError("its class has no kind of recon.base.method_kinds as a base")
+        raise ValueError("its class must derive from one of the classes in recon.base.method_kinds")
     if method.name != name:
-        raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
+        raise ValueError(f"the `name` of its class is {method.name!r}; expected the name of the entry point")
     entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
     if getattr(import_module(entry.module), entry.cls, None) is not method:
-        raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
+        raise ValueError(
+            f"its class {method.__qualname__} must be defined at the top level of the module {entry.module}"
+        )
     _ = method(), method.label  # every setting has a default
     return entry
 
 
 METHODS = Registry("method", REGISTRY, _made, reserved=(AUTO,))
-"""All methods, with those of other packages."""
+"""All methods, including those of other packages."""
 
 
 def names() -> tuple[str, ...]:
@@ -67,8 +69,7 @@ def names() -> tuple[str, ...]:
 
 
 def names_of_one_volume() -> tuple[str, ...]:
-    """Names of the methods that make one volume of all views, as rows of a table do; imports no module of this
-    project."""
+    """Names of the methods that make one volume from all projections; imports no module of this project."""
     return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 
@@ -78,10 +79,10 @@ def names_compared() -> tuple[str, ...]:
 
 
 def streams(name: str) -> bool:
-    """Whether a method's volume can grow while views arrive, which AUTO does not promise; imports nothing.
+    """Whether a method can reconstruct during the scan; False for AUTO. Imports nothing.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: the name is unknown.
     """
     return name != AUTO and METHODS[name].streams
 
@@ -90,19 +91,19 @@ def by_name(name: str) -> type[Method]:
     """The settings class of a method.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: the name is unknown.
     """
     entry = METHODS[name]
     return getattr(loaded(entry.module), entry.cls)
 
 
 def taking(field: str) -> tuple[str, ...]:
-    """Names of the methods that have a setting, such as "iterations", or "fit.loss" of a nested one."""
+    """Names of the methods that have this setting, such as "iterations" or the nested "fit.loss"."""
     return names_where(lambda method: has_setting(method, field))
 
 
 def has_setting(method: type[Method], field: str) -> bool:
-    """Whether the settings class has this field; "fit.loss" is the field of the default value of `fit`."""
+    """Whether the settings class has this field; "fit.loss" is the field `loss` in the default value of `fit`."""
     value: Any = method()
     *outer, last = field.split(".")
     for name in outer:
@@ -111,7 +112,7 @@ def has_setting(method: type[Method], field: str) -> bool:
 
 
 def setting_names(method: Any) -> list[str]:
-    """Names of all settings of a method, by path as in `taking`."""
+    """Names of all settings of a method; nested ones as paths, see `taking`."""
     names = []
     for each in fields(method):
         value = getattr(method, each.name)
@@ -120,22 +121,22 @@ def setting_names(method: Any) -> list[str]:
 
 
 def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
-    """A method with these settings, by name as in `taking`; other settings have their defaults.
+    """A method with these settings, named as in `taking`; other settings have their defaults.
 
     Raises:
-        ValueError: the method lacks the setting, or refuses the value.
+        ValueError: the method does not have the setting, or the value is not allowed.
     """
     for name in settings:
         if not has_setting(method, name):
             if not (owners := ", ".join(taking(name))):
                 raise ValueError(unknown(f"setting of {method.name}", name, setting_names(method())))
-            raise ValueError(f"method {method.name!r} has no setting {name!r} ({owners} has)")
+            raise ValueError(f"method {method.name!r} has no setting {name!r}; these methods have it: {owners}")
     found: Method = with_settings(method(), settings)
     return found
 
 
 def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
-    """A method, or a part of its settings, with these changed, by name as in `taking`."""
+    """A method, or a part of its settings, with these settings changed; named as in `taking`."""
     flat = {name: setting for name, setting in settings.items() if "." not in name}
     nested: dict[str, dict[str, Any]] = {}
     for name, setting in settings.items():
@@ -152,7 +153,7 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
 
 
 def names_where(holds: Callable[[type[Method]], object]) -> tuple[str, ...]:
-    """Names of the methods of which this holds."""
+    """Names of the methods for which this condition is true."""
     return tuple(name for name in METHODS if holds(by_name(name)))
 
 

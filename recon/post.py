@@ -1,4 +1,4 @@
-"""Grey values of a volume in clusters."""
+"""Divides the grey values of a volume into clusters (k-means)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Clusters:
     """Grey values grouped by k-means.
 
     Attributes:
-        centres: float64 [cluster], rising.
-        shares: of all values in each.
+        centres: float64 [cluster], ascending.
+        shares: share of all values in each cluster.
         inertias: mean squared distance to the centres for 1, 2, ... clusters, if the elbow rule was used.
     """
 
@@ -32,25 +32,25 @@ class Clusters:
     def threshold(self) -> float:
         """Half-way between the brightest centre and the centre of the largest other cluster.
 
-        Clusters between those two are edges, mixtures of both; an edge lies half-way (ISO 50 % rule).
+        Clusters between these two are voxels at edges, mixtures of both. The edge is half-way (ISO 50 % rule).
         """
         return float(self.centres[-1] + self.centres[:-1][self.shares[:-1].argmax()]) / 2
 
 
 def k_means(values: NDArray[np.floating], k: int, seed: int = 0) -> F64:
-    """Rising centres [k] of one-dimensional k-means (MacQueen 1967), the best of some starts by k-means++.
+    """Centres [k], ascending, of one-dimensional k-means (MacQueen 1967): the best of several k-means++ starts.
 
     Raises:
-        ValueError: fewer than k different values, or values that are not finite.
+        ValueError: there are fewer than k different values, or values that are not finite.
     """
     return _fitted(_sampled(values, seed), k, seed)[0]
 
 
 def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) -> Clusters:
-    """Clusters of grey values; k None: as many as the elbow rule says, 2 to 5, see `elbow`.
+    """Divide grey values into k clusters. k None: the elbow rule chooses 2 to 5, see `elbow`.
 
     Raises:
-        ValueError: as `k_means`, or for k below 2.
+        ValueError: as for `k_means`, or k is below 2.
     """
     if k is not None and k < 2:
         raise ValueError(f"at least 2 clusters are needed to tell particles from the rest, got {k}")
@@ -68,8 +68,8 @@ def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) 
 def elbow(inertias: F64) -> int:
     """The number of clusters at the elbow of the mean squared distances W for 1, 2, ... clusters; at least 2.
 
-    That is the sharpest bend of the logarithm log(W). The bend of W itself (Thorndike 1953) is at 2 for any number of
-    equal steps, because W falls as 1 / k² before it.
+    The elbow is the sharpest bend of log(W). W itself (Thorndike 1953) has its sharpest bend at 2 for any number of
+    equal steps of grey value, because it falls as 1 / k² up to that number.
     """
     if inertias.size < 3:
         return 2
@@ -87,22 +87,24 @@ def _sampled(values: NDArray[np.floating], seed: int) -> F64:
 
 
 def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
-    """Centres, rising, and the mean squared distance to them."""
+    """Centres, ascending, and the mean squared distance of the values to them."""
     from scipy.cluster.vq import ClusterError, kmeans2
 
     if np.unique(sample).size < k:
-        raise ValueError(f"{np.unique(sample).size} different grey values do not make {k} clusters")
+        raise ValueError(f"{np.unique(sample).size} different grey values are too few for {k} clusters")
     best: tuple[F64, float] | None = None
     rng = np.random.default_rng(seed)
     for _ in range(_STARTS):
         try:
             centres = np.sort(kmeans2(sample[:, None], k, iter=30, minit="++", rng=rng, missing="raise")[0].ravel())
-        except ClusterError:  # a start may lose a cluster
+        except ClusterError:  # a cluster may become empty
             continue
         nearest = centres[np.searchsorted((centres[1:] + centres[:-1]) / 2, sample)]
         inertia = float(np.mean((sample - nearest) ** 2))
         if best is None or inertia < best[1]:
             best = centres, inertia
     if best is None:
-        raise ValueError(f"{k} clusters do not fit {sample.size} grey values from {sample.min():g} to {sample.max():g}")
+        raise ValueError(
+            f"k-means found no {k} clusters in {sample.size} grey values from {sample.min():g} to {sample.max():g}"
+        )
     return best

@@ -33,7 +33,7 @@ from recon.voxels.beyond_field import run_on_extended_grid
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LOOKED_AT, _LARGEST = 2**16, 1e15  # values; of line integrals, whose true ones end at about 15
+_LOOKED_AT, _LARGEST = 2**16, 1e15  # values in the sample; largest line integral (true ones end at about 15)
 
 
 def reconstruct(
@@ -50,27 +50,28 @@ def reconstruct(
     """Reconstruct a volume from line integrals.
 
     Args:
-        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
-            finite, or masked, are filled from their neighbours and weigh nothing. Or what was counted, where photons
-            are few. The method is then given line integrals and weights that carry the likelihood of the counts, see
-            `recon.prep.counts.line_integrals`; `use.weights` multiply them.
+        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
+        masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
+        `Counts` instead. The method then gets line integrals with weights that represent the likelihood of the counts,
+        see `recon.prep.counts.line_integrals`; they are multiplied by `use.weights`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
-        grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
-            small box holds what the whole volume holds there.
-        seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.
-        device: that the method computes on, "cpu" or "cuda" (the current CUDA device).
-        use: weights of the rays and views held out; None: equal weights, all views used.
-        control: how to watch, end and continue the reconstruction.
+        grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
+        projections see, so a smaller box is identical to that part of the whole volume.
+        seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
+        of threads.
+        device: where the method computes: "cpu" or "cuda" (the current CUDA device).
+        use: weights of the rays, and held-out projections; None: equal weights, and all projections are used.
+        control: how to follow, stop and resume the reconstruction.
 
     Raises:
-        ValueError: an unknown method, shapes that disagree, views from one side only, an axis outside the detector,
-            data without matter, a negative seed, or views, views held out, a device or a checkpoint that the method
-            does not take.
+        ValueError: the method is unknown, shapes do not match, all projections are from one side, the axis is outside
+        the detector, the projections show no material, the seed is negative, or the method cannot use the projections,
+        the held-out projections, the device or the checkpoint.
 
     Warns:
-        UserWarning: projections are not finite where weights do not leave them out, angles look like degrees,
-            projections like counts or transmission, or like -1 times line integrals.
+        UserWarning: values with a weight are not finite, angles look like degrees, or the projections look like counts,
+        like transmission or like line integrals of the wrong sign.
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())
@@ -85,7 +86,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if not chosen.allow_negative:  # a method with that setting may be asked for such voxels
+    if not chosen.allow_negative:  # a method with that setting can make such voxels
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
@@ -98,7 +99,7 @@ def reconstruct(
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
-    """Warn of values that are not finite, except those that weights leave out."""
+    """Warn if values are not finite, except those with weight 0."""
     lost = sum(
         int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
         for at, view in enumerate(data)
@@ -106,8 +107,8 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | R
     )
     if 0 < lost < data.size:
         warnings.warn(
-            f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
-            "and weigh nothing. If you know which they are, give them the weight 0 in DataUse(weights)",
+            f"{lost} of {data.size} values of the projections are not finite. They are filled from their neighbours "
+            "and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 
@@ -117,9 +118,9 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     some = some[np.isfinite(some)]
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
-            f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0, -log of the transmission: change the sign. For differences of views, set "
-            "allow_negative in methods that keep no voxel below 0",
+            "change the sign of the projections: most of their values are below 0 (mean "
+            f"{some.mean(dtype=np.float64):.4g}), but line integrals of material, -log of the transmission, are above "
+            "0. If the projections are differences, set allow_negative in methods that clip voxels at 0",
             stacklevel=3,
         )
 
@@ -128,30 +129,30 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
     if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
-            f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
-            "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
-            "for it. Give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate of sharp "
-            "edges",
+            "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp edges. "
+            f"In all projections the rotation axis is tilted along the beam by {math.degrees(lean):.3g} degrees or "
+            "more, so no projection measures structure along the axis, such as the faces of a plate, and held-out "
+            "projections choose too small a weight",
             stacklevel=3,
         )
 
 
 def _refuse_geometry(geometry: Geometry) -> None:
-    """Raise ValueError for views from one side only, and for an axis outside the detector."""
-    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
-    # A cone's, and those that look down on the rotation axis, differ up to the whole turn.
+    """Raise ValueError if all projections are from one side, or if the axis is outside the detector."""
+    # Parallel projections 180° apart contain the same rays, so |sin| of the angle between two shows whether they
+    # differ. Projections of a cone, and those with a tilt along the beam, differ up to 360°.
     turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
     if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(
-            f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "
-            "determine a volume; give at least two, at different angles"
+            "give projections at two or more different angles, because one direction does not determine a volume; "
+            f"got {geometry.n_views} from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
         )
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)
 
 
 def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunControl) -> None:
-    """Raises ValueError for arguments that the method would silently ignore."""
+    """Raise ValueError for arguments that the method would silently ignore."""
     wanted = {
         f"device {device!r}": ("device", device != "cpu"),
         "held_out": ("held_out", len(use.held_out) > 0),
@@ -162,11 +163,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
     foreign = [(what, taken) for what, (taken, given) in wanted.items() if given and taken not in method.takes]
     if foreign:
         owners = ", ".join(f"{what} (of {', '.join(accepting(taken))})" for what, taken in foreign)
-        raise ValueError(f"method {method.name!r} has no option {owners}: leave that out, or choose another method")
+        raise ValueError(
+            f"method {method.name!r} has no option {owners}: leave the option out, or choose another method"
+        )
 
 
 def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
-    """Line integrals, and their weights times the given ones."""
+    """Line integrals of the counts, and their weights multiplied by the given weights."""
     require_views(geometry, counts.counts, "counts")
     if use.weights is not None:
         require_views(geometry, use.weights, "weights")
@@ -180,13 +183,14 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     if given.dtype.kind not in "fiub":
         raise ValueError(f"projections must be real numbers, got {given.dtype}")
     require_views(geometry, given)
-    with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
+    with np.errstate(over="ignore"):  # values outside the range of float32 count as not finite
         data = np.ascontiguousarray(given, np.float32)
     some = np.abs(some_values(data, _LOOKED_AT))
     some = some[np.isfinite(some)]
     if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
         raise ValueError(
-            f"one in ten line integrals is above {most:.3g}; up to {_LARGEST:g} are computed with, since float32 holds "
-            "no sums of the squares of larger ones. Divide them by a constant: the volume is then smaller by it"
+            "divide the line integrals by a constant (the volume is then divided by the same constant): one in ten "
+            f"is above {most:.3g}, and the largest possible value is {_LARGEST:g}, because sums of squares would "
+            "exceed the range of float32"
         )
     return data

@@ -1,4 +1,4 @@
-"""warm_up: compile every kernel of a method on a toy, so that compilation never falls into a reconstruction's time."""
+"""warm_up: compiles every kernel of a method on a small example, before a reconstruction is timed."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from recon.voxels.fbp import is_gridded
 from recon.voxels.view_weights import missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
-_SEVERAL = 12  # times these views, for methods of several volumes
+_SEVERAL = 12  # factor on the number of projections, for methods that make several volumes
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 _RECONSTRUCTED: set[tuple[object, ...]] = set()
-"""Toys, with what they were reconstructed by, whose kernels this process has loaded."""
+"""Small examples, with method and geometry, whose kernels this process has already loaded."""
 
 
 def warm_up(
@@ -38,29 +38,33 @@ def warm_up(
     weighted: bool = False,
     on_kernel: Callable[[int], None] | None = None,
 ) -> None:
-    """Reconstruct a toy: a fit takes 1 to 2 minutes the first time on a machine, a fraction of a second later.
+    """Compile all kernels of a method by reconstructing a small example.
 
-    A process reconstructs each toy once. numba keeps what it compiles beside the package (or in the user's cache
-    folder), once for each kind of processor.
-    Kernels for another kind of geometry, first volume or ray are compiled only for it. Leaning views, a cone or weights
-    add a sixth of that time. A start by TV adds a third, a short scan of a cone with exact rays two thirds.
+    For a fit this takes 1 to 2 minutes the first time on a machine, and a fraction of a second later. A process
+    reconstructs each example once. numba stores compiled kernels next to the package (or in the user's cache folder),
+    once for each kind of processor.
+
+    Kernels for another kind of geometry, first volume or ray are compiled only if they are needed. Tilted projections,
+    a cone or weights add a sixth of the time. The start "tv" adds a third, and a short cone scan with exact rays adds
+    two thirds.
 
     Args:
-        method: with the settings of the run to come; None: the default one, with its defaults.
-        geometry: of the run to come; None: a parallel beam, straight.
-        weighted: its rays have weights, or values that are not finite.
-        on_kernel: called with the number of functions compiled so far, after each; never if all are cached.
+        method: the method with the settings of the later run; None: the default method with its default settings.
+        geometry: geometry of the later run; None: a parallel beam without roll and tilt.
+        weighted: True if the rays have weights, or values that are not finite.
+        on_kernel: function called after each compiled function with their number so far; never called if all are
+            cached.
 
     Raises:
-        ValueError: the method does not take such views.
+        ValueError: the method cannot use such projections.
     """
     method = method or by_name(DEFAULT)()
     if geometry is not None:
-        method.views_wanted(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
+        method.views_wanted(geometry)  # the error names the missing degrees of this geometry, not those of the example
     data, views = toy_of(geometry, _SEVERAL if isinstance(method, Series) else 1)
     where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
-        # A fit may end with patches.
+        # A fit may end with PnP-DCT steps.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, Fit) else (method,):
             toy = warmed.toy()
             if (key := (type(toy), repr(toy), where, device, weighted)) not in _RECONSTRUCTED:
@@ -71,11 +75,11 @@ def warm_up(
 
 
 def _reconstruct_silently(toy: Method, data: F32, views: Geometry, device: str, weighted: bool) -> None:
-    """Reconstruct a toy, of which nobody needs to be warned."""
+    """Reconstruct a small example, without warnings."""
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)
-        weights[::2, 3, 4] = 0  # views with and without go different ways
+        weights[::2, 3, 4] = 0  # projections with and without weight 0 use different code
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reconstruct(data, views, toy, device=device, use=DataUse(weights))
@@ -83,7 +87,7 @@ def _reconstruct_silently(toy: Method, data: F32, views: Geometry, device: str, 
 
 @contextmanager
 def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
-    """Call `on_kernel` with the number of functions compiled so far, after each."""
+    """Call `on_kernel` after each compiled function, with the number of functions compiled so far."""
 
     class Counter(event.Listener):
         n = 0
@@ -100,10 +104,11 @@ def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
 
 
 def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geometry]:
-    """Line integrals [view, row, col] of a Gaussian in four small views, which run the same kernels as `geometry`'s.
+    """Line integrals [view, row, col] of a Gaussian in four small projections, which run the same kernels as
+    `geometry`.
 
-    The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around. They
-    come so many `times`, one after the other.
+    They have the same beam, roll, tilt and shifts as `geometry`, and also cover 360° or not. The four projections are
+    repeated `times` times.
     """
     once = views = _views_like(geometry)
     for _ in range(times - 1):
@@ -112,8 +117,8 @@ def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geome
     rows, cols = (np.arange(n) for n in once.detector_shape)
     col, row = np.array([once.origin(view) for view in range(once.n_views)]).T[:, :, None]
     u, v = (cols - col) * once.pixel_pitch, (rows - row) * once.pixel_pitch
-    from_axis = u[:, None, :] ** 2 + v[:, :, None] ** 2  # where the ray meets the detector, mm²
-    if once.is_cone:  # where it passes the origin
+    from_axis = u[:, None, :] ** 2 + v[:, :, None] ** 2  # mm² at the point where the ray meets the detector
+    if once.is_cone:  # mm² at the point where the ray passes the origin
         from_axis *= once.sod**2 / (once.sdd**2 + from_axis)
     lines = density * width * np.sqrt(2 * np.pi) * np.exp(-from_axis / (2 * width**2))
     return np.tile(lines.astype(np.float32), (times, 1, 1)), views
@@ -124,12 +129,12 @@ def _views_like(geometry: Geometry | None) -> Geometry:
         views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     else:
         turn = 2 * np.pi if missing_arc(geometry) == 0 else np.pi
-        pitch = geometry.pixel_pitch * geometry.detector_shape[1] / _SHAPE[1]  # the same field
+        pitch = geometry.pixel_pitch * geometry.detector_shape[1] / _SHAPE[1]  # the same field of view
         angles = np.linspace(0, turn, _VIEWS, endpoint=False)
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
         leaning = (geometry.roll != 0) | (geometry.tilt != 0) | geometry.centres.any(axis=1)
-        # If only some views lean, the same holds here.
+        # If only some projections are tilted, the same is true here.
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     return views

@@ -1,8 +1,7 @@
-"""Causes of failures: why a library does not load, why a port does not open, and which other service answers on a
-line.
+"""Causes of failures: why a library does not load, why a port does not open, and which other service answers on a line.
 
-The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way
-on.
+This is the only place where drivers turn messages of others (loaders, operating systems, servers) into a sentence and
+advice.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ _LOADERS = (
         "Install the version made for this operating system",
     ),
     ("", "the file exists but is not a library that can be loaded", "Check the file and the permission to read it"),
-)  # what the loaders of Linux (which calls one for another processor not found), macOS and Windows say
+)  # messages of the loaders of Linux (which calls a library for another processor "not found"), macOS and Windows
 
 
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
-    """Why a library is not loaded, and what to do; both empty if it is not there."""
+    """Why a library cannot be loaded, and what to do; both are empty if the library does not exist."""
     for said, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
         if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
@@ -48,7 +47,7 @@ def of_library(name: str, problem: OSError) -> tuple[str, str]:
 
 
 def of_port(url: str, problem: BaseException) -> str:
-    """What to do about a port that does not open."""
+    """What to do if a port does not open."""
     number, group = getattr(problem, "errno", None) or getattr(problem.__context__, "errno", None), "root"
     with suppress(OSError, ValueError, KeyError, NotImplementedError):  # no file, a group without a name, Windows
         group = Path(url).group() if Path(url).stat().st_mode & 0o060 == 0o060 else group
@@ -63,7 +62,7 @@ def of_port(url: str, problem: BaseException) -> str:
             "it to one of your groups (GROUP, MODE)",
         ),
         (
-            number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # the latter on Windows
+            number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # on Windows
             f"Another program uses it (on Linux, `fuser {url}` names the program): close that program",
         ),
         (
@@ -76,17 +75,17 @@ def of_port(url: str, problem: BaseException) -> str:
     return next(advice for holds, advice in rows if holds)
 
 
-NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that no text of a device has
+NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that does not occur in texts of devices
 TELNET = re.compile("\xff[\xf0-\xfe]")  # the beginning of its negotiation
-_FOREIGN = (  # searched in the URL, a line end, and what was heard
+_FOREIGN = (  # searched in the URL, a line end, and the received text
     (
         f"^socket:.*{TELNET.pattern}",  # on a serial line it is noise
-        "the server speaks Telnet (FF starts its negotiation)",
-        "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
+        "the server uses Telnet (it sent FF, which starts the negotiation)",
+        "Set this port of the terminal server to raw TCP, without Telnet and RFC 2217",
     ),
     (
         r"\b(login|user ?name|password) ?:",
-        "a login is asked for",
+        "the server asks for a login",
         "Set this port of the terminal server to raw TCP, without a login",
     ),
     (
@@ -96,17 +95,18 @@ _FOREIGN = (  # searched in the URL, a line end, and what was heard
     ),
     (
         r"already in use|(port|line) is (in use|busy)|too many (clients|connections|sessions)",
-        "another client holds the server's port",
+        "another client uses the server's port",
         "Close the other program, or configure the server to accept a second client",
     ),
     (
         rf"\n.*{NO_TEXT.pattern}",
-        "it has bytes that are no text",
+        "it contains bytes that are not text",
         "Check the baud rate, the cable, and that the device is set to a text protocol",
     ),
 )
 
 
 def of_bytes(url: str, heard: str) -> tuple[str, str]:
-    """Who speaks on a line in the place of its device, by what was heard (a character a byte), and what to do."""
+    """Which other service answers on a line instead of the device, from the received text (a character per byte), and
+    advice."""
     return next((row[1:] for row in _FOREIGN if re.search(f"(?is){row[0]}", f"{url}\n{heard}")), ("", ""))

@@ -10,13 +10,13 @@ from typing import Protocol
 
 class Clock(Protocol):
     def now(self) -> float:
-        """Seconds since the Unix epoch, never going back."""
+        """Seconds since the Unix epoch; never decreases."""
 
     def sleep(self, seconds: float) -> None: ...
 
 
 class SystemClock:
-    """Wall-clock time that never goes back: the epoch time at the start plus a monotonic counter.
+    """Wall-clock time that never decreases: the epoch time at the start plus a monotonic counter.
 
     The counter is time.perf_counter: Windows advances time.monotonic in steps of 16 ms.
     """

@@ -48,11 +48,11 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # As a worker process sends it: with its parts, from which no message is made again.
+        # Worker processes send the error with its parts, and the message is not composed again.
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error, reported by `device`, which uses the device that failed. changed: error parts to replace."""
+        """The same error, reported by `device`, which uses the device that failed. `changed`: parts to replace."""
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 
@@ -62,4 +62,4 @@ class DeviceTimeout(DeviceError):  # noqa: N818 - the name that operators know
 
 
 class DeviceRefused(DeviceError):  # noqa: N818
-    """The device (or its driver) refuses a setting; nothing has changed."""
+    """The device (or its driver) rejected a setting; nothing has changed."""

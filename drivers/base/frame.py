@@ -17,24 +17,24 @@ class FrameKind(IntEnum):
     DARK = 2
     INVALID = 3
     ALIGNMENT = -1
-    OFFSET_VIEW = -2  # a projection with the sample stepped aside; in files a projection with a translation
+    OFFSET_VIEW = -2  # a projection with the sample moved sideways; in files it is a projection with a translation
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image with its metadata. It owns its memory, which is the only copy made of the camera's ring buffer.
+    """One image with its metadata. It owns its memory, which is the only copy of the camera's ring buffer.
 
     Attributes:
         counts: [row, col], uint16 of a camera; those of a file may be of another type.
         kind: projection, flat, dark, ...
         index: row in the file, counted over all frames of the scan from 0.
-        trigger: index of the trigger pulse that exposed it, counted within its block of frames from 0.
-        framestamp: the camera's own counter, -1 without one.
+        trigger: number of the trigger pulse that exposed it, counted from 0 within its block of frames.
+        framestamp: the camera's own counter; -1: the camera has no counter.
         angle: radians, the stage position at the trigger; NaN if the position does not matter (a dark).
         time: s since the Unix epoch, at the trigger.
         exposure: s.
-        replaces: row of the view that this one repeats; -1: none.
-        aside: mm by which the sample was moved across the beam, towards higher columns.
+        replaces: row of the projection that this frame repeats; -1: it repeats none.
+        aside: mm by which the sample was moved perpendicular to the beam, towards higher columns.
     """
 
     counts: NDArray[np.uint16]

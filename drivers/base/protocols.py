@@ -1,6 +1,4 @@
-"""Device Protocols: interfaces of stage, camera, shutter and devices that move in the beam; units are rad, s and
-keV.
-"""
+"""Device Protocols: interfaces of stage, camera, shutter and devices that move in the beam. Units: rad, s and keV."""
 
 from __future__ import annotations
 
@@ -21,11 +19,13 @@ class StageLimits:
         counts_per_turn: encoder counts (or motor pulses) for 2π; triggers fall on whole counts.
         max_speed, acceleration: rad/s, rad/s².
         low, high: soft limits in radians.
-        trigger_output: it can emit position-synchronised trigger pulses.
-        run_up: intervals of a train before its first pulse within which the stage cannot be armed.
-        pulse_spacing: s that the pulses of a train must be apart at `max_speed`.
-        interval_unit: counts; intervals of trains must be multiples of it (2 if each fire toggles the output).
-        tolerance: counts from its target within which the stage has arrived, and may stand while a frame is exposed.
+        trigger_output: True if the stage can emit position-synchronised trigger pulses.
+        run_up: distance before the first pulse, in intervals of the train, within which the stage cannot be armed.
+        pulse_spacing: smallest time in s between the pulses of a train at `max_speed`.
+        interval_unit: counts; intervals of trains must be multiples of this number (2 if each trigger toggles the
+            output).
+        tolerance: largest distance from the target, in counts, at which a move counts as finished and a frame may be
+            exposed.
     """
 
     counts_per_turn: int
@@ -44,7 +44,7 @@ class StageLimits:
 class TriggerTrain:
     """Position-synchronised pulses at start, start + interval, ... (n of them), in whole counts.
 
-    A negative interval means that the stage turns the other way.
+    With a negative interval the stage turns in the negative direction.
     """
 
     start: int
@@ -86,28 +86,34 @@ class RotationStage(Protocol):
         """Radians, read from the device."""
 
     def start_move(self, angle: float, speed: float) -> None:
-        """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
+        """Begin a move at `speed` (rad/s) and return at once. Raises DeviceRefused for a target outside the limits."""
 
     def start_home(self) -> None:
         """Begin the search for the reference and return at once; `wait` returns when the search has ended.
 
         Raises:
-            DeviceRefused: the stage has no reference, or it moves.
+            DeviceRefused: the stage has no reference, or it is moving.
         """
 
     def moving(self) -> bool: ...
 
     def wait(self, timeout: float) -> float:
-        """Wait for the move to end; the position in rad. Raises DeviceTimeout, or DeviceError if it stopped short."""
+        """Wait for the end of the move; returns the position in rad.
+
+        Raises DeviceTimeout, or DeviceError if it stopped early.
+        """
 
     def stop(self) -> None:
-        """Decelerate and stand. Legal in every state."""
+        """Decelerate and stop. Allowed in every state."""
 
     def abort(self) -> None:
-        """Stop at once, without deceleration. Legal in every state."""
+        """Stop at once, without deceleration. Allowed in every state."""
 
     def arm(self, train: TriggerTrain) -> None:
-        """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
+        """Prepare the pulses.
+
+        The stage must be at rest before the position of the first pulse; pulses come when it moves.
+        """
 
     def disarm(self) -> None: ...
 
@@ -115,7 +121,7 @@ class RotationStage(Protocol):
         """Another output of the stage's controller, such as one that opens a shutter.
 
         Raises:
-            DeviceRefused: the controller has no output to set, or this output gives the trigger pulses.
+            DeviceRefused: the controller has no such output, or the output is used for the trigger pulses.
         """
 
     def describe(self) -> dict[str, str | int | float]:
@@ -135,11 +141,11 @@ class CameraSettings:
     """Requested settings of a camera; as the return value of `configure`, the accepted ones.
 
     Attributes:
-        exposure: s.
-        trigger: who starts an exposure.
-        roi: (row0, col0, rows, cols) of the sensor; None is the full sensor.
-        binning: pixels summed per side.
-        readout: a mode of the camera by name: "standard", "ultra_quiet" or "photon_number".
+        exposure: exposure time in s.
+        trigger: what starts an exposure.
+        roi: (row0, col0, rows, cols) of the sensor; None: the full sensor.
+        binning: binning x binning pixels are summed.
+        readout: name of a readout mode of the camera: "standard", "ultra_quiet" or "photon_number".
     """
 
     exposure: float
@@ -151,14 +157,14 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """The camera's timing with its present settings; read from it, never computed by the caller.
+    """The camera's timing with its present settings; it is read from the camera and never computed by the caller.
 
     Attributes:
         shape: (rows, cols) of the next frames.
-        min_period: least s between triggers; earlier pulses are ignored.
-        readout: s for a full frame.
-        row_period: s by which each row starts later than the one above (rolling shutter); 0 for a global one.
-        bits: of a count; saturation is 2**bits - 1.
+        min_period: smallest time in s between triggers; the camera ignores earlier pulses.
+        readout: time in s to read a full frame.
+        row_period: time in s by which each row starts later than the row above (rolling shutter); 0: global shutter.
+        bits: bits of a count; saturation is at 2**bits - 1.
     """
 
     shape: tuple[int, int]
@@ -183,22 +189,22 @@ class Camera(Protocol):
     name: str
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply and read back. Raises DeviceRefused if the camera cannot."""
+        """Apply the settings and read them back. Raises DeviceRefused if the camera does not accept them."""
 
     @property
     def timing(self) -> CameraTiming: ...
 
     def arm(self, n_frames: int) -> None:
-        """Allocate the ring and wait for triggers; framestamps start at 0."""
+        """Allocate the ring buffer and wait for triggers; framestamps start at 0."""
 
     def software_trigger(self) -> None:
         """Expose one frame (trigger source SOFTWARE)."""
 
     def next_frame(self, timeout: float) -> CameraFrame:
-        """The oldest frame not yet taken. Raises DeviceTimeout when none comes within `timeout` s."""
+        """The oldest frame that was not returned yet. Raises DeviceTimeout if no frame arrives within `timeout` s."""
 
     def disarm(self) -> None:
-        """Stop and free the ring; legal in every state."""
+        """Stop, and free the ring buffer. Allowed in every state."""
 
     def describe(self) -> dict[str, str | int | float]: ...
 
@@ -207,12 +213,14 @@ class Camera(Protocol):
 
 class CooledCamera(Camera, Protocol):
     def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> float:
-        """Wait until the sensor is cold, at most `timeout` s; its temperature, °C. `progress` gets it and the status
-        of the cooler. Raises DeviceError: it does not get cold, or its cooler is off or in trouble."""
+        """Wait at most `timeout` s until the sensor is cold; returns its temperature in °C.
+
+        `progress` is called with the temperature and the status of the cooler. Raises DeviceError if the sensor does
+        not get cold, or if the cooler is off or reports a fault."""
 
 
 class Shutter(Protocol):
-    """Beam shutter. Darks need it closed. `by_hand`: the operator is asked to move it."""
+    """Beam shutter. It must be closed for darks. `by_hand`: the operator is asked to move it."""
 
     name: str
     by_hand: bool
@@ -229,7 +237,7 @@ class ConnectedShutter(Shutter, Protocol):
     """A shutter with its own connection."""
 
     def disconnect(self) -> None:
-        """Close the connection; the shutter stays as it is."""
+        """Close the connection; the shutter does not move."""
 
 
 class SampleMover(Protocol):
@@ -240,16 +248,16 @@ class SampleMover(Protocol):
     def out(self) -> None: ...
 
     def back(self, aside: float = 0.0) -> None:
-        """Move the sample into the beam, so many mm beside its place, towards higher columns of the frame."""
+        """Move the sample into the beam, `aside` mm from its position, towards higher columns of the frame."""
 
 
 class Filter(Protocol):
-    """A filter (attenuator) in the beam, at one of some named places; one of them may be an empty one."""
+    """A filter (attenuator) in the beam with several named places; one of them may be empty."""
 
     name: str
 
     def put(self, place: str) -> None:
-        """Move the filter to a place, and return when it is there. Raises DeviceError if it did not arrive."""
+        """Move the filter to a place, and return when it has arrived. Raises DeviceError if it did not arrive."""
 
     def place(self) -> str | None:
         """Name of the present place; None if it has no name or is not known. Raises DeviceError."""
@@ -268,7 +276,7 @@ class Monochromator(Protocol):
     name: str
 
     def move_to(self, energy: float) -> None:
-        """Move to an energy, and return when it has settled there. Raises DeviceError if it did not arrive."""
+        """Move to an energy, and return when the monochromator has settled. Raises DeviceError if it did not arrive."""
 
     def energy(self) -> float | None:
         """Present energy in keV; None if it is not known. Raises DeviceError."""
@@ -283,7 +291,7 @@ class ConnectedMonochromator(Monochromator, Protocol):
         """Stop the monochromator if it can be stopped. Raises DeviceError."""
 
     def close(self) -> None:
-        """End the connection; the monochromator stays where it is."""
+        """Close the connection; the monochromator does not move."""
 
 
 @runtime_checkable
@@ -291,21 +299,22 @@ class Watchable(Protocol):
     """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """Call `check` again and again from now on while the device moves; its exception ends the wait."""
+        """From now on, call `check` repeatedly while the device moves. An exception from `check` ends the wait."""
 
 
 @runtime_checkable
 class Rechecked(Protocol):
-    """A device whose position is trusted after a move, and can be checked again later."""
+    """A device whose position counts as known after a move, and can be checked again later."""
 
     def remember_place(self) -> Callable[[], str]:
-        """Note where it stands. The function returned says, whenever it is called, where it stands instead; "" if it is
-        still there. Both raise DeviceError."""
+        """Store the present position. The returned function says where the device is now; "" if it is still there.
+
+        Both raise DeviceError."""
 
 
 @dataclass(frozen=True)
 class BeamReading:
-    """A beam monitor's reading: a value in `unit` (A of an ion chamber, mA of the ring), at a time in s since 1970."""
+    """A beam monitor's reading: a value in `unit` (ion chamber: A, ring current: mA), at a time in s since 1970."""
 
     value: float
     unit: str
@@ -325,7 +334,7 @@ class BeamMonitor(Protocol):
 
 @dataclass(frozen=True)
 class Devices:
-    """The devices of the instrument; made by the composition root."""
+    """The devices of the instrument."""
 
     stage: RotationStage
     camera: Camera

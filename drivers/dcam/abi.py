@@ -106,7 +106,7 @@ _STATE: Mapping[str, str] = MappingProxyType(
         "dcamcap_firetrigger": "No frame was exposed",
     }
 )
-"""State after a call that failed; calls that are not listed only read."""
+"""The state after a call that failed. Calls that are not in this list only read."""
 
 
 class DcamError(DeviceError):
@@ -119,7 +119,7 @@ class DcamError(DeviceError):
             "the camera's library reports an error",
             request=call,
             reply=error_name(code),
-            expected="success, a number of 0 or more",
+            expected="a return value of 0 or more (success)",
             advice=_ADVICE.get(self.code, _USUAL_ADVICE),
             state=_STATE.get(call.split()[0], "Nothing was changed; frames taken before are good"),
         )
@@ -131,7 +131,7 @@ def installed_library(platform: str) -> str:
 
 
 STARTS_WITHIN = 20.0  # s for the library to look for cameras; some seconds are usual
-_SURVIVED = 86  # exit code of a trial whose library has loaded and started, or has said why not
+_SURVIVED = 86  # exit code of a test process whose library has started, or has reported an error
 _TRIAL = f"""
 import ctypes, os, sys
 try:
@@ -146,12 +146,12 @@ os._exit({_SURVIVED})
 
 @cache
 def try_out(name: str, device: str) -> None:
-    """Load and start a library in a process of its own, once a process of ours, in which it may hang or crash.
+    """Load and start a library in a separate process first, where it may hang or crash; once per process.
 
-    A program that contains its Python, and so cannot start another one, goes without this.
+    A program with a built-in Python cannot start another Python, and skips this test.
 
     Raises:
-        DeviceError: it does not return, or ends that process.
+        DeviceError: the library does not return, or ends the separate process.
     """
     if "python" not in Path(sys.executable or "").name.lower():
         return
@@ -160,18 +160,18 @@ def try_out(name: str, device: str) -> None:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is for us
+        start_new_session=True,  # so that Ctrl-C reaches only this process
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
     try:
         *_, last = process.communicate(timeout=STARTS_WITHIN)[1].decode(errors="replace").splitlines() or [""]
         if process.returncode == _SURVIVED:
             return
-        how = f"ends the process that starts it (code {process.returncode}{last and ', '}{last})"
+        how = f"ends every process that starts it (code {process.returncode}{last and ', '}{last})"
     except subprocess.TimeoutExpired:
-        how = f"does not return from its start within {STARTS_WITHIN:g} s"
+        how = f"did not finish starting within {STARTS_WITHIN:g} s"
         process.kill()
-        with suppress(subprocess.TimeoutExpired):  # one that hangs in its driver cannot even be killed
+        with suppress(subprocess.TimeoutExpired):  # a process that hangs in the driver cannot be killed
             process.communicate(timeout=1)
     raise DeviceError(
         device,
@@ -184,7 +184,7 @@ def try_out(name: str, device: str) -> None:
 
 
 class Dcam:
-    """A loaded DCAM library. Handles are plain integers; every method raises DcamError if the library returns an error.
+    """A loaded DCAM library. Handles are plain integers. Every method raises DcamError if the library returns an error.
 
     Calls that wait release Python's global interpreter lock.
 
@@ -193,12 +193,12 @@ class Dcam:
         device: name of the camera in error messages.
 
     Raises:
-        DeviceError: the library cannot be loaded, or lacks a function.
+        DeviceError: the library cannot be loaded, or a function is missing in it.
     """
 
     def __init__(self, library: Path | None, device: str) -> None:
         self._device = device
-        # A name without a folder is looked for in the folders of the system alone, a path is not.
+        # A name without a folder is searched for only in the folders of the system; a path is used as it is.
         name = str(library.resolve() if library and library.exists() else library or installed_library(sys.platform))
         try_out(name, device)
         try:
@@ -212,7 +212,7 @@ class Dcam:
             raise DeviceError(device, problem, advice=advice, state="Nothing was changed") from error
         missing = [call for call in ARGUMENTS if getattr(loaded, call, None) is None]
         if missing:
-            problem = f"{name} is not a DCAM-API version 4 library: {', '.join(missing)} missing"
+            problem = f"{name} is not a DCAM-API version 4 library, because it has no {', '.join(missing)}"
             raise DeviceError(
                 device, problem, advice="Check the library's path and version", state="Nothing was changed"
             )
@@ -226,13 +226,13 @@ class Dcam:
             raise DcamError(self._device, f"{call} {detail}".rstrip(), code)
 
     def api_init(self) -> int:
-        """Start the session (takes seconds with a real camera); returns the number of cameras found."""
+        """Start the session (this takes seconds with a real camera); returns the number of cameras found."""
         init = ApiInit(size=sizeof(ApiInit))
         self._call("dcamapi_init", byref(init))
         return int(init.device_count)
 
     def api_uninit(self) -> None:
-        """End the session; this closes all that is open."""
+        """End the session; this closes everything that is open."""
         self._call("dcamapi_uninit")
 
     def dev_open(self, index: int) -> int:
@@ -271,13 +271,16 @@ class Dcam:
         self._call("dcamprop_setvalue", camera, prop, value, detail=f"{prop.name} = {value:g}")
 
     def prop_queryvalue(self, camera: int, prop: Property, value: float, option: int) -> float:
-        """The legal value next to `value` (`option`: in which direction); an error if there is none."""
+        """The allowed value next to `value` in the direction `option`; an error if there is none."""
         answer = c_double(value)
         self._call("dcamprop_queryvalue", camera, prop, byref(answer), option, detail=prop.name)
         return answer.value
 
     def buf_alloc(self, camera: int, frames: int) -> None:
-        """Allocate a ring in the library's memory; until release, properties that change the frame size are locked."""
+        """Allocate a ring buffer in the library's memory.
+
+        Until it is released, properties that change the frame size are locked.
+        """
         self._call("dcambuf_alloc", camera, frames, detail=f"{frames} frames")
 
     def buf_release(self, camera: int) -> None:
@@ -293,7 +296,7 @@ class Dcam:
         self._call("dcamcap_start", camera, mode, detail=mode.name)
 
     def cap_stop(self, camera: int) -> None:
-        """Stop the capture; legal in every state."""
+        """Stop the capture; allowed in every state."""
         self._call("dcamcap_stop", camera)
 
     def cap_status(self, camera: int) -> CaptureState:
@@ -336,7 +339,7 @@ class Dcam:
         self._call("dcamwait_abort", wait)
 
     def wait_start(self, wait: int, mask: int, timeout_ms: int) -> None:
-        """Block until an event of `mask`. Events may be merged, so the transfer count says how many frames arrived.
+        """Wait for an event in `mask`. Events may be merged, so use the transfer count to find how many frames arrived.
 
         Raises:
             DcamError: also TIMEOUT, ABORT, LOSTFRAME and MISSINGFRAME_TROUBLE.

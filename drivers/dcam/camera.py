@@ -21,30 +21,30 @@ from drivers.dcam.settings import apply_settings, apply_trigger_source, descript
 from drivers.frame_memory import FrameMemory
 from drivers.orca_quest import DcamOptions, TriggerMode
 
-_WAIT_SLICE = 0.1  # s; short, since an event between a check and the wait is missed
-_LEAST_SLOTS = 16  # if memory allows: the camera may take additional frames while the host is busy
+_WAIT_SLICE = 0.1  # s; short, because an event between a check and the wait would be missed
+_LEAST_SLOTS = 16  # number of slots if there is enough memory, so that frames can arrive while the host is busy
 _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
 
 class DcamCamera:
     """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.base.protocols.Camera.
 
-    Framestamps are counted by the camera, so a frame that is lost anywhere leaves a gap. An overrun of the ring is also
-    an error, and `describe` returns how many frames were overwritten and how many losses the transport reported. Two
-    losses leave no gap and show in the times only: a trigger that comes too early, and the first frame of a run with a
-    camera whose framestamps continue over captures (the constructor tests for that). One thread takes frames; another
-    may call `disarm` or `close`, which end its wait.
+    The camera counts the framestamps, so a frame that is lost anywhere leaves a gap. An overrun of the ring buffer is
+    an error. `describe` also returns how many frames were overwritten and how many losses the transport reported. Two
+    kinds of loss leave no gap and are visible only in the times: a trigger that comes too early, and the first frame of
+    a run if the camera continues its framestamps over captures (the constructor tests for this). One thread takes the
+    frames. Another thread may call `disarm` or `close`, which end the wait of the first one.
 
     Args:
         library: path of the DCAM-API library; None: the installed one. A process can have one session with it.
         index: number of the camera among those that DCAM finds, from 0.
-        name: its name in error messages.
-        clock: gives the time of the first frame of a run; the camera's own clock gives the differences after it.
-        options: response to triggers, correction of counts, memory of the ring.
-        memory: of the frames that are taken.
+        name: name of the camera in error messages.
+        clock: gives the time of the first frame of a run. Later times come from the camera's own clock.
+        options: response to triggers, correction of counts, and memory of the ring buffer.
+        memory: memory for the frames that are taken.
 
     Raises:
-        DeviceError: no library, no camera, or no two test frames with counts and times.
+        DeviceError: there is no library or no camera, or two test frames with counts and times did not arrive.
     """
 
     def __init__(
@@ -60,19 +60,19 @@ class DcamCamera:
         self.name = name
         self._clock, self._options = clock or SystemClock(), options or DcamOptions()
         self._memory = memory or FrameMemory()
-        self._inside = threading.Lock()  # held while a frame is taken: close() waits for it
+        self._inside = threading.Lock()  # held while a frame is taken, so that close() waits
         self._ring_lock = threading.Lock()  # held while slots are read or freed
         self._ring: Ring | None = None  # set while armed
-        self._held: Ring | None = None  # allocated in the library, also if it could not be freed
-        self._clock_offset: float | None = None  # s, host time minus the camera's, in this run
-        self._origin: int | None = None  # framestamp of this run's first trigger; None until known from a frame
+        self._held: Ring | None = None  # True while allocated in the library, also if freeing failed
+        self._clock_offset: float | None = None  # s, host time minus camera time in this run
+        self._origin: int | None = None  # framestamp of the first trigger of this run; None until a frame shows it
         self._overwritten, self._transport_losses = 0, 0
         self._closed = False
         self._session = Session(library, index, name)
         try:
             self._dcam, self._camera = self._session.dcam, self._session.camera
             self._properties = Properties(self._dcam, self._camera, name)
-            self._apply(_TEST_SETTINGS)  # another program may have left any settings
+            self._apply(_TEST_SETTINGS)  # another program may have changed any setting
             stamps = self._first_framestamp(), self._first_framestamp()
             self._first_stamp = stamps[0] if stamps[0] == stamps[1] else None
         except BaseException:
@@ -81,10 +81,10 @@ class DcamCamera:
             raise
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply settings and read them back; only the exposure may differ, by the camera's rounding.
+        """Apply settings and read them back. Only the exposure may differ, because the camera rounds it.
 
         Raises:
-            DeviceRefused: the camera refuses a setting, or is armed; the earlier settings stay.
+            DeviceRefused: the camera rejects a setting, or is armed; then the earlier settings remain.
         """
         self._require_open()
         if self._ring is not None:
@@ -103,20 +103,20 @@ class DcamCamera:
         return read_timing(self._properties, self._settings.trigger, self._options)
 
     def arm(self, n_frames: int) -> None:
-        """Allocate the ring and start the capture; when this returns, the camera accepts triggers.
+        """Allocate the ring buffer and start the capture. When this returns, the camera accepts triggers.
 
         Raises:
-            DeviceRefused: it is armed already, or n_frames < 1.
+            DeviceRefused: the camera is already armed, or n_frames < 1.
         """
         self._require_open()
         if self._ring is not None:
             raise DeviceRefused(self.name, "it is already armed", advice="disarm() it first")
         if n_frames < 1:
             raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
-        self.disarm()  # frees a ring that could not be freed before
+        self.disarm()  # frees a ring buffer that could not be freed before
         if self._options.trigger_mode is TriggerMode.START:
             apply_trigger_source(self._properties, self._settings.trigger)
-        # One slot more than frames: the oldest slot of a full ring may be half overwritten at any moment.
+        # One more slot than frames, because the oldest slot of a full ring may be half overwritten at any moment.
         fitting = self._options.ring // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
         slots = max(2, min(max(n_frames + 1, _LEAST_SLOTS), fitting))
         ring = self._start(slots, CaptureMode.SEQUENCE)
@@ -132,13 +132,13 @@ class DcamCamera:
         self._dcam.cap_firetrigger(self._camera)
 
     def next_frame(self, timeout: float) -> CameraFrame:
-        """The oldest frame not yet taken, as a copy.
+        """A copy of the oldest frame that was not returned yet.
 
         Raises:
             DeviceTimeout: no frame arrived within `timeout` s.
-            DeviceRefused: not armed, or disarmed while waiting.
-            DeviceError: the ring was overrun (later frames can still be taken), the camera is unplugged, or the capture
-                ended by itself.
+            DeviceRefused: the camera is not armed, or was disarmed during the wait.
+            DeviceError: the ring buffer was overrun (later frames can still be taken), the camera is unplugged, or the
+                capture ended by itself.
         """
         deadline = self._clock.now() + timeout
         while True:
@@ -159,7 +159,8 @@ class DcamCamera:
                 self._await_event(min(left, _WAIT_SLICE))
 
     def disarm(self) -> None:
-        """Stop the capture and free the ring; legal in every state. It ends the wait of another thread for a frame.
+        """Stop the capture and free the ring buffer; allowed in every state. This ends the wait of another thread for a
+        frame.
 
         Raises:
             DcamError: the library failed; a second call tries again.
@@ -173,7 +174,7 @@ class DcamCamera:
         return wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 
     def describe(self) -> dict[str, str | int | float]:
-        """Identity and state of the camera, and the frames lost in the current or last run."""
+        """Identity and state of the camera, and the number of frames lost in the current or last run."""
         self._require_open()
         return {
             **description(self._session, self._properties, self._settings, self._options),
@@ -183,7 +184,7 @@ class DcamCamera:
         }
 
     def close(self) -> None:
-        """Free all resources, also after a failure; may be called again.
+        """Free all resources, also after a failure. Calling it again does nothing.
 
         Raises:
             DcamError: the first failure. An unplugged camera is not a failure.
@@ -213,7 +214,7 @@ class DcamCamera:
             self._session.close()
 
     def _start(self, slots: int, mode: CaptureMode) -> Ring:
-        """Allocate a ring and start a capture; it stays allocated until `_free`, also after an error."""
+        """Allocate a ring buffer and start a capture. The ring stays allocated until `_free`, also after an error."""
         ring = self._held = Ring(self._dcam, self._camera, self.name, slots, self._memory)
         try:
             ring.start(mode, self._clock)
@@ -224,14 +225,17 @@ class DcamCamera:
         return ring
 
     def _first_framestamp(self) -> int:
-        """Framestamp of the first frame of a capture, 0 or 1 by model; it reveals a lost first frame of a run."""
+        """Framestamp of the first frame of a capture (0 or 1, depending on the model).
+
+        It reveals a lost first frame of a run.
+        """
         ring = self._start(2, CaptureMode.SNAP)
         deadline = self._clock.now() + START_TIMEOUT
         while ring.arrived() < 2:
             if self._clock.now() > deadline:
                 raise DeviceTimeout(
                     self.name,
-                    f"only {ring.arrived()} of 2 test frames arrived within {START_TIMEOUT:g} s in free run",
+                    f"only {ring.arrived()} of 2 test frames arrived within {START_TIMEOUT:g} s without triggers",
                     expected=f"2 frames of {_TEST_SETTINGS.exposure:g} s",
                     advice="Check its cable, then switch it off and on",
                     state="Nothing was measured",
@@ -243,23 +247,23 @@ class DcamCamera:
         return int(first.framestamp)
 
     def _await_event(self, seconds: float) -> None:
-        """Wait until the ring may have changed; `_look` then reads the change."""
+        """Wait until the ring buffer may have changed; `_look` then reads the change."""
         try:
             self._dcam.wait_start(self._session.wait, self._session.events, max(1, round(seconds * 1000)))
         except DcamError as error:
             if error.code in (Error.LOSTFRAME, Error.MISSINGFRAME_TROUBLE):
-                self._transport_losses += 1  # the capture continues; the framestamps show which frame is missing
+                self._transport_losses += 1  # the capture continues, and the framestamps show which frame is missing
             elif error.code not in (Error.TIMEOUT, Error.ABORT):
                 raise
 
     def _look(self) -> CameraFrame | None:
-        """The next frame of the ring; None if none has arrived."""
+        """The next frame of the ring buffer; None if none has arrived."""
         self._require_open()
         with self._ring_lock:
             ring = self._ring
             if ring is None:
                 raise DeviceRefused(self.name, "it is not armed, so no frame will arrive", advice="arm() it first")
-            state = ring.state()  # read before the ring, so that the last frame is not missed
+            state = ring.state()  # read before the ring buffer, so that the last frame is not missed
             try:
                 taken = ring.take()
             finally:
@@ -285,7 +289,7 @@ class DcamCamera:
     def _trigger_time(self, frame: BufFrame) -> float:
         """Time of the trigger, s since the Unix epoch.
 
-        The camera's clock has its own epoch: the offset is the host's time at the first frame of the run, less its
+        The camera's clock has its own epoch. The offset is the host's time at the first frame of the run, minus
         exposure and readout.
         """
         stamp = seconds_of(frame)
@@ -297,6 +301,6 @@ class DcamCamera:
 
 
 def configured(section: Any, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
-    """Connect the camera of a section of a configuration; see `DcamCamera` for errors and `memory`."""
+    """Connect the camera that a section of a configuration describes; errors and `memory` as for `DcamCamera`."""
     library = None if section.library is None else Path(section.library)
     return DcamCamera(library, section.index, clock=clock, options=section.options, memory=memory)

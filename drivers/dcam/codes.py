@@ -287,7 +287,7 @@ class Property(IntEnum):
     CONVERSIONFACTOR_OFFSET = 0x00FFE020
 
 
-QUERY_NEXT = 0x01000000  # an option of dcamprop_queryvalue
+QUERY_NEXT = 0x01000000  # one of the options of dcamprop_queryvalue
 ATTRIBUTE_TYPE_MASK, ATTRIBUTE_TYPE_MODE = 0x0F, 1
 UNIT_SECOND = 1
 ATTRIBUTE_HASRANGE = 0x80000000  # a bit of DCAMPROP_ATTR.attribute

@@ -21,7 +21,7 @@ _REFUSALS = frozenset(
         *(Error.NOTWRITABLE, Error.ACCESSDENY, Error.NOTSTABLE, Error.BUSY),
     )
 )
-"""Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on their use."""
+"""Errors for a value that a camera rejects, always or at the moment; the vendor's manuals disagree on their use."""
 _STATE = "No frame was taken with this setting; earlier frames are good"
 
 
@@ -60,7 +60,7 @@ class Properties:
         """
         limits = self._limits(prop)
         if limits.attribute & codes.ATTRIBUTE_HASRANGE and not limits.minimum <= value <= limits.maximum:
-            # The camera itself may silently take the nearest limit instead.
+            # Otherwise the camera might silently use the nearest limit.
             raise self._refused(f"{prop.name} = {value:g} is out of range", prop, value)
         try:
             self._dcam.prop_setvalue(self._camera, prop, value)
@@ -68,7 +68,7 @@ class Properties:
             if error.code not in _REFUSALS:
                 raise
             reply = codes.error_name(error.code)
-            raise self._refused(f"it refuses {prop.name} = {value:g}", prop, value, reply) from error
+            raise self._refused(f"it rejects {prop.name} = {value:g}", prop, value, reply) from error
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:
@@ -78,7 +78,7 @@ class Properties:
             raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
 
     def set_if_available(self, prop: Property, value: float) -> None:
-        """Call `set_exactly` if the camera has the property; one without it behaves as if it had this value."""
+        """Call `set_exactly` if the camera has the property. A camera without it behaves as if it had this value."""
         if self.find(prop) is not None:
             self.set_exactly(prop, value)
 
@@ -92,7 +92,7 @@ class Properties:
                 request=f"{prop.name} = {value:g}",
                 reply=f"{accepted:g}",
                 expected=f"{value:g} within {tolerance:g}",
-                advice="Choose a value that the camera has, or a larger exposure_tolerance",
+                advice="Choose a value that the camera supports, or a larger exposure_tolerance",
                 state=_STATE,
             )
 
@@ -108,12 +108,12 @@ class Properties:
                 request=error.request,
                 reply=codes.error_name(error.code),
                 expected="an ORCA-Quest, or a camera with the same properties",
-                advice="Check that index names the right camera, and its firmware",
+                advice="Check that index is the number of the right camera, and check its firmware",
                 state=_STATE,
             ) from error
 
     def _refused(self, problem: str, prop: Property, value: float, reply: str = "") -> DeviceRefused:
-        """The error for a refused value, with the legal values."""
+        """The error for a rejected value, with the allowed values."""
         return DeviceRefused(
             self._device,
             problem,
@@ -132,7 +132,7 @@ class Properties:
             return f"{limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
         values = [limits.minimum]
         try:
-            # Stop if the value does not grow, which would repeat for ever.
+            # Stop if the value does not grow, because the loop would then never end.
             while (value := self._dcam.prop_queryvalue(self._camera, prop, values[-1], codes.QUERY_NEXT)) > values[-1]:
                 values.append(value)
         except DcamError as error:
@@ -145,7 +145,10 @@ Progress = Callable[[float, str], None]  # Called with the sensor's temperature 
 
 POLL = 1.0  # s
 STEADY_BAND, STEADY_FOR = 0.5, 60.0
-"""°C and s: with a cooler that reports no READY, a temperature within this band for this time counts as final."""
+"""Band in °C and time in s.
+
+If a cooler does not report READY, a temperature that stays within this band for this time is final.
+"""
 
 
 def wait_until_cold(
@@ -193,6 +196,6 @@ def _target(properties: Properties) -> str:
 
 
 def _steady(history: list[tuple[float, float]]) -> bool:
-    """True if the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
+    """True if the temperatures cover at least STEADY_FOR s and stay within STEADY_BAND °C."""
     values = [value for _, value in history]
     return history[-1][0] - history[0][0] >= STEADY_FOR and max(values) - min(values) <= STEADY_BAND

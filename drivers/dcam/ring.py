@@ -1,6 +1,4 @@
-"""Ring buffer: the frame buffers of the DCAM library during one capture; frames are read in order, with one copy
-each.
-"""
+"""Ring buffer: the frame buffers of the DCAM library during one capture; frames are read in order and copied once."""
 
 from __future__ import annotations
 
@@ -23,8 +21,8 @@ class Ring:
     """A ring of frame buffers, allocated by the constructor and released by `free`. Not safe from several threads.
 
     Args:
-        slots: number of frames that it holds; during a capture the oldest may be half overwritten at any moment.
-        memory: of the frames that are taken.
+        slots: number of frames in the ring. During a capture the oldest one may be half overwritten at any moment.
+        memory: memory for the frames that are taken.
 
     Raises:
         DcamError: the memory cannot be allocated.
@@ -37,7 +35,7 @@ class Ring:
         self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
         self._next = 0  # number of the next frame to take, counted from 0 in the order of arrival
         self._count = 0  # frames that had arrived at the last call
-        self._overrun_reported = False  # and no frame was taken since
+        self._overrun_reported = False  # overwritten frames that have not been reported yet
         self.overwritten = 0
         self._memory = memory
         dcam.buf_alloc(camera, slots)
@@ -50,7 +48,7 @@ class Ring:
         """
         deadline = clock.now() + START_TIMEOUT
         self._dcam.cap_start(self._camera, mode)
-        # Triggers before BUSY are lost. A SNAP may already have ended.
+        # Triggers before BUSY are lost. A SNAP capture may already have ended.
         while mode is CaptureMode.SEQUENCE and self.state() is not CaptureState.BUSY:
             if clock.now() > deadline:
                 raise DeviceTimeout(
@@ -71,13 +69,13 @@ class Ring:
         """Number of frames that have arrived since the start.
 
         Raises:
-            DeviceError: the count went back, so the capture cannot go on.
+            DeviceError: the count decreased, so the capture cannot continue.
         """
         before, self._count = self._count, self._dcam.cap_transferinfo(self._camera)
         if self._count < before:
             raise DeviceError(
                 self._device,
-                f"its frame counter went back from {before} to {self._count}",
+                f"its frame counter decreased from {before} to {self._count}",
                 request="dcamcap_transferinfo",
                 expected="a counter that only increases during a capture",
                 advice="Check that no other program uses the camera, then arm it again",
@@ -93,7 +91,7 @@ class Ring:
         """A copy of the next frame, and its stamps; None if none has arrived yet.
 
         Raises:
-            DeviceError: the ring was overrun. Raised once; the next call continues with the frames still there.
+            DeviceError: the ring was overrun. It is raised once; the next call continues with the remaining frames.
         """
         while True:
             # The ring overwrites frames that were not taken: the oldest slot may change at any moment.
@@ -110,7 +108,8 @@ class Ring:
             return counts, frame
 
     def free(self) -> None:
-        """Stop the capture and release the memory, also if stopping fails: an unplugged camera still holds memory."""
+        """Stop the capture and release the memory, also if stopping fails, because an unplugged camera still has
+        memory."""
         run_all(lambda: self._dcam.cap_stop(self._camera), lambda: self._dcam.buf_release(self._camera))
 
     def _skip(self, oldest: int) -> None:
@@ -123,15 +122,15 @@ class Ring:
             self._overrun_reported = True
             raise DeviceError(
                 self._device,
-                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers "
-                f"{first} to {oldest - 1} of this run in the order of arrival",
+                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: frames {first} to "
+                f"{oldest - 1} of this run, in the order of arrival",
                 expected="every frame to be read before the ring buffer overwrites it",
                 advice="Read frames faster, trigger more slowly, or give the ring buffer more memory",
                 state="Later frames can still be read",
             )
 
     def _copy(self, frame: BufFrame) -> NDArray[np.uint16]:
-        """Copy a frame, uint16 [row, col], out of the ring, where rows may be padded."""
+        """Copy a frame, uint16 [row, col], out of the ring, in which rows may be padded."""
         rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
         if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
             problem = f"it returned a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes per row"
@@ -140,7 +139,7 @@ class Ring:
                 problem,
                 request="dcambuf_lockframe",
                 expected="whole rows of 16-bit pixels",
-                advice=f"{RUNTIME}, and that no other program sets the camera",
+                advice=f"{RUNTIME}, and that no other program changes the camera's settings",
                 state=f"{self._next} frames of this run were taken earlier",
             )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
@@ -150,15 +149,15 @@ class Ring:
 
 
 def seconds_of(frame: BufFrame) -> float:
-    """Timestamp of a frame in s, from an epoch of the camera's own."""
+    """Timestamp of a frame in s, counted from the camera's own epoch."""
     return float(frame.timestamp.seconds + 1e-6 * frame.timestamp.microseconds)
 
 
 def require_stamps(first: BufFrame, second: BufFrame, device: str) -> None:
-    """Check that the camera counted and dated two successive frames: without that, a lost frame could not be seen.
+    """Check that the camera counted and timed two successive frames; otherwise a lost frame could not be detected.
 
     Raises:
-        DeviceError: the framestamps are not one apart, or the times do not grow.
+        DeviceError: the framestamps do not differ by one, or the times do not increase.
     """
     if second.framestamp - first.framestamp == 1 and seconds_of(second) > seconds_of(first):
         return
@@ -166,8 +165,8 @@ def require_stamps(first: BufFrame, second: BufFrame, device: str) -> None:
         device,
         f"its frames have no usable counter and time: framestamps {first.framestamp}, "
         f"{second.framestamp}, times {seconds_of(first):.6f} s, {seconds_of(second):.6f} s",
-        request="2 frames in free run",
-        expected="framestamps one apart and increasing times; without them a lost frame cannot be detected",
+        request="2 frames without triggers",
+        expected="framestamps that differ by one, and increasing times; otherwise a lost frame cannot be detected",
         advice="Update the camera's firmware and the vendor's DCAM-API runtime",
         state="Nothing was measured",
     )

@@ -27,7 +27,7 @@ class Session:
         device: name of the camera in error messages.
 
     Raises:
-        DeviceError: no library, or no camera; nothing stays open.
+        DeviceError: there is no library or no camera; nothing remains open.
     """
 
     def __init__(self, library: Path | None, index: int, device: str) -> None:
@@ -45,7 +45,8 @@ class Session:
                     state="Nothing was changed",
                 )
             self.camera = self.dcam.dev_open(index)
-            self._steps.append(lambda: self.dcam.dev_close(self.camera))  # also ends a capture and frees the ring
+            # also ends a capture and frees the ring buffer
+            self._steps.append(lambda: self.dcam.dev_close(self.camera))
             self.wait, supported = self.dcam.wait_open(self.camera)
             self._steps.append(lambda: self.dcam.wait_close(self.wait))
             self.events = (DcamEvent.FRAMEREADY | DcamEvent.STOPPED) & supported
@@ -55,7 +56,7 @@ class Session:
             raise
 
     def close(self) -> None:
-        """Close everything, also if a step fails; may be called again.
+        """Close everything, also if a step fails. Calling it again does nothing.
 
         Raises:
             DcamError: the first failure. An unplugged camera is not a failure.
@@ -64,12 +65,12 @@ class Session:
         run_all(*steps)
 
     def _start(self) -> int:
-        self._steps.append(self._end)  # also a session that failed to start must be ended
+        self._steps.append(self._end)  # a session that failed to start must also be ended
         try:
             return self.dcam.api_init()
         except DcamError as error:
             if error.code in (Error.BUSY, Error.EXCLUDED):
-                self._steps.clear()  # ending it would end the session of another camera in this process
+                self._steps.clear()  # ending it would end the session of another camera in this process, too
             if error.code != Error.NOCAMERA:
                 raise
             raise DeviceError(
@@ -86,16 +87,16 @@ class Session:
         try:
             self.dcam.api_uninit()
         except DcamError:
-            # Try once more: a session left open would block every later one in this process.
+            # Try once more, because a session that stays open would block every later one in this process.
             self.dcam.api_uninit()
             raise
 
 
 def run_all(*steps: Callable[[], None]) -> None:
-    """Run every step, also after a failed one.
+    """Run every step, also after a failed step.
 
     Raises:
-        DcamError: the first failure. An unplugged camera is not a failure: there is nothing to undo.
+        DcamError: the first failure. An unplugged camera is not a failure, because there is nothing to undo.
     """
     first: DcamError | None = None
     for step in steps:
@@ -113,15 +114,18 @@ _LINKS = {1: "1.5 Mbit/s", 2: "12 Mbit/s", 3: "480 Mbit/s", 4: "5 Gbit/s", 5: "1
 
 class Verdict(StrEnum):
     READY = "ready"
-    SLOW = "slow"  # the camera works, at a fraction of its frame rate
+    SLOW = "slow"  # the camera works, but at a fraction of its frame rate
     ABSENT = "absent"
     AMBIGUOUS = "ambiguous"
-    UNKNOWN = "unknown"  # this machine cannot check
+    UNKNOWN = "unknown"  # this computer cannot check USB
 
 
 @dataclass(frozen=True)
 class UsbDevice:
-    """Descriptors of one USB device. Texts without read permission are empty; `speed` is libusb's number."""
+    """Descriptors of one USB device.
+
+    Texts that cannot be read for lack of permission are empty; `speed` is libusb's number.
+    """
 
     vendor: int
     product: int
@@ -139,7 +143,7 @@ class UsbDevice:
 
 @dataclass(frozen=True)
 class Preflight:
-    """The verdict, one sentence for the operator, and the devices found."""
+    """The result, one sentence for the operator, and the devices found."""
 
     verdict: Verdict
     message: str
@@ -149,12 +153,12 @@ class Preflight:
 def preflight(
     vendor: int = HAMAMATSU, product: int | None = None, serial: str | None = None, backend: Any = None
 ) -> Preflight:
-    """Look for one camera on USB; every outcome is a verdict, never an exception.
+    """Look for one camera on USB. Every outcome is a result, never an exception.
 
     Args:
-        vendor, product: USB ids; without the product id other devices of the vendor match too.
-        serial: serial number, needed with several cameras of one kind.
-        backend: a pyusb backend; None takes the installed libusb.
+        vendor, product: USB ids; without the product id, other devices of the vendor also match.
+        serial: serial number; needed if there are several cameras of one kind.
+        backend: a pyusb backend; None: the installed libusb.
     """
     fields = {"idVendor": vendor} if product is None else {"idVendor": vendor, "idProduct": product}
     wanted = f"{vendor:04x}:{'*' if product is None else f'{product:04x}'}"
@@ -164,7 +168,7 @@ def preflight(
         return Preflight(Verdict.UNKNOWN, "USB cannot be checked, because libusb is not installed on this computer.")
     except usb.core.USBError as error:
         return Preflight(Verdict.UNKNOWN, f"USB cannot be checked: {error}.")
-    # A device whose serial number cannot be read may be the requested one.
+    # a device whose serial number cannot be read may be the requested one
     devices = tuple(device for device in connected if not (serial and device.serial and device.serial != serial))
     if not devices:
         which = f"{wanted} with serial number {serial}" if serial else wanted

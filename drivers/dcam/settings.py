@@ -33,7 +33,7 @@ def description(
 
     Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
     missing for a camera that does not report them. `row_period` (s): how much later each row starts than the one
-    above. It is missing where all rows start together.
+    above. It is missing if all rows start together.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON
@@ -70,7 +70,7 @@ def description(
 
 
 def _if_told(ask: Callable[[], str], otherwise: str) -> str:
-    """The camera's answer; `otherwise` if it does not give one."""
+    """The camera's answer, or `otherwise` if it does not answer."""
     try:
         return ask()
     except DcamError as error:
@@ -98,7 +98,7 @@ _VALUES: Mapping[StrEnum, int] = MappingProxyType(
         HotPixelMode.AGGRESSIVE: 3,
     }
 )
-"""Our choices as values of the camera's properties."""
+"""Our options as values of the camera's properties."""
 PHOTON_NUMBER = "photon_number"
 _READOUTS = MappingProxyType(
     {
@@ -107,7 +107,7 @@ _READOUTS = MappingProxyType(
         PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # has only one speed
     }
 )
-"""Sensor mode and readout speed. With photon_number the camera converts a pixel's charge to photoelectrons itself."""
+"""Sensor mode and readout speed. With photon_number the camera itself converts a pixel's charge to photoelectrons."""
 _PLAIN = DcamOptions()
 
 
@@ -117,7 +117,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     Only the exposure may be rounded.
 
     Raises:
-        DeviceRefused: at the first property that the camera refuses; earlier ones are set.
+        DeviceRefused: the camera rejects a property; earlier properties have been set.
     """
     if settings.readout not in _READOUTS:
         problem = f"there is no readout {settings.readout!r}"
@@ -128,7 +128,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             advice="Choose one of the legal values in the configuration",
             state="Its settings were not changed",
         )
-    # Sensor mode and speed first: they change the ranges of the others.
+    # Sensor mode and speed first, because they change the ranges of the other properties.
     mode, speed = _READOUTS[settings.readout]
     properties.set_exactly(Property.SENSORMODE, mode)
     if speed is not None:
@@ -157,7 +157,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     tolerance = options.exposure_tolerance * settings.exposure + line
     properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
     apply_trigger_source(properties, settings.trigger)
-    # Pulse options do not apply to software triggers: each of these gives one frame of the set exposure.
+    # Pulse options do not apply to software triggers. Each of them gives one frame with the set exposure.
     pulses = options if settings.trigger is TriggerSource.EXTERNAL else _PLAIN
     properties.set_exactly(Property.TRIGGER_MODE, _VALUES[pulses.trigger_mode])
     properties.set_exactly(Property.TRIGGERACTIVE, _VALUES[pulses.trigger_active])
@@ -168,7 +168,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
 
 
 def apply_trigger_source(properties: Properties, source: TriggerSource) -> None:
-    """Set the trigger source. In START mode the first pulse resets it, so that it must be set before each run."""
+    """Set the trigger source. In START mode the first pulse resets the source, so it must be set before each run."""
     properties.set_exactly(Property.TRIGGERSOURCE, _VALUES[source])
 
 
@@ -190,13 +190,13 @@ def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSetti
 def read_timing(properties: Properties, trigger: TriggerSource, options: DcamOptions) -> CameraTiming:
     """Frame shape and timing that the camera reports, with the shortest trigger period.
 
-    The vendor's rule for external triggers (DCAM property reference). With exposure Tx, cyclic trigger period Tc and
-    minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart. They are also not closer than the minimum trigger
-    interval. Tx is left out where the pulses set the exposure; where n pulses give one frame, pulses may be n times as
-    close.
+    For external triggers it is the vendor's rule (DCAM property reference). With exposure Tx, cyclic trigger period Tc
+    and minimum blanking Tb, triggers must be at least max(Tc, Tx + Tb) apart. They must also be at least the minimum
+    trigger interval apart. Tx is left out if the pulses set the exposure. If n pulses give one frame, pulses may be n
+    times as close.
 
-    Frames of a set exposure are also not closer than in free run, where the camera allows for the link. A full frame
-    takes 56 ms over USB and 8 ms on the sensor.
+    Frames with a set exposure are also not closer than in free run, because the camera's period in free run includes
+    the transfer. A full frame takes 56 ms over USB and 8 ms on the sensor.
     """
     get = properties.get
     rows, cols = round(get(Property.IMAGE_HEIGHT)), round(get(Property.IMAGE_WIDTH))
@@ -223,7 +223,7 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     if roi is None:
         return
     row0, col0, rows, cols = roi
-    # Positions to 0 first: position + size must stay within the sensor at every step, also in the reported ranges.
+    # Positions to 0 first, because position + size must stay within the sensor at every step, also in reported ranges.
     properties.set_exactly(Property.SUBARRAYVPOS, 0)
     properties.set_exactly(Property.SUBARRAYHPOS, 0)
     height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))

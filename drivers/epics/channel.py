@@ -12,10 +12,10 @@ from typing import Any, NoReturn, Protocol
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 
 INVALID = 3
-"""The severity of a value that the IOC does not vouch for: its hardware does not answer, or it was never set."""
+"""The severity of a value that the IOC does not guarantee, because its hardware does not answer or it was never set."""
 UNREACHABLE = (
-    "Check the name, that its IOC is running, and which hosts are searched: EPICS_PVA_ADDR_LIST for "
-    "pva://, EPICS_CA_ADDR_LIST for ca://"
+    "Check the name, that its IOC is running, and which hosts are searched (EPICS_PVA_ADDR_LIST for pva://, "
+    "EPICS_CA_ADDR_LIST for ca://)"
 )
 
 
@@ -46,35 +46,38 @@ class ProcessVariable(Protocol):
     name: str
 
     def read(self, *suffixes: str) -> list[PvValue]:
-        """The present values. Raises DeviceTimeout: one does not answer in time; DeviceError: it cannot be read."""
+        """The present values.
+
+        Raises DeviceTimeout if one does not answer in time, DeviceError if one cannot be read.
+        """
 
     def write(self, suffix: str, value: float | str) -> None:
-        """Set a value, before any later read. Raises DeviceTimeout, DeviceError: it refuses.
+        """Set a value; later reads see it. Raises DeviceTimeout, or DeviceError if the variable rejects the value.
 
-        Channel Access does not say whether a disabled record (DISP) took it; only a later read shows it.
+        Channel Access does not report whether a disabled record (DISP) accepted the value; only a later read shows it.
         """
 
     def close(self) -> None:
-        """Later reads and writes raise DeviceError."""
+        """Close the channel; later reads and writes raise DeviceError."""
 
 
 def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
     """Open the channel of pva://NAME or ca://NAME, without reading it yet.
 
     Args:
-        device: its name in errors.
-        timeout: s, of each read and write.
+        device: name of the device in errors.
+        timeout: time limit in s of each read and write.
 
     Raises:
         DeviceRefused: the address is of another kind.
-        DeviceError: the library for it is not installed.
+        DeviceError: the library for this kind is not installed.
     """
     if problem := url_problem(url):
         raise DeviceRefused(device, problem, state="Nothing was asked")
     scheme, _, name = url.partition("://")
     try:
         return OPENERS[scheme.lower()](name, device, timeout)
-    except (ImportError, OSError, ValueError) as error:  # ValueError: it was compiled for another numpy
+    except (ImportError, OSError, ValueError) as error:  # ValueError: the library was compiled for another numpy
         library = getattr(error, "name", None) or f"for {scheme}://"
         raise DeviceError(
             device,
@@ -85,7 +88,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
 
 
 def url_problem(url: str) -> str:
-    """Why a URL names no process variable; "" if it names one."""
+    """Why a URL does not name a process variable; "" if it does."""
     scheme, _, name = url.partition("://")
     legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
     return "" if legal else f"{url!r} does not name a process variable; expected pva://NAME (PVAccess) or ca://NAME"
@@ -105,7 +108,7 @@ def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> N
 
 @dataclass(frozen=True)
 class _Errors:
-    """What a channel says when it fails."""
+    """The errors of a channel."""
 
     device: str
     timeout: float
@@ -176,7 +179,7 @@ def _of_pva(found: Any) -> PvValue:
     if (labels := getattr(choices, "choices", None)) is not None:
         index = int(choices.index)
         return PvValue(float(index), labels[index] if index < len(labels) else "", severity)
-    # str() of a p4p text has its time before it
+    # str() of a p4p text begins with its time
     return PvValue(str.__str__(found) if isinstance(found, str) else float(found), "", severity)
 
 
@@ -211,7 +214,7 @@ class CaChannel:
             self._errors.refused(f"{name} = {value}", result)
 
     def close(self) -> None:
-        """Close the channel; the process keeps its circuits, which others may use."""
+        """Close the channel. The process keeps its circuits, because other channels may use them."""
         self._ca = None
 
     def _asked(self) -> Any:
@@ -228,7 +231,7 @@ def _of_ca(found: Any) -> PvValue:
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of Channel Access, in a separate thread, once a process."""
+    """The event loop of Channel Access in a separate thread; one for each process."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
     return loop
@@ -239,4 +242,4 @@ def _waited(asked: Any) -> Any:
 
 
 OPENERS: dict[str, Callable[[str, str, float], ProcessVariable]] = {"pva": PvaChannel, "ca": CaChannel}
-"""Scheme of a URL -> what opens it; a simulation adds its own."""
+"""For each scheme of a URL, the function that opens it. A simulation adds its own scheme."""

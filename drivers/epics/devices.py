@@ -12,23 +12,25 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
 from recon.base.setting import CheckedSettings, setting
 
-POLL = 0.05  # s between looks at a shutter that moves
+POLL = 0.05  # s between two reads while a shutter moves
 NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
 
 
 class _PvDevice:
-    """A device behind process variables, which are opened together."""
+    """A device that is controlled by process variables, which are opened together."""
 
     def __init__(self, name: str, clock: Clock, timeout: float) -> None:
-        """`timeout`: s, of each read and write."""
+        """`timeout`: time limit in s of each read and write."""
         self.name, self._clock, self._timeout = name, clock, timeout
         self._check: Callable[[], None] = lambda: None
         self.disconnect: Callable[[], None]
-        """Close the connection; the device stays as it is."""
+        """Close the connection; the device does not move."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """Call `check` again and again from now on during the move; its exception ends the wait, and stops what can be
-        stopped."""
+        """From now on, call `check` repeatedly during a move.
+
+        Its exception ends the wait and stops the device, if possible.
+        """
         self._check = check
 
     @contextmanager
@@ -42,7 +44,7 @@ class _PvDevice:
             self.disconnect = opened.pop_all().close
 
     def _waited(self, arrived: Callable[[], bool], travel: float, check: Callable[[], None] | None = None) -> bool:
-        """Wait at most `travel` s; whether it has arrived."""
+        """Wait at most `travel` s; returns whether the device has arrived."""
         deadline = self._clock.now() + travel
         while not (there := arrived()) and self._clock.now() < deadline:
             (check or self._check)()
@@ -60,25 +62,27 @@ class ShutterPvs(CheckedSettings):
     )
     close_pv: str | None = setting(
         None,
-        "Process variable that closes the shutter; null: open_pv, which then takes both values.",
+        "Process variable that closes the shutter; null: open_pv is used for both values.",
         problem=url_problem,
     )
-    open_value: float | str = setting(1.0, "Written to open_pv to open it: a number, a text or a label.")
+    open_value: float | str = setting(
+        1.0, "Value that is written to open_pv to open the shutter: a number, a text or a label."
+    )
     close_value: float | str = setting(0.0)
     status_open: float | str = setting(
-        1.0, "Its value or label while the shutter is open; any other value counts as closed."
+        1.0, "Value or label of the status while the shutter is open; any other value counts as closed."
     )
     timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
     travel: float = setting(10.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
 
 
 class PvShutter(_PvDevice):
-    """Implements `drivers.base.protocols.Shutter`. Opening and closing end when the status says so.
+    """Implements `drivers.base.protocols.Shutter`. Opening and closing end when the status confirms it.
 
     `close` always writes, even if the status says closed.
 
     Raises:
-        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+        DeviceRefused: an address is not a process variable. DeviceTimeout, DeviceError: the status does not answer.
     """
 
     by_hand = False
@@ -127,7 +131,10 @@ class PvShutter(_PvDevice):
 class FilterPvs(CheckedSettings):
     """The process variables of a filter, as pva://NAME or ca://NAME; times in s."""
 
-    pv: str = setting(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
+    pv: str = setting(
+        doc="Process variable to which the value of a place is written: a number, a text or a label.",
+        problem=url_problem,
+    )
     status_pv: str | None = setting(
         None,
         "Process variable with the position of the filter itself, in the same values; null: pv.",
@@ -139,10 +146,10 @@ class FilterPvs(CheckedSettings):
 
 
 class PvFilter(_PvDevice):
-    """Implements `drivers.base.protocols.Filter`. A move ends when the status says so.
+    """Implements `drivers.base.protocols.Filter`. A move ends when the status confirms it.
 
     Raises:
-        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+        DeviceRefused: an address is not a process variable. DeviceTimeout, DeviceError: the status does not answer.
     """
 
     def __init__(self, pvs: FilterPvs, clock: Clock, name: str = "filter") -> None:
@@ -168,7 +175,7 @@ class PvFilter(_PvDevice):
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
-                advice="Check where it is, and whether this computer has write access",
+                advice="Check its position, and whether this computer has write access",
             )
 
     def remember_place(self) -> Callable[[], str]:
@@ -194,32 +201,41 @@ class EnergyUnit(StrEnum):
 class MonochromatorPvs(CheckedSettings):
     """The process variables of a monochromator, as pva://NAME or ca://NAME; times in s, `tolerance` in eV."""
 
-    pv: str = setting(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)
+    pv: str = setting(
+        doc="Process variable to which the energy is written, for example VAL of a motor record.", problem=url_problem
+    )
     status_pv: str = setting(doc="Process variable with the energy itself.", problem=url_problem)
     stop_pv: str | None = setting(
-        None, "Process variable that stops it if 1 is written; null: it cannot be stopped.", problem=url_problem
+        None,
+        "Process variable that stops the monochromator if 1 is written to it; null: it cannot be stopped.",
+        problem=url_problem,
     )
     unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
     tolerance: float = setting(
-        0.5, "Largest difference between the energy and the one that was asked for.", unit="ev", gt=0, le=1e4
+        0.5, "Largest allowed difference between the energy and the requested energy.", unit="ev", gt=0, le=1e4
     )
     settle: float = setting(
-        1.0, "How long it must stay within tolerance_ev before a move counts as finished.", unit="s", ge=0, le=1e6
+        1.0,
+        "Time for which the energy must stay within tolerance_ev before a move counts as finished.",
+        unit="s",
+        ge=0,
+        le=1e6,
     )
     timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
     travel: float = setting(60.0, "Longest time of a move.", unit="s", gt=0, le=1e6)
 
     @property
     def per_kev(self) -> float:
-        """The number that the process variables show at 1 keV."""
+        """The value of the process variables at 1 keV."""
         return 1e3 if self.unit is EnergyUnit.EV else 1.0
 
 
 class PvMonochromator(_PvDevice):
-    """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has stayed there for `settle`.
+    """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has stayed at the energy for
+    `settle`.
 
     Raises:
-        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+        DeviceRefused: an address is not a process variable. DeviceTimeout, DeviceError: the status does not answer.
     """
 
     def __init__(self, pvs: MonochromatorPvs, clock: Clock, name: str = "monochromator") -> None:
@@ -259,16 +275,19 @@ class PvMonochromator(_PvDevice):
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
-            advice="Check where it is, and whether this computer has write access",
+            advice="Check its position, and whether this computer has write access",
         )
 
     def stop(self) -> None:
-        """Stop the monochromator, if it can be stopped. Raises DeviceError."""
+        """Stop the monochromator if it can be stopped. Raises DeviceError."""
         for stopper in self._stoppers:
             stopper.write("", 1)
 
     def remember_place(self) -> Callable[[], str]:
-        """See `drivers.base.protocols.Rechecked`. The energy may be off for less than `settle`, as after a move."""
+        """See `drivers.base.protocols.Rechecked`.
+
+        A deviation of the energy that lasts less than `settle` does not count, as after a move.
+        """
         before = self.energy()
 
         def moved() -> str:
@@ -292,7 +311,7 @@ class PvSource:
     """Implements `drivers.beam_monitors.TextSource`: the number of a process variable as text.
 
     Raises:
-        DeviceRefused: an address of another kind.
+        DeviceRefused: the address is not a process variable.
     """
 
     def __init__(self, url: str, timeout: float, name: str = "beam monitor") -> None:

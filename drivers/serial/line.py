@@ -1,9 +1,9 @@
 """SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or sim:// of a simulator.
 
-Three rules keep requests and replies in step: one request at a time, a finite timeout, and every reply must match the
-form expected. After a timeout or a reply of another form, received data are discarded until the device has answered a
-probe without side effects and the line is silent. Commands without a reply are sent at once, so that a stop does not
-wait.
+Three rules keep requests and replies synchronised: there is one request at a time, every wait has a timeout, and every
+reply must match the expected form. After a timeout or a reply of another form, received data are discarded until the
+device has answered a probe without side effects and the line is silent. Commands without a reply are sent at once, so
+that a stop does not wait.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         write_timeout: s after which a write fails.
 
     Raises:
-        OSError, ValueError: it does not open.
+        OSError, ValueError: the port does not open.
     """
     port = serial.serial_for_url(url, baudrate=baudrate, timeout=quiet, write_timeout=write_timeout, exclusive=True)
     if url.lower().startswith("socket://"):
-        # Send each request at once: Nagle's algorithm, which gathers small packets, costs 40 to 200 ms for every
-        # command and its read-back.
+        # Send each request at once, because Nagle's algorithm, which collects small packets, costs 40 to 200 ms for
+        # every command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as copy:
             copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return port
 
 
 _SILENT = "Check power, cable and baud rate; the next request first synchronises the line again"
-_SERVER = ". Many terminal servers allow one client only: another program may use this port"
-NEVER = r"(?!)"  # A form that no line has
+_SERVER = ". Many terminal servers allow only one client: another program may use this port"
+NEVER = r"(?!)"  # a pattern that matches no line
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
 
@@ -73,10 +73,12 @@ class LineRules:
     Attributes:
         unsolicited: regular expression of lines that the device may send without a request; they are skipped and
             recorded.
-        identified: each reply has the number of its request, so that a second one comes from another device.
-        check: returns the fault of a received line, "" if it is good; for checksums.
-        text: no reply has control characters or bytes above 7F; one that has them is refused, whatever its form.
-        unanswered: further sentences of advice on a device that has never answered.
+        identified: True if each reply contains the number of its request, so that a second reply comes from another
+            device.
+        check: function that returns the fault of a received line, "" if it is good; for checksums.
+        text: True if no reply contains control characters or bytes above 7F; a reply that contains them is rejected in
+            any form.
+        unanswered: further advice if the device has never answered.
     """
 
     probe: Probe
@@ -89,12 +91,12 @@ class LineRules:
 
 
 class SerialLine:
-    """A device that talks in ASCII lines; 8 data bits, no parity, 1 stop bit. Safe from several threads.
+    """A device that communicates in ASCII lines (8 data bits, no parity, 1 stop bit). Several threads may use it.
 
     Args:
         url: pyserial URL: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
-        device: its name in error messages.
-        timeout: s for a whole reply, more than 0.
+        device: name of the device in error messages.
+        timeout: time limit in s for a whole reply, above 0.
         transcript: log file to which every byte sent and received is appended with its time; None: no file.
 
     Raises:
@@ -131,7 +133,7 @@ class SerialLine:
             raise DeviceError(
                 device,
                 f"the transcript {str(transcript)!r} cannot be written: {problem}",
-                advice="Name a file in an existing folder, or no file",
+                advice="Give a file in an existing folder, or no file",
                 state="Nothing was sent",
             ) from problem
         try:
@@ -150,7 +152,7 @@ class SerialLine:
         self._reader = LineReader(self._port, clock, self._transcript, rules.framing, rules.unsolicited, rules.check)
 
     def send(self, command: str | bytes) -> None:
-        """Send a command without a reply, at once, even while another thread waits, or the line is out of step.
+        """Send a command without a reply, at once, even while another thread waits or the line is not synchronised.
 
         Bytes, such as one control character, get no line end.
 
@@ -163,13 +165,14 @@ class SerialLine:
         """Send a request and read its reply.
 
         Args:
-            command: as `send` takes it.
+            command: as for `send`.
             reply: regular expression that the whole reply must match.
-            meaning: the expected reply in words, for error messages.
+            meaning: description of the expected reply, for error messages.
             state: what has moved and what has not, for error messages.
 
         Raises:
-            DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port failed.
+            DeviceTimeout: no complete reply arrived within the timeout. DeviceError: the reply has another form, or the
+                port failed.
         """
         data, request = self._worded(command)
         with self._asking:
@@ -183,8 +186,8 @@ class SerialLine:
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
             match = re.fullmatch(reply, text) if isinstance(text, str) else None
-            words = self._rules.text and isinstance(command, str)  # a control byte may be answered by another one
-            telnet = self._socket and TELNET.search(self._reader.heard)  # which may have been discarded
+            words = self._rules.text and isinstance(command, str)  # the answer to a control byte may be a control byte
+            telnet = self._socket and TELNET.search(self._reader.heard)  # the error text may have been discarded
             if match is not None and not (words and (telnet or NO_TEXT.search(match[0]))):
                 self._in_step, self._has_answered, self._reader.heard = True, True, ""
                 self._answered = (request, reply) if self._rules.identified else self._answered
@@ -192,7 +195,7 @@ class SerialLine:
             if isinstance(text, str):
                 self._refuse_second_reply(text, state)
             with contextlib.suppress(OSError):
-                for _ in range(RECENT_LINES if self._socket else 0):  # what else a server says tells what it is
+                for _ in range(RECENT_LINES if self._socket else 0):  # further text of a server shows what it is
                     self._reader.line(self._clock.now() + QUIET)
             if text is None:
                 what, received = (
@@ -204,7 +207,7 @@ class SerialLine:
                 what, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
-                what, received = "the reply does not have the form it must have", text
+                what, received = "the reply does not have the expected form", text
                 advice = "There may be noise on the line, or the device may be another model"
             raise self._error(
                 DeviceTimeout if text is None else DeviceError,
@@ -217,10 +220,10 @@ class SerialLine:
             )
 
     def close(self) -> None:
-        """Close the port once a request of another thread has ended; calling again does nothing."""
+        """Close the port after the current request of another thread has ended. Calling it again does nothing."""
         with self._asking, self._writing:
             self._closed = True
-            with contextlib.suppress(OSError):  # a failed port needs no closing
+            with contextlib.suppress(OSError):  # a failed port need not be closed
                 self._port.close()
             self._transcript.close()
 
@@ -231,7 +234,7 @@ class SerialLine:
         return command.encode("ascii") + self._rules.framing.command_end, command or "an empty line"
 
     def _resynchronise(self, request: str, state: str) -> None:
-        """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
+        """Discard received data, send the probe, skip late replies until that of the probe, and wait for silence."""
         self._transcript.add_line("!", "out of step: probing")
         self._wait_for_quiet(request, state)
         self._write(*self._worded(self._probe.request))
@@ -253,7 +256,7 @@ class SerialLine:
         self._transcript.add_line("!", "in step again")
 
     def _refuse_second_reply(self, line: str, state: str) -> None:
-        """DeviceError if a line is another reply to the last request that was answered."""
+        """Raise DeviceError if a line is a second reply to the last request that was answered."""
         request, form = self._answered
         if re.fullmatch(form, line):
             raise self._error(
@@ -262,7 +265,8 @@ class SerialLine:
                 request=request,
                 reply=line,
                 expected="one reply",
-                advice="Two controllers on this line have the same address: give each its own address, or unplug one",
+                advice="Two controllers on this line have the same address: give each controller its own address, or "
+                "unplug one",
                 state=f"{state}. Both carried out earlier requests",
             )
 
@@ -270,10 +274,10 @@ class SerialLine:
         if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):
             raise self._error(
                 DeviceTimeout,
-                "it sends continuously, without a request",
+                "it sends data continuously without a request",
                 request=request,
                 expected="a silent line before the next request",
-                advice="Check the baud rate and that the port is this device's",
+                advice="Check the baud rate, and that this port belongs to the device",
                 state=state,
             )
 
@@ -306,8 +310,8 @@ class SerialLine:
                 f"the port failed: {error}{'; the other side closed the connection' if self._socket else ''}",
                 request=request,
                 expected="a port that stays open",
-                advice="Configure the server to keep idle connections (idle time 0), and check that no other "
-                "client uses its port. Then start again"
+                advice="Configure the server to keep idle connections (idle time 0), check that no other client uses "
+                "its port, and start again"
                 if self._socket
                 else "Check that the cable or adapter is plugged in, then start again. Serial ports of this "
                 f"computer: {serial_ports()}",
@@ -315,15 +319,15 @@ class SerialLine:
             ) from error
 
     def _refuse_if_closed(self, request: str) -> None:
-        """Raise DeviceError if the line is closed: operating systems raise different errors for a closed port."""
+        """Raise DeviceError if the line is closed. (Operating systems raise different errors for a closed port.)"""
         if self._closed:
             raise DeviceError(
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
             )
 
     def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
-        """The error, with its cause where the bytes since the last good reply show one."""
-        line_end = self._rules.framing.line_end.decode("latin-1")  # which may be no text
+        """The error, with a cause if the bytes since the last good reply show one."""
+        line_end = self._rules.framing.line_end.decode("latin-1")  # the reply may not be text
         cause, todo = of_bytes(self._url, self._reader.heard.replace(line_end, "\n"))
         advice = (todo or advice) + ("" if self._has_answered else self._rules.unanswered)
         wire = self._transcript.recent()
@@ -335,7 +339,7 @@ def line_to(wiring: Any, url: str, name: str, clock: Clock, probe: Probe, **rule
 
     Args:
         wiring: settings of a stage, with `timeout`, `baudrate` and `transcript`.
-        rules: as in `LineRules`.
+        rules: the fields of `LineRules`.
     """
     return SerialLine(
         url,

@@ -15,20 +15,20 @@ from typing import Any
 from drivers.base.clock import Clock
 
 LONGEST_LINE = 1024
-LONGEST_REPLY = 1 << 16  # Most characters of a reply of several lines
-RECENT_LINES = 6  # Lines that error messages quote
-RECENT_CHARACTERS = 40  # Characters of each of these lines
+LONGEST_REPLY = 1 << 16  # largest number of characters in a reply of several lines
+RECENT_LINES = 6  # number of lines that error messages quote
+RECENT_CHARACTERS = 40  # largest number of characters of each of these lines
 
 
 class Transcript:
-    """Record of one serial line. Safe from several threads.
+    """Record of one serial line. It can be used from several threads.
 
-    The last lines are for error messages; a log file has every byte. A log file that fails later is closed: a full disk
-    must not end a scan. Each of its lines holds the time in s since the epoch, a mark and the bytes as a Python
-    literal. Marks: ">" sent, "<" received, "!" done by the driver.
+    The last lines are for error messages; a log file contains every byte. A log file that fails later is closed,
+    because a full disk must not end a scan. Each line of the log file contains the time in s since the epoch, a mark
+    and the bytes as a Python literal. Marks: ">" sent, "<" received, "!" done by the driver.
 
     Args:
-        path: log file, appended to; None: no file.
+        path: log file to which lines are appended; None: no file.
 
     Raises:
         OSError: the file does not open.
@@ -38,7 +38,7 @@ class Transcript:
         self._clock = clock
         self._last: deque[tuple[float, str, str]] = deque(maxlen=RECENT_LINES)  # time, mark, text
         self._lock = threading.Lock()
-        # Unbuffered, so that the bytes before a crash are in the file.
+        # unbuffered, so that the bytes before a crash are in the file
         self._file: FileIO | None = None if path is None else path.open("ab", buffering=0)
 
     def add_line(self, mark: str, text: str) -> None:
@@ -58,7 +58,7 @@ class Transcript:
                 self._give_up()
 
     def recent(self) -> str:
-        """The last lines with their age, in one string."""
+        """The last lines with their age, as one string."""
         with self._lock:
             now, last = self._clock.now(), list(self._last)
         return ", ".join(f"{mark} {_cut(text)} ({now - time:.2f} s ago)" for time, mark, text in last)
@@ -69,7 +69,7 @@ class Transcript:
 
     def _give_up(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # a full or missing disk may fail again
+            with contextlib.suppress(OSError):  # a full or missing disk may also make closing fail
                 self._file.close()
             self._file = None
 
@@ -86,8 +86,8 @@ class Framing:
     Attributes:
         command_end: end of each command sent.
         line_end: end of each line received.
-        continued: end of a line that is followed by another line of the same reply; "" if every reply is one line.
-            Such a reply is its lines without that text, joined by newlines.
+        continued: end of a line that is followed by another line of the same reply; "" if every reply is one line. The
+            lines of such a reply are joined by newlines, without this text.
     """
 
     command_end: bytes = b"\r\n"
@@ -107,14 +107,14 @@ class Damaged:
 
 
 class LineReader:
-    """Reads lines from a port and holds the bytes of an incomplete one; skips and records unsolicited lines.
+    """Reads lines from a port and keeps the bytes of an incomplete line; skips and records unsolicited lines.
 
-    For one thread at a time.
+    It can be used by one thread at a time.
 
     Args:
         port: a pyserial port whose read ends after a short silence.
         unsolicited: regular expression of lines that the device may send without a request.
-        check: returns the fault of a received line, "" if it is good.
+        check: function that returns the fault of a received line, "" if it is good.
 
     Raises (in all methods):
         OSError: the port failed.
@@ -132,11 +132,11 @@ class LineReader:
         self._port, self._clock, self._transcript = port, clock, transcript
         self._framing, self._unsolicited, self._check = framing, re.compile(unsolicited), check
         self._received = bytearray()
-        self.heard = ""  # the last of what has come; whoever reads empties it where all was understood
+        self.heard = ""  # the last received bytes; the reader empties this after a good reply
 
     @property
     def incomplete(self) -> str:
-        """The line that has not ended yet, in readable form."""
+        """The incomplete line in readable form."""
         return readable(self._received)
 
     def reply(self, deadline: float) -> str | Damaged | None:
@@ -153,7 +153,7 @@ class LineReader:
         return None
 
     def line(self, deadline: float) -> str | Damaged | None:
-        """The next line that is not unsolicited; None if none is complete by `deadline`."""
+        """The next line, skipping unsolicited ones; None if no line is complete by `deadline`."""
         while True:
             while self._framing.line_end in self._received:
                 line, _, rest = bytes(self._received).partition(self._framing.line_end)
@@ -169,7 +169,7 @@ class LineReader:
             self._received += self._read()
 
     def drain(self, deadline: float) -> bool:
-        """Discard bytes until the line is silent; returns whether it was silent by `deadline`."""
+        """Discard bytes until the line is silent; returns True if it was silent by `deadline`."""
         while (junk := self._read()) or self._received:
             self._transcript.add_line("!", f"discarded {readable(self._received + junk)}")
             self._received.clear()
@@ -178,10 +178,9 @@ class LineReader:
         return True
 
     def discard_lines(self) -> list[str]:
-        """Discard the complete lines received so far, and return them: they cannot be the reply to a request not yet
-        sent.
+        """Discard and return the complete lines received so far, which cannot be the reply to a later request.
 
-        The rest stays: it may be the beginning of an unsolicited line.
+        The incomplete rest is kept, because it may be the beginning of an unsolicited line.
         """
         while len(self._received) <= LONGEST_LINE and self._port.in_waiting:
             self._received += self._read()
@@ -192,7 +191,10 @@ class LineReader:
         return [readable(line) for line in old.split(self._framing.line_end)] if end else []
 
     def _read(self) -> bytes:
-        """The bytes that have arrived (over TCP one of them), or the first to arrive; b"" if the line stays silent."""
+        """The bytes that have arrived (over TCP one byte), or the first byte to arrive.
+
+        B"" if the line remains silent.
+        """
         data = bytes(self._port.read(max(1, int(self._port.in_waiting))))
         self._transcript.log_bytes("<", data)
         self.heard = (self.heard + readable(data))[-LONGEST_LINE:]
@@ -200,5 +202,5 @@ class LineReader:
 
 
 def readable(data: bytes | bytearray) -> str:
-    """Bytes as Latin-1 text: a character a byte."""
+    """Bytes as Latin-1 text: one character per byte."""
     return bytes(data).decode("latin-1")

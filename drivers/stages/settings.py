@@ -16,25 +16,25 @@ from drivers.base.protocols import RotationStage, StageLimits
 from recon.base.setting import CheckedSettings, setting, settings_of
 
 FARTHEST = 1e9  # rad
-MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
+MOST = 2.0**53  # counts; the largest whole number that a float represents exactly
 
 
 def with_settings(name: str, driver: Any) -> Any:
-    """Another package's driver. AttributeError, TypeError: it has no dataclass of settings."""
+    """A driver of another package. Raises AttributeError or TypeError if it has no dataclass of settings."""
     settings_of(driver.Settings)
     return driver
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageFigures(CheckedSettings):
-    """Base of a stage's settings, with its limits: counts for 2π, rad/s, rad/s², soft limits in rad.
+    """Base class of a stage's settings, with its limits: counts for 2π, rad/s, rad/s², soft limits in rad.
 
     Raises:
-        ValueError: figures that no stage can have.
+        ValueError: a value is impossible for a stage.
     """
 
     stand_in: ClassVar[str] = ""
-    """The kind of stage that is simulated in the place of this one; "": this one has a simulated controller itself."""
+    """The kind of stage that is simulated instead of this one; "": this kind has its own simulated controller."""
     counts_per_turn: int = setting(
         doc="Motor pulses or encoder counts per 360 deg; triggers are possible only on whole ones.", gt=0
     )
@@ -50,7 +50,9 @@ class StageFigures(CheckedSettings):
                 raise ValueError(f"{rate:g} rad is impossible as {meaning} of a stage")
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
-            raise ValueError(f"low_deg {low:g} and high_deg {high:g} leave no room to move")
+            raise ValueError(
+                f"high_deg must be above low_deg, so that the stage can move; got low_deg {low:g} and high_deg {high:g}"
+            )
         if not (self.high - self.low) * self.per_radian < MOST:
             raise ValueError(
                 f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can resolve"
@@ -58,7 +60,7 @@ class StageFigures(CheckedSettings):
 
     @property
     def per_radian(self) -> float:
-        """Counts in a radian."""
+        """Counts per radian."""
         return self.counts_per_turn / (2 * math.pi)
 
     def limits_with(
@@ -73,7 +75,7 @@ class StageFigures(CheckedSettings):
         """The limits with a trigger output; arguments as in `StageLimits`.
 
         Raises:
-            ValueError: no pulses can be so far apart.
+            ValueError: pulses cannot have this spacing.
         """
         if not 0 <= pulse_spacing * self.max_speed * self.per_radian < MOST:
             raise ValueError(f"pulses cannot be {pulse_spacing:g} s apart")
@@ -93,26 +95,31 @@ class StageFigures(CheckedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Wiring(CheckedSettings):
-    """Base of the settings of a stage on a serial line; times in s.
+    """Base class of the settings of a stage on a serial line; times in s.
 
-    The baud rate is the controller's, nominal over USB and TCP.
+    The baud rate is that of the controller; over USB and TCP it has no effect.
     """
 
     timeout: float = setting(1.0, "Longest wait for a reply.", unit="s", gt=0)
     baudrate: int = setting(115_200, gt=0)
     pulse_width: float | None = setting(
-        None, "Width of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
+        None,
+        "Width of the trigger pulses; null: the driver chooses it, or the controller has a fixed width.",
+        unit="s",
+        gt=0,
     )
     active_high: bool = setting(
-        True, "true: trigger pulses are high. The driver stops with an error if the controller cannot do what is set."
+        True,
+        "true: trigger pulses are high; false: low. The driver stops with an error if the controller does not "
+        "support this.",
     )
     transcript: Path | None = setting(
-        None, "A file to which every byte to and from the controller is appended with its time; null: none."
+        None, "File to which every byte to and from the controller is appended with its time; null: no file."
     )
 
 
 class StageSettings(Protocol):
-    """Settings of a driver, and the limits that follow from them: a dataclass on `StageFigures`."""
+    """Settings of a driver, and the limits that follow from them: a dataclass that derives from `StageFigures`."""
 
     stand_in: ClassVar[str]
 
@@ -133,14 +140,14 @@ class StageSettings(Protocol):
 
     @property
     def pulse_output(self) -> int | None:
-        """Number of the digital output that the trigger pulses come from; None if no output can be set."""
+        """Number of the digital output of the trigger pulses; None if no output can be set."""
 
     def limits(self) -> StageLimits:
         """The stage's limits, as far as they are known before it is connected."""
 
 
 class StageDriver(Protocol):
-    """A driver's class; each stage's folder has one, and `beamline.config.stages` lists them.
+    """The class of a driver. The folder of each stage has one, and `beamline.config.stages` lists them.
 
     Attributes:
         Settings: the class of its settings.
@@ -149,16 +156,17 @@ class StageDriver(Protocol):
     Settings: type[StageSettings]
 
     def __call__(self, url: str, settings: Any, clock: Clock) -> RotationStage:
-        """The driver, connected at a pyserial URL. Nothing moves.
+        """The driver, connected to a pyserial URL. Nothing moves.
 
         Raises:
-            DeviceRefused: the settings do not fit the controller, or it is moving.
-            DeviceError, DeviceTimeout: no contact.
+            DeviceRefused: the settings do not match the controller, or the stage is moving.
+            DeviceError, DeviceTimeout: there is no connection.
         """
 
     def halt(self, url: str, settings: Any, clock: Clock) -> None:
-        """Stop the stage, also in a move of a program that has died; it may still slow down at return.
+        """Stop the stage, also during a move of a program that has died. It may still be slowing down when this
+        returns.
 
         Raises:
-            DeviceError, DeviceTimeout: no contact.
+            DeviceError, DeviceTimeout: there is no connection.
         """

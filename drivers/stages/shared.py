@@ -1,7 +1,7 @@
 """Code that all stages share: positions, stops, waiting for the end of a move, and restoring settings.
 
-Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
-program that is killed leaves its speed in the controller, and the next one would take it for the original.
+A driver changes settings in a controller. Their original values are kept in a file until they are restored. Otherwise,
+if a program is killed, its speed would remain in the controller, and the next program would take it for the original.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from drivers.stages.travel import Travel
 
 
 class FoundSettings:
-    """The settings that a controller was found with, by their names there, for the driver that changes them."""
+    """The original settings of a controller, by their names in the controller, for the driver that changes them."""
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
         self.notice = ""
-        """What an earlier program left, in words; "" if it restored all."""
+        """Text on the settings that an earlier program did not restore; "" if it restored all."""
         self._file: Path | None = None
 
     def keep_in(self, file: Path) -> None:
@@ -43,12 +43,12 @@ class FoundSettings:
             whole.replace(file)
         if changed:
             self.notice = (
-                f"a program that was killed, or lost this stage, changed {', '.join(changed)}; the values "
-                "from before are restored at the end"
+                f"an earlier program that was killed, or lost the connection, changed {', '.join(changed)}; the "
+                "original values are restored at the end"
             )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
-        """Write each setting back, once. If one is refused, the file keeps them all."""
+        """Write each setting back, once. If one is rejected, all of them remain in the file."""
         values, self.values = self.values, {}
         for name, value in values.items():
             write(name, value)
@@ -58,7 +58,7 @@ class FoundSettings:
 
 
 def _settings_in(file: Path) -> dict[str, str]:
-    """Settings that an earlier program found and did not restore; empty if it did, or where the file is not whole."""
+    """Original settings that an earlier program did not restore; empty if it did, or if the file is damaged."""
     with suppress(OSError, ValueError):
         found = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(found, dict):
@@ -67,13 +67,13 @@ def _settings_in(file: Path) -> dict[str, str]:
 
 
 class Stops:
-    """Stops of a stage, so that none is lost while a move begins; `count` of them so far.
+    """Stops of a stage, so that no stop is lost while a move begins; `count`: number of stops so far.
 
-    A stop goes out at once, perhaps just before the move command that another thread is about to send. So the thread
-    that starts a move checks after its command whether a stop came meanwhile, and sends the stop again.
+    A stop is sent at once, perhaps just before the move command that another thread is about to send. So after its
+    command, the thread that starts a move checks whether a stop came meanwhile, and sends the stop again.
 
     Args:
-        send: sends a stop (True: without deceleration) and does not wait until it stands.
+        send: function that sends a stop (True: without deceleration) and does not wait until the stage has stopped.
     """
 
     def __init__(self, name: str, send: Callable[[bool], object]) -> None:
@@ -87,20 +87,20 @@ class Stops:
         return self.count != self._before
 
     def came(self, *, hard: bool) -> None:
-        """Call this before the stop is sent. The stop is then counted in time, or sent after the move's command."""
+        """Call this before the stop is sent. Then the stop is counted in time, or it is sent after the move command."""
         self._hard = hard
         self.count += 1
 
     @contextmanager
     def none_while(self, purpose: str, since: int | None = None) -> Iterator[None]:
-        """Context around the commands that begin a move.
+        """Context for the commands that begin a move.
 
         Args:
-            purpose: the move, for the error message.
+            purpose: description of the move for the error message.
             since: the number of stops before the first of several commands.
 
         Raises:
-            DeviceError: a stop came; it has been sent again.
+            DeviceError: a stop came, and has been sent again.
         """
         self._before, problem = self.count if since is None else since, None
         try:
@@ -122,16 +122,16 @@ class Stops:
 
 
 POLL = 0.02  # s between two status queries of a moving stage
-STOP_MARGIN = 2.0  # s beyond the longest deceleration after which a stop has failed
+STOP_MARGIN = 2.0  # s after the longest deceleration until a stop counts as failed
 Status = TypeVar("Status")
 
 
 def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[Status], bool], timeout: float) -> Status:
-    """Wait until the stage stands, at most `timeout` s; the last status.
+    """Wait at most `timeout` s until the stage has stopped; returns the last status.
 
     Args:
-        look: asks the controller, at least once.
-        moves: whether the stage moves by what a look has shown.
+        look: function that reads the status; called at least once.
+        moves: function that says whether the stage moves according to a status.
     """
     deadline = clock.now() + timeout
     while moves(status := look()) and (left := deadline - clock.now()) > 0:
@@ -140,22 +140,25 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
 
 
 def longest_stop(limits: StageLimits) -> float:
-    """Longest time in s that any stage takes to stop from its full speed."""
+    """Longest time in s that a stage with these limits takes to stop from full speed."""
     return limits.max_speed / limits.acceleration + STOP_MARGIN
 
 
 FOUND = "found_at_opening"
-"""Key of a description: what a controller said of the time before it was opened, which opening has cleared."""
+"""Key of a description: errors that the controller reported at opening, which opening has cleared."""
 
 
 def found_at_opening(*sentences: str) -> dict[str, str]:
-    """The entry of a description; none if all sentences are empty."""
+    """The entry of a description with these sentences; no entry if all are empty."""
     joined = "; ".join(filter(None, sentences))
     return {FOUND: joined} if joined else {}
 
 
 def refuse_another(name: str, wanted: str | None, serial: str) -> None:
-    """Refuse a device with another serial number than the configured one; None: any may answer."""
+    """Raise DeviceError if the device has another serial number than the configured one.
+
+    `wanted` None: any is accepted.
+    """
     if wanted is not None and serial != wanted:
         raise DeviceRefused(
             name,
@@ -167,7 +170,7 @@ def refuse_another(name: str, wanted: str | None, serial: str) -> None:
 
 
 def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
-    """The error for a request that needs a standing stage, while it moves."""
+    """The error for a request that is possible only at rest, while the stage moves."""
     return DeviceRefused(
         name,
         f"{purpose} is not possible while it moves",
@@ -179,7 +182,7 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
 
 @dataclass
 class StageOutput:
-    """Implements `drivers.base.protocols.DigitalOutput` by what an open stage's controller is told and asked."""
+    """Implements `drivers.base.protocols.DigitalOutput` with the controller of a connected stage."""
 
     name: str
     set: Callable[[bool], None]
@@ -187,14 +190,15 @@ class StageOutput:
 
 
 class LineStage(RotationStage):
-    """A stage behind a line; its driver adds the commands of the controller.
+    """A stage on a serial line; its driver adds the commands of the controller.
 
-    `stop` returns when the stage stands, `abort` at once. A `wait` for a move that any thread stopped raises, so that
-    no thread takes the move as complete. Closing restores the settings that the driver has changed.
+    `stop` returns when the stage has stopped, `abort` returns at once. If any thread stops a move, `wait` for this move
+    raises an error, so that no thread takes the move as complete. Closing restores the settings that the driver has
+    changed.
     """
 
     _found: FoundSettings
-    """What opening and moves change in the controller, as it was found."""
+    """Original values of the settings that opening and moves change in the controller."""
 
     def __init__(self, url: str, settings: Any, clock: Clock, name: str) -> None:
         self.name, self._url, self._clock = name, url, clock
@@ -204,7 +208,7 @@ class LineStage(RotationStage):
 
     @abstractmethod
     def _counts(self) -> int:
-        """The present place, asked of the controller."""
+        """The present position in counts, read from the controller."""
 
     @abstractmethod
     def _send_stop(self, hard: bool) -> str:
@@ -212,11 +216,11 @@ class LineStage(RotationStage):
 
     @abstractmethod
     def _release(self) -> None:
-        """Restore settings, and close the line even if it is dead."""
+        """Restore settings, and close the line even if the connection is lost."""
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
-        """Context around the opening of the controller."""
+        """Context for opening the controller; closes the line if opening fails."""
         try:
             yield
         except BaseException:
@@ -225,7 +229,7 @@ class LineStage(RotationStage):
 
     @property
     def _aim(self) -> str:
-        """Where the last move or search was to end; "" before the first."""
+        """Text on the target of the last move or search; "" before the first one."""
         if self._searching:
             return "its reference"
         return "" if self._target is None else self._travel.degrees(self._target)
@@ -235,17 +239,17 @@ class LineStage(RotationStage):
         return self._travel.limits
 
     def keep_found_settings(self, file: Path) -> None:
-        """Keep the settings that the controller was found with in `file`, too, until they are restored.
+        """Keep the original settings of the controller also in `file`, until they are restored.
 
-        Those of an earlier program that died are restored at the end instead of what it left, and `describe` says so. A
-        disk that refuses costs only this.
+        If an earlier program died, its original settings are restored at the end, not those that it left, and
+        `describe` reports this. If the disk cannot be written, only this protection is missing.
         """
         self._found.keep_in(file)
 
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with suppress(DeviceError):  # a dead line is closed, too
+            with suppress(DeviceError):  # the line is closed also if the connection is lost
                 self._release()
 
     def to_counts(self, angle: float) -> int:

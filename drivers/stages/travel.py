@@ -9,23 +9,23 @@ from fractions import Fraction
 from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.base.protocols import StageLimits, TriggerTrain
 
-ROUNDING = 1e-6  # counts: tolerance of a spacing, because speeds in degrees are rounded floats
+ROUNDING = 1e-6  # counts; tolerance of a spacing, because speeds in degrees are rounded floats
 
 
 def counts_in(seconds: float, limits: StageLimits) -> int:
-    """Least whole counts that take at least this long at the stage's full speed."""
+    """Smallest whole number of counts that take at least this long at the stage's full speed."""
     return math.ceil(seconds * limits.max_speed * limits.counts_per_turn / (2 * math.pi) - ROUNDING)
 
 
 def least_interval(limits: StageLimits) -> int:
-    """Least counts between pulses: closer ones would merge at the stage's full speed."""
+    """Smallest number of counts between pulses; closer pulses would merge at the stage's full speed."""
     units = -(-counts_in(limits.pulse_spacing, limits) // limits.interval_unit)
     return max(units, 1) * limits.interval_unit
 
 
 @dataclass(frozen=True)
 class Travel:
-    """Limits of a named stage, in counts and in words."""
+    """Limits of a named stage in counts, with texts for messages."""
 
     name: str
     limits: StageLimits
@@ -66,12 +66,13 @@ class Travel:
         }
 
     def target(self, angle: float) -> int:
-        """Count of the target angle in rad.
+        """Count of a target angle in rad.
 
         Raises:
-            DeviceRefused: it is beyond the soft limits.
+            DeviceRefused: the angle is beyond the soft limits.
         """
-        near = self.limits.low - 1 <= angle <= self.limits.high + 1  # also refuses NaN and values that are too large
+        # also false for NaN and for values that are too large
+        near = self.limits.low - 1 <= angle <= self.limits.high + 1
         if not near or not self.low <= self.to_counts(angle) <= self.high:
             raise DeviceRefused(
                 self.name,
@@ -82,7 +83,7 @@ class Travel:
         return self.to_counts(angle)
 
     def no_such_speed(self, speed: float, slowest: str) -> DeviceRefused:
-        """The error for a speed, in rad/s, that the stage does not have."""
+        """The error for a speed in rad/s that the stage does not support."""
         return DeviceRefused(
             self.name,
             f"a speed of {math.degrees(speed):g} deg/s is not possible",
@@ -91,10 +92,10 @@ class Travel:
         )
 
     def native(self, speed: float, scale: float, most: int, unit: str) -> int:
-        """A speed (rad/s) in whole steps of the controller, of which a radian has `scale`.
+        """A speed (rad/s) in whole steps of the controller, with `scale` steps per radian.
 
         Raises:
-            DeviceRefused: fewer than one of them, or more than `most`.
+            DeviceRefused: the speed is less than one step or more than `most`.
         """
         steps = round(speed * scale) if 0 < speed < 2 * self.limits.max_speed else 0
         if not 1 <= steps <= most:
@@ -102,42 +103,40 @@ class Travel:
         return steps
 
     def refuse_train(self, train: TriggerTrain) -> None:
-        """Refuse a train without pulses or intervals, or beyond the soft limits.
+        """Raise DeviceRefused for a train without pulses or intervals, or beyond the soft limits.
 
-        Also if its pulses would merge at full speed, or are not multiples of `interval_unit` apart. The interval of a
-        single pulse does not count.
+        Also if its pulses would merge at full speed, or their interval is not a multiple of `interval_unit`. The
+        interval of a single pulse does not matter.
         """
         interval, least = abs(train.interval), least_interval(self.limits)
         close = train.n > 1 and interval < least
         uneven = train.n > 1 and interval % self.limits.interval_unit != 0
         within = all(self.low <= at <= self.high for at in (train.start, train.end))
         if train.n < 1 or interval == 0 or close or uneven or not within:
-            raise self.cannot_emit(
-                train, advice="A lower max_speed allows pulses that are closer together" if close else ""
-            )
+            raise self.cannot_emit(train, advice="Lower max_speed for pulses that are closer together" if close else "")
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
-        """The error for a train that the stage cannot emit, with the conditions for trains."""
+        """The error for a train that the stage cannot emit; the message states the conditions for trains."""
         unit, least = self.limits.interval_unit, least_interval(self.limits)
         multiple = f" apart by a multiple of {unit} counts (a toggled output: an even number)," if unit > 1 else ""
         return DeviceRefused(
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
-            expected=f"one or more, not closer than {self.limits.pulse_spacing:g} s at full speed, which are "
+            expected=f"one or more pulses, at least {self.limits.pulse_spacing:g} s apart at full speed, which is "
             f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
             state="This train is not armed and nothing was sent for it; the stage is where the last move ended",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
-        """Refuse a train whose first pulse does not lie ahead of a stage that stands at `counts`.
+        """Raise DeviceRefused if the first pulse of a train is not ahead of the stage, which is at `counts`.
 
-        Also if the stage is past the count before the first pulse at which the output opens.
+        Also if the stage is past `opening`, the count before the first pulse at which the output opens.
         """
         here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
             problem = f"it is at {here}, at or past the first pulse at {self.degrees(train.start)}"
-            advice = "Move to a place before the first pulse, then arm"
+            advice = "Move to a position before the first pulse, then arm"
         elif opening is not None and train.interval * (opening - counts) <= 0:
             problem = f"it is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
             advice = f"Move back by at least {self.degrees(abs(train.interval))}, then arm"
@@ -146,18 +145,18 @@ class Travel:
         raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
-        """Refuse a controller whose own limits (counts) are narrower."""
+        """Raise DeviceRefused if the controller's own limits (counts) are narrower than those configured."""
         if self.low < low or self.high > high:
             raise DeviceRefused(
                 self.name,
                 f"the controller itself is limited to {self.degrees(low)} to {self.degrees(high)}",
                 expected=f"room for the configured {self.span}",
-                advice=f"Narrow low and high in the configuration, or {advice}",
+                advice=f"Narrow low_deg and high_deg in the configuration, or {advice}",
                 state="Nothing has moved",
             )
 
     def still_moving(self, timeout: float, counts: int, aim: str, request: str, reply: str = "") -> DeviceTimeout:
-        """The error of a wait that ended after its timeout (s), before the stage has arrived."""
+        """The error for a wait that ended after its timeout (s) before the stage had arrived."""
         return DeviceTimeout(
             self.name,
             f"it is still moving after {timeout:g} s",
@@ -165,11 +164,11 @@ class Travel:
             reply=reply,
             expected=f"to be at {aim}" if aim else "",
             advice="Allow more time, or stop it",
-            state=f"It was left moving and is at {self.degrees(counts)}",
+            state=f"It was left moving, and is at {self.degrees(counts)}",
         )
 
     def not_stopped(self, timeout: float, counts: int, request: str) -> DeviceTimeout:
-        """The error of a stop if the stage does not stand within `timeout` s."""
+        """The error for a stop if the stage has not stopped within `timeout` s."""
         return DeviceTimeout(
             self.name,
             f"it is still moving {timeout:.1f} s after the stop command",

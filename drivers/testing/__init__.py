@@ -1,6 +1,6 @@
-"""Conformance tests for drivers of cameras and stages, as pytest classes that the tests of a driver subclass.
+"""Conformance tests for drivers of cameras and stages: pytest classes from which the tests of a driver derive.
 
-They need pytest, and import neither simulators nor beamline.
+They need pytest, and do not import simulators or beamline.
 """
 
 import pytest

@@ -1,6 +1,6 @@
-"""Conformance tests for every camera, real or simulated; the tests of a camera subclass them.
+"""Conformance tests for every camera, real or simulated; the tests of a camera derive from them.
 
-A subclass gives `bench`, a fixture that makes a CameraBench again for each test. Frames are small and exposures
+A subclass defines the fixture `bench`, which makes a new CameraBench for each test. Frames are small and exposures
 short.
 """
 
@@ -25,12 +25,12 @@ class CameraBench:
     """A camera and the tools to test it.
 
     Attributes:
-        pulse: put rising edges on the camera's trigger input, at these times on the clock.
+        pulse: function that puts rising edges on the camera's trigger input at these times of the clock.
         settings: accepted settings: externally triggered, a small region, about 10 ms.
-        refused: changes of them that it refuses, and a pattern of the message.
-        binnings: its binnings beside 1.
-        time_error: s by which the time of a frame may miss its trigger: more than that of a camera's own clock where
-            another computer tells the time.
+        refused: changes of the settings that the camera rejects, each with a pattern of the message.
+        binnings: its binnings in addition to 1.
+        time_error: s by which the time of a frame may differ from its trigger; larger if another computer gives the
+            time.
     """
 
     camera: Camera
@@ -53,7 +53,7 @@ class CameraConformance:
 
     @pytest.fixture
     def bench(self) -> CameraBench:
-        pytest.fail("A subclass gives the fixture `bench`: a CameraBench with the camera, made anew for each test.")
+        pytest.fail("Define the fixture `bench` in the subclass: a new CameraBench with the camera for each test.")
 
     def _pulses(self, bench: CameraBench, n: int, period: float | None = None, delay: float = 0.05) -> list[float]:
         step = 1.05 * bench.camera.timing.min_period if period is None else period
@@ -139,7 +139,7 @@ class CameraConformance:
         with pytest.raises(DeviceTimeout, match=r"0\.3 s"):
             bench.camera.next_frame(timeout=0.3)
         assert bench.clock.now() - start == pytest.approx(0.3, abs=0.1)
-        self._pulses(bench, 1)  # and it still works
+        self._pulses(bench, 1)  # and the camera still works
         assert bench.camera.next_frame(timeout=1.0).framestamp == 0
 
     def test_software_triggers(self, bench: CameraBench) -> None:
@@ -166,7 +166,8 @@ class CameraConformance:
         assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
         gaps = np.diff([frame.time for frame in frames])
         beyond_clock = bench.time_error - CLOCK_ERROR
-        assert (gaps >= bench.settings.exposure - beyond_clock - 2e-6).all()  # its clock may tick in microseconds
+        # the resolution of its clock may be microseconds
+        assert (gaps >= bench.settings.exposure - beyond_clock - 2e-6).all()
         assert gaps == pytest.approx(gaps[0], abs=bench.time_error)
 
     def test_framestamps_start_anew_with_every_arm(self, bench: CameraBench) -> None:
@@ -212,7 +213,7 @@ class CameraConformance:
         text = bench.camera.describe()
         assert {type(value) for value in text.values()} <= {str, int, float}
         assert text["model"]
-        assert float(text["conversion_factor"]) > 0  # electrons a count
+        assert float(text["conversion_factor"]) > 0  # electrons per count
         assert float(text["conversion_offset"]) >= 0  # counts
 
     def test_a_closed_camera_says_so(self, bench: CameraBench) -> None:

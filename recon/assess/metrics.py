@@ -199,7 +199,7 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     box = inscribed_cuboid(volume.shape)
     values = volume[box]
     if not np.isfinite(values).all():
-        raise ValueError("the volume holds NaN or infinite values")
+        raise ValueError("the volume contains NaN or infinite values")
     rng = np.random.default_rng(seed)
     some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
     sample = np.asarray(values[some], np.float64).ravel()
@@ -278,7 +278,7 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
         mean, base = (float(each.mean(dtype=np.float64)) for each in (dense, empty))
         spread = float(empty.std(dtype=np.float64))
     if not (math.isfinite(mean) and math.isfinite(spread)):
-        raise ValueError("the volume holds NaN or infinite values")
+        raise ValueError("the volume contains NaN or infinite values")
 
     def decibel(signal: float) -> float:
         if not signal > 0:

@@ -28,7 +28,7 @@ def without_mask(values: Any) -> Any:
 
 
 def frozen(values: F64) -> F64:
-    """A copy that cannot be written."""
+    """A read-only copy."""
     copy = np.array(values, np.float64)
     copy.setflags(write=False)
     return copy

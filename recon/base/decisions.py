@@ -90,8 +90,8 @@ class Stop:
         now: the clock.
 
     Attributes:
-        stopped: True if somebody asked for the end. The own deadline does not count, because it was planned. For a
-            request made with `by`, the deadline of the first request counts as asked for.
+        stopped: True if somebody asked for the end. A run that ends at its own deadline is not stopped, because this
+            end was planned. For a request made with `by`, the deadline of the first request counts as asked for.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Stop:
         return type(self)(self, deadline, now)
 
     def leaves(self, seconds: float) -> bool:
-        """Whether at least `seconds` s remain before its own deadline."""
+        """Whether at least `seconds` s remain before the deadline of this request."""
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:
@@ -122,7 +122,7 @@ class Stop:
 
 
 class GoesOn:
-    """A `go_on` (step, residual) that keeps its last answer in `going`."""
+    """A function `go_on` (step, residual) that also stores its last answer in `going`."""
 
     def __init__(self, go_on: Callable[[int, float], bool]) -> None:
         self._go_on, self.going = go_on, True

@@ -49,7 +49,7 @@ def faults_of(
         data: the plain values.
         schema: JSON schema of the legal values.
         where: path that is put before the path of each key; "" at the top of a file.
-        former: by path of a removed key, a sentence on what does the same now.
+        former: by path of a removed key, a sentence that says what replaces it.
         advice: sentence for a group that has the keys of another kind.
     """
     faults: dict[KeyPath, Fault] = {}

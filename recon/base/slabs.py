@@ -53,8 +53,8 @@ def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
 def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
     """The detector rows that show these slices of the whole volume, the geometry of the rows, and the slices' grid.
 
-    For a parallel beam without roll and tilt. Rows at the edge of a shifted projection also show slices outside this
-    grid.
+    The beam must be parallel, without roll and tilt. Rows at the edge of a shifted projection also show slices outside
+    this grid.
     """
     z = grid.coordinates()[0][slices] / geometry.pixel_pitch + geometry.axis_row
     shifts, last = geometry.shifts[:, 1], geometry.detector_shape[0] - 1

@@ -1,8 +1,9 @@
-"""Kernels that need no compiling: numba compiles for a level of x86-64, whose compiled kernels the package carries.
+"""Compiled kernels in the package: numba compiles for a level of x86-64, so that users need not compile.
 
-numba finds a compiled kernel again by its source, numba's version, Python's minor version, and the processor that it
-compiles for. With a level in place of the processor, what one machine compiled serves all of that level. Everything
-else is a miss, and compiles as ever: an edited kernel, another Python or numba, an older or another processor, Windows.
+numba identifies a compiled kernel by its source, the version of numba, the minor version of Python, and the processor
+for which it compiles. With a level instead of the processor, a kernel that was compiled on one machine can be used on
+all machines of this level. In all other cases numba compiles as usual: for an edited kernel, another Python or numba,
+an older or another processor, and on Windows.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from recon.compiled.archive import ROOT
 
 @dataclass(frozen=True)
 class ProcessorLevel:
-    """Instructions of a level of the x86-64 psABI.
+    """The instructions of a level of the x86-64 psABI.
 
     Attributes:
-        name: as LLVM knows it.
-        flags: that Linux says of a processor of this level, beyond those of the level below.
-        features: as LLVM names them. Kernels ask for them (`recon.kernels.cpu.picks`).
+        name: name of the level in LLVM.
+        flags: flags that Linux reports for a processor of this level, in addition to those of the level below.
+        features: the instructions as LLVM names them. Kernels check for them (`recon.kernels.cpu.picks`).
     """
 
     name: str
@@ -49,16 +50,16 @@ V4 = ProcessorLevel(
     _V3 + ",+avx512bw,+avx512cd,+avx512dq,+avx512f,+avx512vl,-prefer-256-bit",
 )
 BASELINE = ProcessorLevel("x86-64", frozenset(), "")
-"""Every processor of x86-64; nothing is carried for it."""
+"""Any x86-64 processor; the package has no compiled kernels for it."""
 LEVELS = (V4, V3)
-"""The highest first."""
+"""The levels with compiled kernels, the highest first."""
 
 
 def level_for(environment: Mapping[str, str], flags: Set[str]) -> ProcessorLevel | None:
-    """The highest level whose instructions the processor has; None below v3, or where the user names a processor.
+    """The highest level that the processor supports; None below v3, or if the user has named a processor.
 
-    A level that the environment names already is kept. A job on another node may inherit one that its processor lacks:
-    that is chosen anew.
+    A level that is already named in the environment is kept. A job on another node may inherit a level that its
+    processor does not support; then the level is chosen again.
     """
     names = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
     stated = {name: environment[name] for name in names if name in environment}
@@ -69,7 +70,7 @@ def level_for(environment: Mapping[str, str], flags: Set[str]) -> ProcessorLevel
 
 
 def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """Flags of the first processor by Linux, on x86-64; none elsewhere."""
+    """Flags of the first processor as Linux reports them, on x86-64; empty on other systems."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return frozenset()
     try:
@@ -84,14 +85,17 @@ LOCATORS = (
     "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,recon.compiled.cache.UnwritableFolder,"
     "IPythonCacheLocator,ZipCacheLocator"
 )
-"""Where numba keeps what it compiles, the first that can be written: its own places, and one that need not be."""
+"""Where numba stores compiled kernels: the first folder that is writable.
+
+The list also has a place that need not be writable.
+"""
 
 
 def use_compiled_kernels() -> None:
-    """Sets the cache and the level for numba, and for processes begun from here on.
+    """Set the cache and the level for numba, in this process and in those it starts from now on.
 
-    The user's own settings of numba stand: of the processor, of the cache, of no compilation. Where numba is imported
-    already, it may have compiled for this very processor, and only the cache is set.
+    Settings of numba by the user are kept: the processor, the cache, and compilation switched off. If numba is already
+    imported, it may have compiled for this processor, and only the cache is set.
     """
     if "NUMBA_DISABLE_JIT" in os.environ:
         return

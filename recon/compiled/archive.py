@@ -1,12 +1,13 @@
-"""The archive of compiled kernels: a zip with one member a module, which is read where it lies.
+"""The archive of compiled kernels: a zip with one member for each module, which is read without unpacking it to disk.
 
-A member holds the files of numba's cache for the kernels of a module (indices, `.nbi`, and object code, `.nbc`), as a
-tar compressed by xz. `sources.json` says which source files its kernels were compiled from: the module and all that it
-imports of this project, since numba copies functions and constants of other modules into a kernel without noticing when
-they change. A member whose sources differ stays packed, so that those kernels are compiled anew.
+A member contains the files of numba's cache for the kernels of a module (indices, `.nbi`, and object code, `.nbc`), as
+a tar compressed by xz. `sources.json` lists the source files from which the kernels were compiled: the module and
+everything of this project that it imports. This is necessary because numba copies functions and constants of other
+modules into a kernel, and does not notice when they change. A member whose sources differ is not used, and its kernels
+are compiled again.
 
 numba's files are pickles, which can run any code when they are loaded. The archive is part of the package and as
-trustworthy as its modules. Checksums of zip and xz tell damage.
+trustworthy as its modules. Checksums of zip and xz reveal damage.
 """
 
 from __future__ import annotations
@@ -26,22 +27,25 @@ from functools import lru_cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-"""The folder of the packages `beamline`, `recon` and `simulators`."""
+"""The folder that contains the packages `beamline`, `recon` and `simulators`."""
 ARCHIVE = Path(__file__).with_name("kernels.zip")
 PYTHONS = ((3, 11), (3, 12), (3, 13))
-"""Where it was tried; made by the first. Object code and numba's own pickles hold nothing of Python's version."""
+"""Python versions with which the archive was tested; the first one made it.
+
+Its files do not depend on the Python version.
+"""
 SOURCES = "sources.json"
 _DAMAGE = (
     *(OSError, ValueError, KeyError, EOFError, RuntimeError, OverflowError, struct.error),
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, tarfile.TarError),
 )
-_MARK = b"sha256:"  # before the digest at the end of a file, which pickle does not read
+_MARK = b"sha256:"  # marks the digest at the end of a file; pickle does not read that far
 _SEAL = len(_MARK) + hashlib.sha256().digest_size
 
 
 @lru_cache(maxsize=8)
 def carried(source: bytes) -> Mapping[str, bytes]:
-    """The files of numba's cache for the module whose source has this digest; none where nothing whole is carried."""
+    """The files of numba's cache for the module whose source has this digest; empty if there are no undamaged ones."""
     with contextlib.suppress(*_DAMAGE):
         module = _carried_modules(ARCHIVE).get(source.hex()) if sys.version_info[:2] in PYTHONS else None
         return {} if module is None else member(ARCHIVE, module)
@@ -50,13 +54,13 @@ def carried(source: bytes) -> Mapping[str, bytes]:
 
 @lru_cache
 def _carried_modules(archive: Path) -> dict[str, str]:
-    """Modules whose kernels can be used, by the digest of their source."""
+    """The modules whose kernels can be used, by the digest of their source."""
     sources = read_sources(archive)
     return {sources[module][source_path(module)]: module for module in fresh_members(archive, ROOT)}
 
 
 def fresh_members(archive: Path, root: Path) -> Iterator[str]:
-    """Modules whose kernels were compiled from the sources that are under `root`."""
+    """The modules whose kernels were compiled from the present sources under `root`."""
     digests: dict[str, str | None] = {}
     for module, sources in read_sources(archive).items():
         for path in sources:
@@ -86,7 +90,7 @@ def member(archive: Path, module: str) -> dict[str, bytes]:
 
 
 def digest(path: Path) -> str | None:
-    """A digest of a file's content; None where it cannot be read."""
+    """A digest of a file's content; None if the file cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
@@ -104,9 +108,9 @@ def sealed(content: bytes) -> bytes:
 
 
 def unsealed(content: bytes) -> bytes:
-    """The content of a file without its digest, if it has one. ValueError where the digest is another file's."""
+    """The content of a file without its digest, if it has one. ValueError if the digest does not match."""
     if not content[-_SEAL:].startswith(_MARK):
         return content
     if sealed(content[:-_SEAL]) != content:
-        raise ValueError("the content differs from its digest")
+        raise ValueError("the content does not match its digest")
     return content[:-_SEAL]

@@ -1,12 +1,12 @@
-"""numba's cache of compiled kernels, such that nothing depends on it.
+"""numba's cache of compiled kernels, changed so that a missing or damaged cache never causes an error.
 
-A kernel is read from the archive that comes with the package, where it lies, else from what numba wrote earlier; else
-it is compiled. A file that is damaged counts as absent and is written anew. Where no folder can be written, or a disk
-is full, kernels are compiled in memory, with one warning.
+A kernel is read from the archive in the package, otherwise from files that numba wrote earlier; otherwise it is
+compiled. A damaged file counts as missing and is written again. If no folder is writable, or the disk is full, kernels
+are compiled in memory, with one warning.
 
-A process that is forked after parallel kernels have run computes the same by them, on the thread that calls.
+A process that is forked after parallel kernels have run computes the same with them, on the calling thread.
 
-numba imports this module when it makes its first cache, as LOCATORS names it; nothing else need be imported for it.
+numba imports this module when it makes its first cache, because LOCATORS names it. No other import is needed.
 """
 
 from __future__ import annotations
@@ -31,18 +31,21 @@ from recon.compiled.archive import carried, sealed, unsealed
 
 
 class UnwritableFolder(caching.InTreeCacheLocator):
-    """The `__pycache__` beside a kernel where no folder can be written: what lies there may be read."""
+    """The `__pycache__` next to a kernel if no folder is writable; existing files in it can still be read."""
 
     def ensure_cache_path(self) -> None:
-        """Nothing is written."""
+        """Does nothing, because nothing is written."""
 
 
 class KernelCacheFile(caching.IndexDataCacheFile):
-    """The index of a kernel and its object code, each with a digest; a file without one is taken as numba takes it."""
+    """The index of a kernel and its object code, each with a digest.
+
+    A file without a digest is read as numba reads it.
+    """
 
     def load(self, key: Any) -> Any:
         files = carried(self._source_stamp)
-        with suppress(Exception):  # a pickle of damaged bytes can raise anything, and there may be none
+        with suppress(Exception):  # a damaged pickle can raise any exception, and the file may be missing
             index = next(name for name in files if _without_python(name) == _without_python(self._index_name))
             overloads = self._overloads(files[index])
             return pickle.loads(files[next(overloads[known] for known in overloads if _same(known, key))])  # noqa: S301
@@ -57,9 +60,9 @@ class KernelCacheFile(caching.IndexDataCacheFile):
             return {}
 
     def _overloads(self, content: bytes) -> dict[Any, str]:
-        """Names of files of object code, by what they were compiled for."""
+        """Names of the files of object code, by the key for which they were compiled."""
         file = io.BytesIO(content)
-        if pickle.load(file) != self._version:  # noqa: S301 - numba's, as trustworthy as the modules beside it
+        if pickle.load(file) != self._version:  # noqa: S301 - numba's file, as trustworthy as the modules next to it
             return {}
         stamp, overloads = pickle.load(file)  # noqa: S301
         return dict(overloads) if stamp == self._source_stamp else {}
@@ -81,27 +84,30 @@ def _without_python(name: str) -> str:
 
 
 def _same(known: Any, key: Any) -> bool:
-    """Keys of the same types, processor and closure. The source is the same; its bytecode is Python's affair."""
+    """Whether two keys have the same types, processor and closure.
+
+    The source is the same; bytecode differs with Python.
+    """
     return bool(known[:2] == key[:2] and known[2][1] == key[2][1])
 
 
 @contextmanager
 def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
-    """Kernels that the disk refuses stay in memory; the first one causes a warning."""
+    """Keeps kernels in memory if they cannot be written to disk; the first one causes a warning."""
     try:
         yield
     except OSError as error:
         if not _told:
             _told.append(cache.cache_path)
             warnings.warn(
-                f"compiled kernels cannot be kept ({cache.cache_path}: {error.strerror or error}): they are compiled "
-                "in memory, each time. Set NUMBA_CACHE_DIR to a folder that can be written.",
+                f"set NUMBA_CACHE_DIR to a writable folder: compiled kernels cannot be stored ({cache.cache_path}: "
+                f"{error.strerror or error}), so they are compiled again in each process",
                 stacklevel=2,
             )
 
 
 _told = list[str]()
-os.environ.pop("NUMBA_CACHE_LOCATOR_CLASSES", None)  # programs begun from here may know numba, and not this module
+os.environ.pop("NUMBA_CACHE_LOCATOR_CLASSES", None)  # programs started from here may import numba without this module
 caching.IndexDataCacheFile = KernelCacheFile
 caching.Cache._guard_against_spurious_io_errors = _in_memory_where_refused
 
@@ -120,43 +126,44 @@ forked:
   ret void
 }}
 """
-"""numba's parallel loop, as its `omppool.cpp` declares it, where this is not {process}: one `work` does all `n`.
+"""numba's parallel loop (declared in its `omppool.cpp`), replaced in a process other than {process}: one `work` does
+all `n`.
 
-A fork copies one thread. GNU OpenMP, by which numba runs the parts of a kernel, would wait for the others, so numba
-ends such a process.
+A fork copies only one thread. GNU OpenMP, with which numba runs the parts of a kernel, would wait for the other
+threads. Therefore numba normally ends such a process.
 """
 _IMPORTED_IN = os.getpid()
-_loops = list[Any]()  # whose machine code lives as long
+_loops = list[Any]()  # kept, because its machine code must live as long
 
 
 _launched_by_numba = parallel._launch_threads
 
 
 def _launch() -> None:
-    """As numba; where the layer that NUMBA_THREADING_LAYER states cannot be had, with another one."""
+    """As in numba; if the layer in NUMBA_THREADING_LAYER is not available, with another layer."""
     try:
         _launched_by_numba()
     except ValueError as error:
         stated, config.THREADING_LAYER = config.THREADING_LAYER, "default"
         _launched_by_numba()
         warnings.warn(
-            f"NUMBA_THREADING_LAYER={stated} in the environment is not used. Another layer is. Unset it "
-            f"({str(error).splitlines()[0]}).",
+            f"Unset NUMBA_THREADING_LAYER: the layer {stated} is not available ({str(error).splitlines()[0]}), so "
+            "another one is used.",
             stacklevel=2,
         )
 
 
 def _launch_threads() -> None:
-    """As above, with the loop above before that of the threads."""
+    """As above; it also puts the loop above in front of the loop of the threads."""
     if _loops:
         return
-    process = _IMPORTED_IN if parallel._is_initialized else os.getpid()  # others may have launched them
+    process = _IMPORTED_IN if parallel._is_initialized else os.getpid()  # another module may have launched the threads
     _launch()
     loop = llvm.parse_assembly(_LOOP.format(process=process, threaded=llvm.address_of_symbol("numba_parallel_for")))
     _loops.append(llvm.create_mcjit_compiler(loop, llvm.Target.from_default_triple().create_target_machine()))
     llvm.add_symbol("numba_parallel_for", _loops[0].get_function_address("run"))
-    if sys.platform != "win32":  # which has no forks
-        # A kernel that another thread compiles is finished before the fork: its lock would stay locked in the child.
+    if sys.platform != "win32":  # Windows has no fork
+        # Wait for kernels that another thread compiles, because its lock would stay locked in the child process.
         lock = global_compiler_lock
         os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=_forked)
 
@@ -165,7 +172,7 @@ def _forked() -> None:
     global_compiler_lock.release()
     torch: Any = sys.modules.get("torch")
     if hasattr(torch, "set_num_threads"):
-        torch.set_num_threads(1)  # its OpenMP would wait, too
+        torch.set_num_threads(1)  # its OpenMP would also wait for threads
 
 
-parallel._launch_threads = _launch_threads if hasattr(os, "register_at_fork") else _launch  # Windows has no forks
+parallel._launch_threads = _launch_threads if hasattr(os, "register_at_fork") else _launch  # Windows has no fork

@@ -65,13 +65,13 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> Axis
 def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
     """Axis from all pairs of opposite projections of a 360° scan, also if the axis is near an edge of the detector.
 
-    It works as `axis_from_pair`, but with the slopes of the projections along the columns, because slopes share no
-    trend if the overlap is narrow. The part that all projections share, such as the rim of a round sample, is
-    subtracted. The sum is over up to 64 pairs and over rows (overlap in half acquisition: Vo et al. 2021, Opt. Express
-    29, 17849). A few columns can agree by chance, so a candidate is scored by Fisher's z = artanh(correlation)
-    √columns. For comparison, projections are paired with those of another pair, which are not opposite, in up to 32
-    ways. The estimate is confident if its z exceeds the largest z of any candidate in each of these pairings: one false
-    alarm in 33.
+    It works as `axis_from_pair`, but with the slopes of the projections along the columns, because a common trend of
+    the projections would give a false match if the overlap is narrow. The part that all projections share, such as the
+    rim of a round sample, is subtracted. The sum is over up to 64 pairs and over rows (overlap in half acquisition: Vo
+    et al. 2021, Opt. Express 29, 17849). A few columns can agree by chance, so a candidate is scored by Fisher's z =
+    artanh(correlation) √columns. For comparison, projections are paired with those of another pair, which are not
+    opposite, in up to 32 ways. The estimate is confident if its z exceeds the largest z of any candidate in each of
+    these pairings: one false alarm in 33.
 
     Args:
         projections: float32 [view, row, col], line integrals.

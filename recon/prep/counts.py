@@ -16,7 +16,7 @@ from recon.base.arrays import F32, F64
 from recon.base.declared_types import check_settings
 
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
-# of the expansion on three samples at 10 to 10 000 photons. So are the other two.
+# of the expansion on three samples at 10 to 10 000 photons. The next two values were chosen in the same way.
 _SIGMA, _SPREAD = 1.5, 2.0
 _DETAIL = 1.5  # variance divided by that of counting; a larger ratio means detail of the sample
 _FEWEST = 0.25  # photons; smallest expected number for a ray
@@ -104,9 +104,9 @@ def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64
     """Line integrals and weights whose weighted squares equal the likelihood to second order, for each pixel.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
-    is Σ λ - n ln λ. At p0 it has the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information. p~
-    = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh & Nelder 1989,
-    section 2.5). Zero counts need no special treatment.
+    is Σ λ - n ln λ. At p0 its gradient equals that of ½ w (p - p~)², and the curvature of this square is Fisher's
+    information. p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh
+    & Nelder 1989, section 2.5). Zero counts need no special treatment.
     """
     seen = beam * np.exp(-around)
     return around - (photons - seen) / seen, seen * seen / (seen + extra)

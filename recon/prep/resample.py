@@ -1,7 +1,8 @@
-"""Resampling: corrects views of a detector that is turned about the beam, or behind a lens that distorts.
+"""Resampling: corrects projections for a detector that is rotated about the beam, and for a lens that distorts.
 
-Positions are pixels of the whole detector, 0 at the centre of the first one. A pixel (col, row) of the new view is
-taken from its place on the detector: first turned about the detector's middle, then displaced by the lens.
+Positions are in pixels of the whole detector, 0 at the centre of the first one. The value of a pixel (col, row) of the
+new projection is read at a position on the detector. To find this position, (col, row) is first rotated about the
+detector's middle and then displaced by the lens.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_TAPS = 6  # taps: pixels along each side that make a new pixel
-_BEFORE = _TAPS // 2 - 1  # taps before a place
-_PHASES = 4096  # steps in a pixel at which weights are tabulated
-_LOOKED_AT = 65  # positions along each side at which the reach is measured
+_TAPS = 6  # taps: number of pixels along each axis from which a new pixel is interpolated
+_BEFORE = _TAPS // 2 - 1  # taps before a position
+_PHASES = 4096  # positions within a pixel at which weights are tabulated
+_LOOKED_AT = 65  # positions along each side at which the largest displacement is measured
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """Radial distortion of a lens: a pixel at (x, y) from the centre, without it, is seen at (x, y) * sum a_i r^i.
+    """Radial distortion of a lens: a point at (x, y) from the centre appears at (x, y) * sum a_i r^i.
 
     The backward model of Vo, Atwood & Drakopoulos 2015 (Opt. Express 23, 32859, equation 7, with even and odd powers).
 
@@ -47,7 +48,7 @@ class Distortion:
 
     @classmethod
     def parse(cls, text: str) -> Distortion:
-        """Read discorpy's text file: lines of a name and a value, xcenter, ycenter, factor0, factor1 ...
+        """Read a text file of discorpy. Each line has a name and a value: xcenter, ycenter, factor0, factor1 ...
 
         Raises:
             ValueError: there are other lines, or values that do not form such a model.
@@ -69,14 +70,14 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How views are resampled, in one step, by cubic convolution over six pixels.
+    """How projections are resampled: in one step, by cubic convolution over six pixels.
 
     Attributes:
         shape: (rows, cols) of the whole detector.
-        tilt: radians by which the rotation axis leans in the detector's plane: its column grows by tan(tilt) a row. A
-            `Geometry` calls such a lean roll; its own tilt is the one along the beam.
-        distortion: of the lens; None: no distortion.
-        binning: each pixel of the views is a mean of so many pixels a side.
+        tilt: tilt of the rotation axis in the detector's plane in radians: the column of the axis grows by tan(tilt)
+            per row. A `Geometry` calls this tilt roll; the tilt of a `Geometry` is the one along the beam.
+        distortion: distortion of the lens; None: no distortion.
+        binning: each pixel of the projections is the mean of binning x binning pixels.
     """
 
     shape: tuple[int, int]
@@ -86,18 +87,18 @@ class Resampling:
 
     @property
     def reach(self) -> int:
-        """Distance in binned rows from which a row takes values."""
+        """Largest distance, in binned rows, of the rows from which a new row is interpolated."""
         rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
         seen = self._seen_at(*np.meshgrid(cols, rows))[1]
         return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2
 
     def apply(self, views: F32, first: int) -> None:
-        """Replace views [view, row, col] by resampled ones, in place.
+        """Resample projections [view, row, col] in place.
 
         Pixels beyond the given rows and columns take the value of the nearest one.
 
         Args:
-            first: detector row of the views' first row.
+            first: detector row of the first row of the projections.
         """
         rows, cols = self._places(views.shape[1:], first)
         table = _weights()
@@ -113,19 +114,19 @@ class Resampling:
         return np.asarray(image[row, col])
 
     def unseen(self, shape: tuple[int, int], first: int) -> NDArray[np.bool_]:
-        """Pixels [row, col] of views that begin at row `first`, which the detector did not see."""
+        """Mask [row, col] of the new pixels outside the detector, for projections that begin at row `first`."""
         rows, cols = self.places(shape, first)
         high, wide = self.shape
         return (rows < -0.5) | (rows > high - 0.5) | (cols < -0.5) | (cols > wide - 0.5)
 
     def places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
-        """Places (row, col) on the detector, each [row, col], of the pixels of views that begin at row `first`."""
+        """Positions (row, col) of the new pixels on the detector, each [row, col]; projections begin at row `first`."""
         rows, cols = (np.arange(length) * self.binning + (self.binning - 1) / 2 for length in shape[-2:])
         col, row = self._seen_at(*np.meshgrid(cols, rows + first))
         return row, col
 
     def _places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
-        """Places (row, col) in the given views, of each new pixel."""
+        """Positions (row, col) of the new pixels in the given projections."""
         row, col = self.places(shape, first)
         middle = (self.binning - 1) / 2
         return (row - middle) / self.binning - first / self.binning, (col - middle) / self.binning
@@ -139,14 +140,17 @@ class Resampling:
 
 
 def _split(at: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
-    """Whole pixels, and the rest in phases."""
+    """The whole pixels of a position, and the rest in units of 1 / number of phases."""
     steps = np.rint(at * _PHASES)
     whole = np.floor(steps / _PHASES)
     return whole.astype(np.int32), (steps - whole * _PHASES).astype(np.int16)
 
 
 def _weights() -> F32:
-    """[phase, tap] of the cubic convolution over six points (Keys 1981, IEEE Trans. ASSP 29, 1153, section VI)."""
+    """[phase, tap] weights of the cubic convolution over six points (Keys 1981, IEEE Trans.
+
+    ASSP 29, 1153, section VI).
+    """
     s = np.abs(np.arange(_TAPS) - _BEFORE - np.arange(_PHASES)[:, None] / _PHASES)
     near = (4 / 3 * s - 7 / 3) * s**2 + 1
     middle = ((-7 / 12 * s + 3) * s - 59 / 12) * s + 5 / 2
@@ -156,7 +160,10 @@ def _weights() -> F32:
 
 @njit(parallel=True, boundscheck=False, cache=True)
 def _resample(view, row, row_phase, col, col_phase, table, out):
-    """out[i, j] = sum over 6 x 6 pixels of `view` about (row, col)[i, j], those beyond an edge as at the edge."""
+    """out[i, j] = weighted sum of the 6 x 6 pixels of `view` around (row, col)[i, j].
+
+    Beyond an edge, the edge is repeated.
+    """
     rows, cols = view.shape
     for i in prange(rows):
         for j in range(cols):

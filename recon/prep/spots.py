@@ -1,4 +1,4 @@
-"""Spots: pixels that a stray gamma or X-ray lit in a single view, found beside the neighbouring views, and filled."""
+"""Spots (zingers): finds and fills pixels that a stray gamma or X-ray hit in a single projection."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from recon.base.jit import njit
 from recon.base.masks import Image, fill, plan_fill
 from recon.prep.unmeasured import DARK, NO_RUNS
 
-_LEAST = 0.005  # least noise of √light, of that of the open beam: 1 % of its light, as grain of screen and optics
+_LEAST = 0.005  # least noise of √light, as a share of the open beam's: 1 % of its light, for grain of screen and optics
 _WIDEST = 3  # pixels of a spot along rows and columns
-_AROUND = 3  # pixels on each side of a spot that show how much the views differ there
-_SAMPLE, _FEWEST = 600, 30  # pixels, about, that show the noise of a view, and whether its light has changed
-_OPAQUE = DARK**0.5  # √light, below which matter shows nothing of a gap that opens in it
-_MEDIAN = MEDIAN * 2**0.5  # of |x - y|, for normal variables of standard deviation 1
+_AROUND = 3  # pixels on each side of a spot in which the normal difference of the projections is measured
+# pixels (about; at least) from which the noise of a projection, and a change of its light, are measured
+_SAMPLE, _FEWEST = 600, 30
+_OPAQUE = DARK**0.5  # √light; where a projection is darker, it cannot show whether a gap is about to open in the sample
+_MEDIAN = MEDIAN * 2**0.5  # median of |x - y| for normal variables of standard deviation 1
 
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Views divided by the flat, or line integrals as they were given, before their spots are filled.
+    """Projections divided by the flat, or given line integrals, before their spots are filled.
 
     Attributes:
-        data: float32 [view, row, col], finite; `line_integrals` takes it over.
+        data: float32 [view, row, col], finite; `line_integrals` reuses its memory.
         view_ids: int64 [view].
-        repaired: int64 [view], pixels that were not finite, or a spot; filled from their neighbours.
-        air: float32 [view], transmission of the air by which each view was divided; 1 before.
-        beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
-        unmeasured: int64 [run, 4], pixels that measured nothing, filled from their neighbours, see `runs_of`.
-        unseen: bool [row, col], pixels that are finite in none of the views of this batch; None: not looked for.
+        repaired: int64 [view], number of pixels that were not finite or were a spot; filled from their neighbours.
+        air: float32 [view], transmission of the air by which each projection was divided; 1: not divided yet.
+        beam: float32 [view, row, col], number of photons without the sample; None: photons are not counted.
+        unmeasured: int64 [run, 4], pixels without data, filled from their neighbours, see `runs_of`.
+        unseen: bool [row, col], pixels that are not finite in any projection of this batch; None: not determined.
     """
 
     data: F32
@@ -46,13 +47,13 @@ class Transmission:
     unseen: Mask | None = None
 
     def __getitem__(self, part: slice | NDArray[np.intp] | list[int]) -> Transmission:
-        """Some of the views."""
+        """Some of the projections."""
         ids, beam = self.view_ids[part], None if self.beam is None else self.beam[part]
         runs = self.unmeasured[np.isin(self.unmeasured[:, 0], ids)]
         return Transmission(self.data[part], ids, self.repaired[part], self.air[part], beam, runs)
 
     def and_then(self, later: Transmission) -> Transmission:
-        """These views and later ones."""
+        """These projections, followed by later ones."""
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         joined: list[Any] = [None if first is None else np.concatenate((first, then)) for first, then in pairs]
         return Transmission(*joined)
@@ -60,16 +61,16 @@ class Transmission:
 
 @dataclass(frozen=True, eq=False)
 class SpotFilter:
-    """Fills spots of views that come in batches of any size, each view between its neighbours in angle or time.
+    """Fills spots of projections, which come in batches of any size, by comparing neighbours in angle or time.
 
-    The newest view waits for the next one. The result is the same to the bit for any split into batches.
+    The newest projection waits for the next one. The result is bit-identical for any split into batches.
 
     Attributes:
-        threshold: see `spots`; inf fills none.
-        root: √transmission of the pixels of a view, where the noise of photons is everywhere the same.
-        before: the last view that was freed of spots, as `root` reads it; None: there is none.
-        waiting: the newest view, which waits for the one after it; None: none waits.
-        left: pixels of spots that were too large to be filled, in all views so far.
+        threshold: see `spots`; inf: no spot is filled.
+        root: function that returns the √transmission of a projection, in which photon noise is the same everywhere.
+        before: the last projection whose spots were filled, as √transmission; None: there is none.
+        waiting: the newest projection, which waits for the next one; None: no projection waits.
+        left: number of pixels of spots that were too large to be filled, in all projections so far.
     """
 
     threshold: float
@@ -85,14 +86,14 @@ class SpotFilter:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Transmission, SpotFilter]:
-        """The waiting view and these, their spots filled in place; and the filter of the views that follow.
+        """The waiting projection and these, with spots filled in place; and the filter for the projections that follow.
 
         Args:
-            views: the next ones; None: there are none after the waiting one.
-            last: no view comes after these; else the newest then waits.
-            progress: how many views are done, after each.
-            order: [view], where each view has its neighbours, beside it; all views are there, and none waits. None:
-                their neighbours are those before and after.
+            views: the next projections; None: the waiting projection was the last one.
+            last: True if no projection comes after these; otherwise the newest one waits.
+            progress: function called with the number of projections done, after each one.
+            order: [view], an order in which neighbours are adjacent; then all projections must be given, and none
+                waits. None: the neighbours are the projections before and after.
         """
         if self.waiting is not None:
             views = self.waiting[[0]] if views is None else self.waiting.and_then(views)
@@ -116,11 +117,12 @@ class SpotFilter:
 
 
 def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:
-    """Darks or flats [row, col] without their spots, each filled by the mean of the frames beside it, and the number of
-    pixels filled in each. A single frame stays as it is.
+    """Darks or flats [row, col] without their spots, and the number of filled pixels in each frame.
+
+    A spot is filled with the mean of the frames before and after. A single frame is not changed.
 
     Args:
-        light: counts of the open beam.
+        light: counts in the open beam.
     """
     before: NDArray[Any] | None = None
     left = iter(frames)
@@ -144,22 +146,25 @@ def _root_of(counts: NDArray[Any], light: float) -> Image:
 def spots(
     view: Image, before: Image | None, after: Image | None, threshold: float, *, still: bool = False
 ) -> tuple[Mask, int]:
-    """bool [row, col], pixels that a stray photon lit: brighter than the neighbouring views, and than what is around;
-    and how many belong to spots that are too large.
+    """Mask [row, col] of spots, which are brighter than the neighbouring projections and than their surroundings.
 
-    All images are √transmission, where photon noise is uniform. A spot is at most three pixels wide along its row and
-    its column, and the view before, which is free of spots, has none within a pixel: edges of a sample are longer, and
-    its gaps move on. A gap between opaque grains may open in a single view. So where a neighbouring view is opaque, a
-    spot is light of no sample: brighter than the open beam, and than all that both neighbours have. Such light may be
-    part of a line, and the next view may have a spot there, too.
+    The second result is the number of pixels in spots that are too large.
+
+    All images are √transmission, in which photon noise is uniform. A spot is at most three pixels wide along its row
+    and its column. The previous projection, whose spots are filled, must have nothing as bright within one pixel. This
+    tells spots from edges of the sample, which are longer, and from its gaps, which move from projection to projection.
+    A gap between opaque grains may open in a single projection. So if a neighbouring projection is opaque there, a spot
+    must be brighter than the open beam and than both neighbours. Such light may be part of a line, and the next
+    projection may have a spot there, too.
 
     Args:
-        before, after: the views beside it in angle; None: there is none. They are made as bright as the view where most
-            of it is brighter than both: its light has changed.
-        threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three: that
-            between the pixels of this view, that between both neighbours around the pixel (the sample turns), and 1 %
-            of the light. A normal variable exceeds 8 of them once in 10¹⁵ pixels.
-        still: there is no sample that moves, nor gaps in it.
+        before, after: the projections before and after; None: there is none. If most of this projection is brighter
+            than both, its light has changed, and both are scaled to its brightness.
+        threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three
+            values: the noise between the pixels of this projection, the difference of both neighbours around the pixel
+            (because the sample turns), and 1 % of the light. A normal variable exceeds 8 standard deviations once in
+            10¹⁵ pixels.
+        still: True if there is no moving sample, as in darks and flats.
     """
     found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
     first, *others = beside or [np.zeros_like(view)] * 2
@@ -175,8 +180,10 @@ def spots(
 
 @njit(nogil=True, cache=True)
 def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
-    """Medians over some lit pixels: of the difference to the next one, and of the light over that of the brighter
-    neighbour (0 where none is lit, or the sum is no larger)."""
+    """Two medians over some lit pixels: the difference from the next pixel, and the light over a neighbour's.
+
+    The neighbour is the brighter one of `before` and `after`. The second median is 0 if no pixel is lit, or if the sum
+    of the light is not larger."""
     rows, cols = view.shape
     step = max(1, rows * cols // _SAMPLE)
     differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
@@ -200,9 +207,10 @@ def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
 def _mark(  # type: ignore[no-untyped-def]
     view, before, after, against, limit, beam, errors, found
 ):
-    """Mark the spots of `spots`, and count the pixels of larger ones: `against` is compared with the view before around
-    them; `beam`: √light of the open beam, inf where no sample has gaps; `errors`: the threshold over the median
-    difference of two normal variables."""
+    """Mark the spots for `spots`, and count the pixels of spots that are too large.
+
+    Around a spot, `against` is compared with the projection before. `beam` is √light of the open beam, inf if there are
+    no gaps in a sample. `errors` is the threshold divided by the median difference of two normal variables."""
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
     left, brightest = 0, beam
@@ -215,7 +223,7 @@ def _mark(  # type: ignore[no-untyped-def]
             stray = light > brightest + limit
             if light <= before[r, c] + limit or (not stray and light <= after[r, c] + limit):
                 continue
-            along, down = -np.inf, -np.inf  # the least light of the brightest piece of its line that is no spot
+            along, down = -np.inf, -np.inf  # light that the brightest piece of its line must exceed to be a spot
             for first in range(-_WIDEST, 1):
                 if c + first >= 0 and c + first + _WIDEST < cols:
                     along = max(along, view[r, c + first : c + first + _WIDEST + 1].min())

@@ -1,7 +1,7 @@
-"""Finish: the volume of a fit, refined on voxels with the prior that views held out prefer.
+"""Voxel refinement (`finish`): refines the volume of a fit on voxels, with the prior that held-out projections prefer.
 
-Gaussians describe smooth matter in few parameters, and leave sharp edges, cracks and pores to the last: where a fit
-ends, they are in its residual. On voxels a few sweeps over the views bring them back.
+Gaussians describe smooth material with few parameters. Sharp edges, cracks and pores come last, so when a fit ends,
+they are still in its residual. A few iterations on voxels restore them.
 """
 
 from __future__ import annotations
@@ -32,20 +32,21 @@ from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, c
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
-"""Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
+"""Iterations of total variation after a fit. Without a voxel refinement: -1.7 dB on a teapot (docs/published.md)."""
 
 PULLED_SWEEPS = 16
-"""Of a pull to few materials after these."""
+"""Iterations with a pull to discrete levels, after those of total variation."""
 
-_REACH = 1.5  # standard deviations of a Gaussian's longest axis
+_REACH = 1.5  # standard deviations of a Gaussian's longest axis up to which it counts as reaching
 
 
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
-    """[view, row, col] the part of the views explained by Gaussians, but not by voxels of their volume; None: nothing.
+    """The part of the projections [view, row, col] that Gaussians explain, but the voxels of their volume do not; or
+    None.
 
-    That is matter beyond the box: what Gaussians that reach there add to the views, but not to the voxels.
-    Measured views alone would bend the volume, by -12 dB on a region of interest and -22 dB in the end slices of a
-    thorax that goes on above the field.
+    This part is material outside the box: Gaussians there contribute to the projections but not to the voxels. If it
+    were not subtracted from the measured projections, the volume would lose 12 dB in a region of interest, and 22 dB in
+    the end slices of a thorax that continues above the field of view. None: there is no such part.
     """
     import torch
 
@@ -61,16 +62,17 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
 
 
 def level_of(beyond: F32) -> F32:
-    """The mean of `beyond_voxels` in each view, [view, 1, 1], which is all that counts for a fit when it is judged.
+    """The mean of `beyond_voxels` in each projection, [view, 1, 1]; only this mean counts when a fit is judged.
 
-    Gaussians far outside explain an air that is not at zero, where voxels cannot: a walnut in a cone whose air is 2 %
-    of the largest line integral off loses 5.7 dB without that. What else they explain there is in no volume.
+    Gaussians far outside can represent an air level that is not zero, and voxels cannot. Without this mean, a walnut in
+    a cone whose air level is wrong by 2 % of the largest line integral loses 5.7 dB. Anything else that these Gaussians
+    represent is not in any volume.
     """
     return beyond.mean(axis=(1, 2), keepdims=True)
 
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
-    """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
+    """Iterations of total variation from x [y, x, z], and PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     first, parts = GoesOn(problem.go_on), Subsets.of(problem, count, to_the_end=False)
     x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
@@ -82,11 +84,11 @@ def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength
 
 @dataclass
 class _Finish:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`.
+    """The voxel refinement as an iterative method for `recon.voxels.iterative.solve`.
 
     Attributes:
-        patches: these may follow.
-        planned: sweeps, and steps with patches where these follow.
+        patches: True: PnP-DCT steps may follow.
+        planned: number of iterations, and of PnP-DCT steps if they follow.
     """
 
     iterations: int
@@ -111,7 +113,10 @@ class _Finish:
 
 
 class Finished(NamedTuple):
-    """The refined volume, and the sweeps of total variation used for it; 0: it is the fit's."""
+    """The refined volume, and the number of its iterations of total variation.
+
+    0: the volume of the fit is unchanged.
+    """
 
     volume: Volume
     sweeps: int
@@ -126,27 +131,26 @@ def finish(
     control: RunControl | None = None,
     nonnegative: bool = True,
 ) -> Finished:
-    """The volume after `sweeps` over all views, starting from the volume of a fit.
+    """The volume after `sweeps` iterations over all projections, starting from the volume of a fit.
 
-    The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB. Matter beyond
-    the box is taken off them before, see `beyond_voxels`.
-
-    Single pixels that stand out in all views alike become rings. They are brought back to their neighbours first, see
-    `ring_offsets`. Memory: 8 volumes and 5 times the projections.
+    The iterations use the measured projections and not the residual of the fit, which is better by 0.5 to 2 dB.
+    Material outside the box is subtracted from the projections first, see `beyond_voxels`. Single pixels that deviate
+    in the same way in all projections would become rings, so their offsets are removed first, see `ring_offsets`.
+    Memory: 8 volumes and 5 times the projections.
 
     Args:
         volume: voxels of the Gaussians, 1/mm.
-        gaussians: result of a fit to the views.
-        problem: the views that were fitted, and the weights of their rays.
-        sweeps: of total variation, 1 or more; None: 8, and a pull to few materials or steps with sparse patches where
-            these predict views held out better.
-        settings: of the fit; None: the defaults.
-        control: gets each sweep, also those of trials, and is asked after it whether to stop. Its decisions may
-            hold the prior.
-        nonnegative: voxels below zero are clipped.
+        gaussians: result of a fit to the projections.
+        problem: the projections that were fitted, and the weights of their rays.
+        sweeps: iterations of total variation, 1 or more. None: 8, followed by discrete levels or PnP-DCT steps if these
+            predict held-out projections better.
+        settings: settings of the fit; None: the defaults.
+        control: is told the progress after each iteration, also of test reconstructions, and may then stop. Its
+            decisions may contain the prior.
+        nonnegative: True: voxels below zero are clipped.
 
     Raises:
-        ValueError: for shapes that disagree, or no sweeps.
+        ValueError: shapes do not match, or `sweeps` is 0.
     """
     fit, control = settings or FitSettings(), control or RunControl()
     prepared = _prepared(gaussians, problem, fit)
@@ -176,7 +180,7 @@ def finish(
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> Views | None:
-    """Views without outliers and rings; None: these or those of the model are empty."""
+    """The projections without outliers and rings; None: they or those of the model are empty."""
     views = problem.views.masked()
     model = project(gaussians, views.geometry, truncation=fit.truncation, model=fit.rays).numpy()
     if not (views.data.any() and model.any()):
@@ -186,9 +190,10 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
 
 
 def _without_outliers(views: Views, model: F32) -> Views:
-    """The views, with weight zero for single rays that differ from the model by as much as its matter.
+    """The projections, with weight 0 for single rays that differ from the model by as much as its material.
 
-    The fit, which counts absolute differences, is not led astray by them; squares would be.
+    The fit uses absolute differences, which such rays hardly affect. The squares of the voxel refinement would be
+    affected.
     """
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:

@@ -21,8 +21,9 @@ from recon.voxels.voxel_problem import VoxelProblem, times_power
 FAR_BEHIND = 0.25
 """A test fit ends at the first look if the residual of total variation is lower by this share of its own residual.
 
-Without this rule, it takes half as much time again. In 17 scans, the fit is best in two; there its residual at the
-first look is 1.17 and 1.22 times that of total variation. In ten others it is 1.45 times and more, and the test ends.
+Without this rule, the test takes half as much time again. In 17 scans, the fit is best in two; there its residual at
+the first look is 1.17 and 1.22 times that of total variation. In ten others it is 1.45 times and more, and the test
+ends.
 """
 
 FIRST_SHARE = 0.25

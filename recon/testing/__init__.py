@@ -1,4 +1,4 @@
-"""MethodConformance: tests that every reconstruction method must pass, as a pytest class to subclass.
+"""MethodConformance: tests that every reconstruction method must pass, as a pytest class to derive from.
 
 class TestMine(MethodConformance):
     @pytest.fixture
@@ -96,7 +96,7 @@ class MethodConformance:
             assert result.history == ()
         else:
             assert steps and result.history
-            assert result.history[-1].step <= 2  # it stopped before the third step
+            assert result.history[-1].step <= 2  # the method stopped before the third step
 
     def test_its_toy_runs_and_its_memory_grows_with_the_volume(self, method: Method) -> None:
         assert type(method.toy()) is type(method)

@@ -1,11 +1,12 @@
-"""Back-projection of filtered views of a parallel beam, sixteen slices at a time: ray by ray, or by gridding.
+"""Back-projection of filtered projections of a parallel beam, sixteen slices at a time: ray by ray, or by gridding.
 
-f(x, y) = Σ_view q_view(x cos θ + y sin θ), where q interpolates the columns of a view linearly. Ray by ray it costs
-views x voxels. Gridding costs views x columns and a few FFTs. By the projection-slice theorem a view is a line through
-the middle of the volume's Fourier plane (O'Sullivan 1985, IEEE Trans. Med. Imaging 4, 200). That plane is periodic, as
-the volume is sampled. So it also holds the part that linear interpolation adds beyond the sampling frequency. Both ways
-give one volume where all views see it. Beyond, they differ at the end of a view: ray by ray adds half a pixel, gridding
-a ramp to 0 within one pixel.
+f(x, y) = Σ_view q_view(x cos θ + y sin θ), where q interpolates the columns of a projection linearly. Ray by ray, the
+work grows as views x voxels. The work of gridding grows as views x columns, plus a few FFTs. By the projection-slice
+theorem a projection is a line through the middle of the volume's Fourier plane (O'Sullivan 1985, IEEE Trans. Med.
+Imaging 4, 200). The plane is periodic, because the volume is sampled. So it also contains the frequencies above the
+sampling frequency that linear interpolation adds. Both ways give the same volume where all projections see it.
+Elsewhere they differ at the end of a projection: ray by ray adds half a pixel, gridding adds a ramp to 0 within one
+pixel.
 """
 
 from __future__ import annotations
@@ -27,25 +28,25 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 SLICES = lanes.WIDTH
-"""Slices that are back-projected together."""
+"""Number of slices that are back-projected together."""
 
 _f = np.float32
 _ACROSS, _DOWN = 16, 8  # voxels along each edge of one job of 16 slices: 8 KiB
 _TILE = 32  # cells of the Fourier plane along each edge of one job
-_FINER = 1.25  # cells of the Fourier plane a voxel, at least
+_FINER = 1.25  # least number of cells of the Fourier plane per voxel
 _REACH = 6  # cells across the kernel
 _STEPS = 2048  # steps of the kernel's table within a cell
-_LEAST = 7e-5  # 1/pixel, least gain of filter and linear interpolation that is followed
-_MOST = 30  # cycles a column, at most
+_LEAST = 7e-5  # 1/pixel; frequencies with a smaller gain of filter and linear interpolation are ignored
+_MOST = 30  # highest frequency in cycles per column
 
-# ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves. They are for a voxel in a view, a point on
-# its way into the Fourier plane, a cell of that plane, a point in the plan.
+# Times in ns for sixteen slices (sum over two cores, AVX-512 in halves): for a voxel in a projection, for adding a
+# point to the Fourier plane, for a cell of that plane, for a point in the plan.
 _NS_A_RAY, _NS_A_POINT, _NS_A_CELL, _NS_OF_PLAN = 5, 85, 150, 20
 
 
 @njit(inline="always")
 def _line_of_lanes(n):
-    """Zeros [n, 16] that begin at a cache line: sixteen lanes then never lie in two."""
+    """Zeros [n, 16] that begin at a cache line, so that sixteen lanes are always in a single one."""
     buffer = np.zeros((n + 1) * lanes.WIDTH, np.float32)
     begin = (-(buffer.ctypes.data // 4)) % lanes.WIDTH
     return buffer[begin : begin + n * lanes.WIDTH].reshape(n, lanes.WIDTH)
@@ -55,7 +56,7 @@ def _line_of_lanes(n):
 def _ray_by_ray(columns: F32, cosines: F64, sines: F64, axis_cols: F64, x: F64, y: F64, out: F32) -> None:
     """out[z, y, x] = Σ_view columns[view, 1 + x cos + y sin + axis, z]; x and y in pixels.
 
-    A view's first and last column stand twice; the view ends half a pixel beyond them.
+    The first and the last column of each projection are stored twice. The projection ends half a pixel beyond them.
     """
     views, cols = columns.shape[0], columns.shape[1] - 2
     nz, ny, nx = out.shape
@@ -85,14 +86,14 @@ def _ray_by_ray(columns: F32, cosines: F64, sines: F64, axis_cols: F64, x: F64, 
 
 @njit(inline="always")
 def _cell(frequency, n):
-    """Place in a period of n cells, 0 <= place < n, of a frequency in cycles a voxel."""
+    """Position in a period of n cells, 0 <= position < n, of a frequency in cycles per voxel."""
     place = (frequency - math.floor(frequency)) * n
     return place if place < n else 0.0
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
 def _runs(k: I32, n: int, fx: F64, fy: F64, shape: tuple[int, int], tiles: I32, runs: I32) -> int:
-    """Cut each view's line of points where it enters another tile of the plane, or another period.
+    """Divide the line of points of each projection where it enters another tile of the plane, or another period.
 
     Fills tiles [run], and runs [run, (view, first point, end)], up to their lengths; returns the number of runs.
     """
@@ -119,10 +120,10 @@ def _spread(
 ) -> None:  # fmt: skip
     """plane[row, col, 2 pair] += each point's value times the kernel's weights around it, for a quarter of the tiles.
 
-    Tiles of one colour, 0 to 3, do not touch, so that threads may fill them at the same time.
+    Tiles of the same colour, 0 to 3, do not touch, so that threads can fill them at the same time.
 
-    spectra [view, k, 16] has one period of the views' spectra, turns [view, period, 2] the phase of each later one.
-    gain [point] is the transfer function of linear interpolation at the frequencies k [point].
+    spectra [view, k, 16] contains one period of the spectra of the projections, turns [view, period, 2] the phase of
+    each later period. gain [point] is the transfer function of linear interpolation at the frequencies k [point].
     """
     n, used = spectra.shape[1], plane.shape[2]
     rows, cols = plane.shape[0], plane.shape[1]
@@ -162,7 +163,7 @@ def _spread(
 
 @njit(**OPTIONS)
 def _crop(plane: F32, down: F32, across: F32, out: F32) -> None:
-    """out[z, y, x] = the plane [row, col, z] around its period's start, over the kernel's own transform."""
+    """out[z, y, x] = the plane [row, col, z] around the start of its period, divided by the transform of the kernel."""
     nz, ny, nx = out.shape
     for j in prange(ny):
         row = plane[(j - ny // 2) % plane.shape[0]]
@@ -174,18 +175,18 @@ def _crop(plane: F32, down: F32, across: F32, out: F32) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Gridding:
-    """The plan of gridding for a set of views and a plane of voxels, for all slices.
+    """The plan of gridding for a set of projections and a plane of voxels; it is the same for all slices.
 
     Attributes:
-        fx, fy: [view], cycles a voxel of the first frequency.
-        phase: complex64 [view, k], of one period, for the places of the axis and of the middle voxel.
+        fx, fy: [view], the first frequency in cycles per voxel.
+        phase: complex64 [view, k], phase of one period, from the positions of the axis and of the middle voxel.
         turns: float32 [view, period, 2], the phase of each period.
-        k, gain: [point], frequencies in turns a period, and the transfer function of linear interpolation there.
-        runs: [run, (view, first point, end)], the points of all views by tiles of the Fourier plane.
-        ends: [tile + 1], where the runs of each tile begin, and end.
-        plane: cells of the Fourier plane (rows, cols).
+        k, gain: [point], frequencies in cycles per period, and the transfer function of linear interpolation there.
+        runs: [run, (view, first point, end)], the points of all projections, ordered by tiles of the Fourier plane.
+        ends: [tile + 1], the first run of each tile; the last entry is the number of runs.
+        plane: number of cells of the Fourier plane (rows, cols).
         table: float32 [step, cell], the kernel.
-        down, across: float32 [y], [x], one over the kernel's transform.
+        down, across: float32 [y], [x], 1 / transform of the kernel.
     """
 
     fx: F64
@@ -206,7 +207,7 @@ def gridding(angles: F64, axis_cols: F64, cols: int, x: F64, y: F64, response: C
     """The plan of gridding for voxels at x and y (pixels, evenly spaced).
 
     Args:
-        response: of the filter that the views come from, [n // 2 + 1] for a transform of n samples.
+        response: transfer function [n // 2 + 1] of the filter of the projections, for a transform of n samples.
     """
     cosines, sines = np.cos(angles), np.sin(angles)
     step = x[1] - x[0] if x.size > 1 else y[1] - y[0] if y.size > 1 else 1.0
@@ -233,7 +234,7 @@ def gridding(angles: F64, axis_cols: F64, cols: int, x: F64, y: F64, response: C
 
 
 def _frequencies(n: int, response: Callable[[int], F32]) -> tuple[I32, F32]:
-    """Frequencies of linearly interpolated filtered views, in turns per n columns, and the gain there."""
+    """Frequencies of filtered, linearly interpolated projections in cycles per n columns, and the gain there."""
     k = np.arange(-_MOST * n, _MOST * n, dtype=np.int32)
     gain = np.sinc(k / n) ** 2
     within = np.mod(k, n)
@@ -243,23 +244,23 @@ def _frequencies(n: int, response: Callable[[int], F32]) -> tuple[I32, F32]:
 
 
 def _period(cosines: F64, sines: F64, axis_cols: F64, cols: int, x: F64, y: F64) -> int:
-    """Length in samples to which a view is padded, so that no voxel sees its next period."""
+    """Length in samples to which a projection is padded, so that no voxel sees its next period."""
     ends = np.array([(a, b) for a in (x[0], x[-1]) for b in (y[0], y[-1])])
     t = ends[:, 0] * cosines[:, None] + ends[:, 1] * sines[:, None] + axis_cols[:, None]
     return int(fft.next_fast_len(math.ceil(max(cols - t.min(), t.max(), cols)) + 2))
 
 
 def _cells(n: int) -> int:
-    """Cells of the Fourier plane for n voxels: whole tiles of four colours, and a fast FFT."""
+    """Number of cells of the Fourier plane for n voxels: whole tiles of four colours, and a length with a fast FFT."""
     return 2 * _TILE * int(fft.next_fast_len(math.ceil(_FINER * n / (2 * _TILE))))
 
 
-# Kaiser-Bessel, of the shape that Beatty, Nishimura & Pauly 2005 (IEEE Trans. Med. Imaging 24, 799, eq. 5) give.
+# Kaiser-Bessel kernel with the shape of Beatty, Nishimura & Pauly 2005 (IEEE Trans. Med. Imaging 24, 799, eq. 5).
 _SHAPE = math.pi * math.sqrt((_REACH / _FINER * (_FINER - 0.5)) ** 2 - 0.8)
 
 
 def _kernel_table() -> F32:
-    """Weights [step, cell] of the cells around a point, by its distance in steps from the cell left of it."""
+    """Weights [step, cell] of the cells around a point, for its distance in steps from the cell on its left."""
     beyond = (np.arange(_STEPS) + 0.5) / _STEPS
     distance = beyond[:, None] - np.arange(1 - _REACH // 2, _REACH // 2 + 1)
     return np.i0(_SHAPE * np.sqrt(np.maximum(1 - (2 * distance / _REACH) ** 2, 0))).astype(np.float32) / np.float32(
@@ -268,7 +269,7 @@ def _kernel_table() -> F32:
 
 
 def _deapodisation(n: int, cells: int) -> F32:
-    """[voxel]: 1 over the kernel's Fourier transform."""
+    """1 / Fourier transform of the kernel, [voxel]."""
     root = np.sqrt(_SHAPE**2 - (np.pi * _REACH * (np.arange(n) - n // 2) / cells) ** 2)
     return (root / (_REACH * np.sinh(root)) * np.i0(_SHAPE)).astype(np.float32)
 
@@ -295,14 +296,14 @@ def ray_by_ray(angles: F64, axis_cols: F64, x: F64, y: F64, columns: F32, out: F
 
 
 def compile_gridding() -> None:
-    """Grid an empty slice, so that its kernels are compiled."""
+    """Grid an empty slice, so that the kernels are compiled."""
     angles, x = np.arange(2.0), np.arange(4.0)
     plan = gridding(angles, np.full(2, 2.0), 4, x, x, lambda n: np.ones(n // 2 + 1, np.float32))
     by_gridding(plan, columns_of(2, 4), np.empty((1, 4, 4), np.float32))
 
 
 def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]) -> bool:
-    """Whether gridding takes less time than going ray by ray, by measured times."""
+    """Whether gridding is faster than ray by ray, according to measured times."""
     rays, gridded = nanoseconds(views, cols, voxels, slices, response)
     return rays > gridded
 
@@ -319,5 +320,5 @@ def nanoseconds(
 
 
 def columns_of(views: int, cols: int) -> F32:
-    """Zeros [view, 1 + col + 1, 16], with each edge twice, for filtered views, aligned to cache lines."""
+    """Zeros [view, 1 + col + 1, 16] for filtered projections (edge columns stored twice), aligned to cache lines."""
     return _line_of_lanes.py_func(views * (cols + 2)).reshape(views, cols + 2, SLICES)

@@ -1,8 +1,9 @@
-"""Beyond the field: how far a sample reaches that is wider than the field, and its volume in a box that holds it all.
+"""Samples wider than the field of view: measures how far they reach, and reconstructs a box that contains all of them.
 
-Each view also sums the matter beside the field. A box of the field alone would push that matter into its rim, and make
-the middle too dense. So the views are explained by voxels, or Gaussians, as far as the sample reaches, and the field's
-part is given back. How far it reaches is the radius whose volume predicts views held out best (docs/reconstruction.md).
+Each projection also contains material outside the field of view. A box of the field alone would put this material at
+its rim and make the middle too dense. So voxels or Gaussians cover the whole sample, and only the part in the field of
+view is returned. The extent of the sample is the radius whose volume predicts held-out projections best
+(docs/reconstruction.md).
 """
 
 from __future__ import annotations
@@ -37,22 +38,23 @@ from recon.voxels.methods import EarlyTv
 from recon.voxels.projector import Projector
 from recon.voxels.residuals import residuals_of
 
-_COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
-_LOOKS = 8  # views by which rows are chosen
-_STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
+# test reconstruction: columns and rows after binning, projections, iterations
+_COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16
+_LOOKS = 8  # number of projections from which rows are chosen
+# ratios between radii in the first and in the second search; largest radius / field of view
+_STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5
 
 
 def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
-    """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
+    """Run a method in a box that contains all of the sample, and return the part on the grid of the problem.
 
-    The box is as wide as the sample. Where a sample goes on above or below the field of a cone, it is as tall as the
-    rays: voxels of a thorax of 48 rows, cut from 128, have 38.7 dB in place of 14.4.
-
-    A sample within the field, a direct method, which continues the views, and methods that make several volumes run as
-    they are.
+    The box is as wide as the sample. If a sample continues above or below the field of view of a cone, the box is as
+    tall as the rays. Without this, 48 rows of a thorax, cut from 128, have 14.4 dB instead of 38.7 dB. The method runs
+    without such a box if the sample is within the field of view, if it is a direct method (which extrapolates the
+    projections), or if it makes several volumes.
 
     Raises:
-        ValueError: as `Method.run`.
+        ValueError: as for `Method.run`.
     """
     decide = control.decide or Decisions(problem.seed)
     if not method.knows_outside:
@@ -79,7 +81,7 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
 
 @dataclass(frozen=True, eq=False)
 class _Outside:
-    """`Reconstruction.outside`: the matter of a box beyond its field; a value, which another process can be sent."""
+    """`Reconstruction.outside`: the material of a box outside the field of view; can be sent to another process."""
 
     whole: F32
     box: Grid
@@ -92,16 +94,17 @@ class _Outside:
 
 
 def sample_radius(views: Views, given: float | SampleRadius | None = None) -> SampleRadius | None:
-    """How far the sample reaches; None: not beyond the field. Of fewer than 16 views the end that FBP takes.
+    """How far the sample reaches; None: it is within the field of view. Below 16 projections, the end assumed by FBP.
 
-    FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
-    and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
-    leaves more unknown than the views tell. Of radii that predict alike the least is taken, or rather the next step up:
-    the search errs to the short side, and where it is right, densities change by 2 %.
+    FISTA-TV with a small weight reconstructs some binned rows from seven of every eight projections, in wider and wider
+    boxes. Each box is judged by the held-out projections. If a box is too small, the outside material ends up in wrong
+    places. If it is too wide, it has more unknowns than the projections determine. If several radii predict equally
+    well, the result is one step above the smallest of them, because the search tends to be too short. If the smallest
+    one was right, this step changes densities by 2 %.
 
     Args:
-        views: only some rows of some views are read; rays of weight 0 do not count.
-        given: mm, the radius where that is known.
+        views: only some rows of some projections are read; rays of weight 0 do not count.
+        given: the radius in mm if it is known.
     """
     geometry = views.geometry
     own, reach = geometry.is_centred, geometry.reach
@@ -121,20 +124,21 @@ def sample_radius(views: Views, given: float | SampleRadius | None = None) -> Sa
 
 
 def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None) -> float:
-    """The square error, 1/mm², in the middle of the field, from not knowing the density beside it.
+    """The square error, in 1/mm², in the middle of the field of view, because the density outside it is unknown.
 
-    It is of a volume in a box as wide as the sample, by the uncertainty of its density. Of cans of packed balls, 1.5, 2
-    and 3 times as wide as the field, 90 views give 6 to 20, 1 and 2 times the true one; 30 views a tenth of it.
+    It is computed from the uncertainty of the density in a box as wide as the sample. For cans of packed balls that are
+    1.5, 2 and 3 times as wide as the field of view, 90 projections give 6 to 20, 1 and 2 times the true value; 30
+    projections give a tenth of it.
 
     Args:
-        geometry: of the views.
-        sample: as of `sample_radius`; None: it is within the field.
+        geometry: the geometry of the projections.
+        sample: result of `sample_radius`; None: the sample is within the field of view.
     """
     return 0.0 if sample is None else (sample.density * _middle_density(volume, geometry.reach)) ** 2
 
 
 def _middle_density(volume: Volume, reach: float) -> float:
-    """1/mm, mean over the middle half of the field."""
+    """Mean density in 1/mm over the middle half of the field of view."""
     y, x = np.meshgrid(*volume.grid.coordinates()[1:], indexing="ij")
     return float(volume.data[:, np.hypot(y, x) < reach / 2].mean())
 
@@ -143,12 +147,14 @@ def _given_radius(given: float | SampleRadius, reach: float) -> SampleRadius | N
     if isinstance(given, SampleRadius):
         return given
     if not 0 <= given < math.inf:
-        raise ValueError(f"sample_radius must be a finite length, 0 for a sample within the field, got {given}")
+        raise ValueError(
+            f"sample_radius must be a finite length in mm (0: the sample is within the field of view), got {given}"
+        )
     return SampleRadius(given, given, given, 0.0) if given > reach else None
 
 
 def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
-    """The radius whose volume predicts views held out best; `reach`: of the whole detector."""
+    """The radius whose volume predicts the held-out projections best; `reach`: half width of the whole detector."""
     trial = _Trial.of(views, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
 
@@ -160,7 +166,7 @@ def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
 
     first = best(_STEP**k for k in range(1 + math.floor(math.log(_WIDEST, _STEP))))
     least = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
-    if least < _STEP:  # coarse voxels blur where the field ends
+    if least < _STEP:  # coarse voxels blur the edge of the field of view
         trial = _Trial.of(views, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
@@ -181,7 +187,7 @@ def _factor(geometry: Geometry, columns: int) -> int:
 
 
 def _some_rows(whole: Views, some: NDArray[np.intp]) -> Views | None:
-    """The measured ones of these views, in the rows with most matter, of a cone in those in its middle; None: none."""
+    """The measured projections, in the rows with the most material (cone: the middle rows); None: there are none."""
     geometry = whole.geometry.select(some)
     look = np.nan_to_num(whole.data[some[:: max(1, len(some) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0)
     height = _ROWS * _factor(geometry, _COLS)
@@ -203,11 +209,11 @@ def _some_rows(whole: Views, some: NDArray[np.intp]) -> Views | None:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Some binned rows of the views, of which one in eight judges.
+    """Some binned rows of the projections; one projection in eight is held out to judge.
 
     Attributes:
-        seen, unseen: views to reconstruct from, and those held out.
-        box: of the field.
+        seen, unseen: the projections to reconstruct from, and the held-out ones.
+        box: the box of the field of view.
     """
 
     seen: Views
@@ -224,7 +230,7 @@ class _Trial:
         return cls(*binned.split(), box)
 
     def of_radius(self, radius: float) -> tuple[F64, float]:
-        """Residual [view held out] of a box that reaches so far, and the mean density in the middle of the field."""
+        """Residual [held-out view] of a box with this radius, and the mean density in the middle of the field."""
         grid = self.box.reaching(radius, self.seen.geometry)
         method = EarlyTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
         volume = method.run(ReconProblem(self.seen, grid), RunControl()).volume

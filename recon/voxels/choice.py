@@ -1,7 +1,8 @@
-"""Choice: which of some candidates predicts views held out, and the strength of a prior that predicts them best.
+"""Choice: which candidate predicts held-out projections best, and which strength of a prior does.
 
-Candidates are compared view by view, since views differ more than candidates do: the simplest is taken that the best
-does not beat by more than one standard error. Of strengths the one of the least mean residual is taken.
+Candidates are compared projection by projection, because projections differ more than candidates do. The choice is the
+simplest candidate that the best one does not beat by more than one standard error. For strengths, the choice is the one
+with the smallest mean residual.
 """
 
 from __future__ import annotations
@@ -17,48 +18,55 @@ from recon.base.arrays import F64
 from recon.base.decisions import Prior
 
 LEAST_GAIN = 0.02
-"""Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
-time."""
+"""Share by which a costlier candidate must lower the residual.
 
-_MEASURE = "root mean square residual in held-out projections, as line integrals"  # by which a choice is explained
-_ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
-_OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
+(A fit of a tooth lowers it by 1.3 %, in four times the time.)
+"""
+
+# the measure in the explanation of a choice
+_MEASURE = "root mean square residual in held-out projections, as line integrals"
+_ERRORS = 1.0  # standard errors of the difference up to which two candidates count as equally good
+_OCTAVES = 10  # most octaves from the first strength: cones with coarse voxels need 6 to 9, and 40 change nothing
 TRIALS = 4
-"""Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
+"""Usual number of tests to choose a strength (3 to 6 on five scans).
+
+Some use fewer columns, see `columns_of_matter`.
+"""
 MOST_TRIALS = (2 + _OCTAVES) / TRIALS
-"""The most sweeps of trials, over those as a rule."""
+"""Largest number of iterations of all tests, divided by the usual number."""
 
 
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
-    """Whether the mean gain [view held out] exceeds `errors` of its standard errors. False: a gain is not finite, as a
-    candidate was ended, or diverged."""
+    """Whether the mean gain [held-out view] exceeds `errors` of its standard errors.
+
+    False if a gain is not finite, because a candidate was stopped or diverged."""
     return bool(np.isfinite(gains).all()) and float(gains.mean()) > errors * _standard_error(gains)
 
 
 def _standard_error(gains: F64) -> float:
-    """Of the mean gain [view held out]; 0 of one view."""
+    """Standard error of the mean gain [held-out view]; 0 for a single projection."""
     return float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
 
 
 def predicts_as_well(residuals: F64, best: F64) -> bool:
-    """Whether residuals [view held out] exceed those of the best by no more than chance."""
+    """Whether residuals [held-out view] exceed those of the best candidate by no more than chance."""
     return not exceeds_standard_error(residuals - best, _ERRORS)
 
 
 def significantly_better(residuals: F64, other: F64, least_gain: float) -> bool:
-    """Whether residuals [view held out] are below another candidate's, beyond chance and by the share `least_gain`."""
+    """Whether residuals [held-out view] are lower than others by the share `least_gain` and by more than chance."""
     by_more = float(residuals.mean()) < (1 - least_gain) * float(other.mean())
     return by_more and exceeds_standard_error(other - residuals, _ERRORS)
 
 
 class Prediction(NamedTuple):
-    """What the volume of a candidate leaves of the views held out.
+    """The residuals of a candidate's volume in the held-out projections.
 
     Attributes:
-        name: of the candidate.
-        residuals: [view held out] root mean square, in line integrals; None: it was not tried.
-        prior: that its volume had, and has again of all views; None: it has none, or it is chosen anew.
-        remark: why it was not tried, or not to its end; may be empty.
+        name: name of the candidate.
+        residuals: [held-out view] root mean square, as line integrals; None: the candidate was not tried.
+        prior: the prior of its volume, also for the volume from all projections; None: it has none, or chooses again.
+        remark: why it was not tried, or was stopped early; may be empty.
     """
 
     name: str
@@ -68,12 +76,12 @@ class Prediction(NamedTuple):
 
 
 class TrialChoice(NamedTuple):
-    """Which candidate predicts views held out, of those tried so far.
+    """Which of the candidates tried so far predicts held-out projections best.
 
     Attributes:
-        where: the part of the scan that was tried; where no candidate was, the reason.
+        where: the part of the scan that was used; if no candidate was tried, the reason.
         least_gain: see `LEAST_GAIN`.
-        predictions: of the candidates, the simplest first.
+        predictions: predictions of the candidates, the simplest first.
     """
 
     where: str
@@ -82,52 +90,54 @@ class TrialChoice(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> TrialChoice:
-        """A choice, or its values from a file, as `Decisions` keeps it."""
+        """A choice, or its values from a file (see `Decisions`)."""
         where, least_gain, predictions = values
         named = ((name, left, prior and Prior.of(prior), remark) for name, left, prior, remark in predictions)
         return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> TrialChoice:
-        """The choice with one candidate more."""
+        """The choice with one more candidate."""
         return self._replace(predictions=(*self.predictions, prediction))
 
     @property
     def tried(self) -> dict[int, F64]:
-        """Residuals [view held out] of the candidates that were tried, by number.
+        """Residuals [held-out view] of the candidates that were tried, by number.
 
-        One with a residual that is not finite was ended, or diverged, and counts as not tried.
+        A candidate whose residual is not finite was stopped or diverged, and counts as not tried.
         """
         given = {at: each.residuals for at, each in enumerate(self.predictions) if each.residuals is not None}
         return {at: np.asarray(left) for at, left in given.items() if np.isfinite(left).all()}
 
     @property
     def best(self) -> int | None:
-        """Number of the candidate of least mean residual; None: none was tried."""
+        """Number of the candidate with the smallest mean residual; None: no candidate was tried."""
         tried = self.tried
         return min(tried, key=lambda at: float(tried[at].mean()), default=None)
 
     @property
     def least(self) -> F64 | None:
-        """The residuals of the least mean; None: none was tried."""
+        """The residuals of the best candidate; None: no candidate was tried."""
         return None if self.best is None else self.tried[self.best]
 
     @property
     def few_materials(self) -> bool:
-        """Whether few materials predict views held out better than total variation: costlier candidates, which know of
-        no levels, are then not tried, to save the time."""
+        """Whether discrete levels predict held-out projections better than total variation.
+
+        If so, costlier candidates are not tried, to save time, because they do not use levels."""
         return any(each.prior and each.prior.materials and each.prior.materials.levels for each in self.predictions)
 
     @property
     def at(self) -> int | None:
-        """Number of the first candidate, and so the simplest, that the best does not beat; None: none was tried."""
+        """Number of the simplest candidate that the best one does not beat significantly; None: none was tried."""
         if (least := self.least) is None:
             return None
         return next(at for at, each in self.tried.items() if not significantly_better(least, each, self.least_gain))
 
     @property
     def verdicts(self) -> list[str]:
-        """[candidate] "best"; "alike", which predicts as well but for chance; or empty. All are empty where the best
-        lowers the residual of no other one by `least_gain`."""
+        """For each candidate "best", or "alike" if it predicts equally well within chance, or "".
+
+        All are empty if the best candidate does not lower any other residual by `least_gain`."""
         tried, least, words = self.tried, self.least, [""] * len(self.predictions)
         if least is None or all((1 - self.least_gain) * each.mean() <= least.mean() for each in tried.values()):
             return words
@@ -137,13 +147,14 @@ class TrialChoice(NamedTuple):
 
     @property
     def prior(self) -> Prior | None:
-        """The prior of the candidate chosen."""
+        """The prior of the chosen candidate."""
         return None if self.at is None else self.predictions[self.at].prior
 
     @property
     def reason(self) -> str:
-        """Where it was tried, with all residuals (of weighed rays; the data residual is a share of the views), remarks,
-        and why a simpler candidate than the best is taken."""
+        """The part of the scan, all residuals, the remarks, and why a simpler candidate than the best was chosen.
+
+        These residuals are of weighted rays; the data residual elsewhere is a share of the projections."""
         if self.at is None:
             return self.where
         given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
@@ -153,7 +164,7 @@ class TrialChoice(NamedTuple):
 
     @property
     def _of_the_best(self) -> str:
-        """By how much the best is better than a simpler one that is taken; empty where the best is taken."""
+        """By how much the best candidate is better than the simpler chosen one; empty if the best one was chosen."""
         if self.at is None or self.best is None or self.at == self.best:
             return ""
         (simple, of_simple), (best, of_best) = (
@@ -174,23 +185,23 @@ class TrialChoice(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BestStrength:
-    """The best strength of a prior by held-out views, and the least residual [view] in its search."""
+    """The strength of a prior that predicts held-out projections best, and its residuals [view]."""
 
     strength: float
     residuals: F64
 
 
 def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> BestStrength | None:
-    """The strength of a prior whose residual is least, searched in octaves from `first`.
+    """The strength of a prior with the smallest residual, searched in octaves from `first`.
 
-    No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
-    standard error of the least is an octave or two above it: a teapot refined from a fit loses 1.1 dB by one.) The
-    search goes to stronger priors as long as they predict no worse beyond chance, else to weaker ones, as long as these
-    predict better. The vertex of the parabola through the least and its neighbours is taken (whole octaves lose 0.5 dB
-    on fibres with texture).
+    No strength is simpler or cheaper than another one, so the standard error plays no role. (The strongest prior within
+    one standard error of the smallest residual is an octave or two higher: one octave costs a teapot refined from a fit
+    1.1 dB.) The search goes to stronger priors as long as they do not predict worse by more than chance, otherwise to
+    weaker ones as long as these predict better. The result is the vertex of the parabola through the best strength and
+    its neighbours. (With whole octaves, fibres with texture lose 0.5 dB.)
 
     Returns:
-        None: a residual is infinite, since the trials were ended.
+        None if a residual is infinite, because the tests were stopped.
     """
     tried: dict[int, F64] = {}
 

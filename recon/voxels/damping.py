@@ -1,15 +1,15 @@
-"""Damping: longer steps for fine detail, whose eigenvalues are small, than for coarse shapes, whose are large.
+"""Damping: steps that are longer for fine detail (small eigenvalues) than for coarse shapes (large eigenvalues).
 
-The eigenvalue of AᵀA of a wave of f cycles a side falls as 1 / f. A step that is safe for the coarsest shapes is short
-for fine detail, which then needs hundreds of sweeps. Here coarse shapes are damped: with L that keeps them and lets
-fine detail go, steps follow P g = gain (1 - L) g, up to `gain` times as long for fine detail.
+The eigenvalue of AᵀA for a wave of f cycles per side falls as 1 / f. A step that is safe for the coarsest shapes is
+short for fine detail, which then needs hundreds of iterations. So coarse shapes are damped. L is a low-pass filter, and
+the steps follow P g = gain (1 - L) g. They are up to `gain` times as long for fine detail.
 
     L(f) = 1 - clip(f / 2 cycles a side, 1, gain) / gain
 
-L acts on coarse cells of the slice plane (tents of `recon.kernels.cpu.tents`), so that it costs little beside a
-projection, and on each slice alone, so that slabs do not depend on each other. (Preconditioners for tomography: Fessler
-& Booth 1999, IEEE Trans. Image Process. 8, 688. Proximal steps in another metric: Combettes & Vũ 2014,
-Optimization 63, 1289.)
+L acts on coarse cells in the plane of a slice (tents of `recon.kernels.cpu.tents`), so that it costs little compared
+with a projection. It acts on each slice alone, so that slabs do not depend on each other. (Preconditioners for
+tomography: Fessler & Booth 1999, IEEE Trans. Image Process. 8, 688. Proximal steps in another metric: Combettes & Vũ
+2014, Optimization 63, 1289.)
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from recon.voxels.devices import VoxelDevice, projector_on, voxel_device
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import one_of_like_rows
 
-_CELLS = 64  # along the longer side, at most: what is finer is not damped
+_CELLS = 64  # most cells along the longer side; finer detail is not damped
 _UNDAMPED, _MOST = 2.0, 32.0  # cycles a side from which steps are longer; the largest gain
-_GAIN_A_VIEW = 2 / 3  # more detail than views resolve would only raise noise
-_LEAST_OF_TENTS = 0.2  # of a wave, that tents leave, below which it is not made up for
-_LANCZOS_STEPS, _MARGIN = 8, 1.1  # they err to the lower side
-_NOTHING = 1e-6  # rounding
+_GAIN_A_VIEW = 2 / 3  # longer steps for detail that the projections do not resolve would only add noise
+_LEAST_OF_TENTS = 0.2  # smallest share of a wave left by the tents that is still compensated
+_LANCZOS_STEPS, _MARGIN = 8, 1.1  # factor, because Lanczos' estimate is too low
+_NOTHING = 1e-6  # rounding error
 
 
 @dataclass(frozen=True)
 class Damping:
-    """L of volumes of one shape.
+    """The filter L for volumes of one shape.
 
     Attributes:
         shape: [y, x, z] of a volume.
-        gain: of the finest detail over the coarsest shapes; 1: L is zero.
+        gain: step of the finest detail, divided by that of the coarsest shapes; 1: L is zero.
     """
 
     shape: tuple[int, int, int]
@@ -50,17 +50,17 @@ class Damping:
 
     @classmethod
     def of(cls, shape: tuple[int, int, int], n_views: int) -> Damping:
-        """The damping for steps from so many views."""
+        """The damping for steps that use this number of projections."""
         return cls(shape, min(max(_GAIN_A_VIEW * n_views, 1.0), _MOST))
 
     @property
     def width(self) -> int:
-        """Voxels of a cell."""
+        """Width of a cell in voxels."""
         return least_width(max(self.shape[:2]), _CELLS)
 
     @cached_property
     def _transfer(self) -> F32:
-        """[a, b of rfft2] what L leaves of a wave in the sums of cells."""
+        """Transfer function [a, b of rfft2] of L in the sums of cells."""
         rows, cols = (cells_of(n, self.width) for n in self.shape[:2])
         down = np.fft.fftfreq(rows) * rows
         across = np.fft.rfftfreq(cols) * cols
@@ -72,7 +72,7 @@ class Damping:
         side = max(rows, cols)
         cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
         left = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
-        left = np.minimum(left / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L keeps less than all
+        left = np.minimum(left / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
         return (left / self.width**2).astype(np.float32)
 
     def cells(self, device: VoxelDevice[Any], x: Any) -> Any:
@@ -80,14 +80,14 @@ class Damping:
         return device.tent_sums(x, self.width)
 
     def take_off(self, device: VoxelDevice[Any], x: Any, cells: Any) -> None:
-        """x -= L of what has these `cells`, in place."""
+        """x -= L of the volume with these `cells`, in place."""
         device.add_tents(x, -1.0, device.filtered(cells, self._transfer), self.width)
 
 
 def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -> float:
-    """An upper estimate of the largest eigenvalue of gain (1 - L) AᵀWA: by Lanczos' steps, from noise.
+    """An upper estimate of the largest eigenvalue of gain (1 - L) AᵀWA, by Lanczos steps from noise.
 
-    It is that of the symmetric √W A gain (1 - L) Aᵀ √W. Where all rows are alike it is computed on one of them.
+    It is the eigenvalue of the symmetric √W A gain (1 - L) Aᵀ √W. If all rows are alike, it is computed on one of them.
     (Lanczos 1950, J. Res. Natl. Bur. Stand. 45, 255; from a random vector: Kuczyński & Woźniakowski 1992, SIAM J.
     Matrix Anal. Appl. 13, 1094.)
     """
@@ -116,11 +116,11 @@ def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -
         previous, q = q, image
         size = device.norm(q)
     if not diagonal or not (largest := float(eigh_tridiagonal(diagonal, off_diagonal[1:], eigvals_only=True)[-1])) > 0:
-        return math.inf  # no ray meets the box
+        return math.inf  # no ray crosses the box
     return _MARGIN * projector.gain(weight) * row_damping.gain * largest
 
 
 def _ray_shape(projector: Projector) -> tuple[int, int, int]:
-    """[view, col, row] of the lines of a projector."""
+    """Shape [view, col, row] of the lines of a projector."""
     views, rows, cols = projector.projection_shape
     return views, cols, rows

@@ -1,7 +1,7 @@
-"""Where a solver on voxels computes: the operations of its loops as one Protocol, by the CPU's kernels or on a GPU.
+"""The device on which a voxel method computes: the operations of its loops as one Protocol, for the CPU or a GPU.
 
-A loop takes its arrays to the device once, and back at its end. Between loops everything is numpy: choices and noise
-are made on the CPU.
+A loop moves its arrays to the device once, and back at its end. Between loops all arrays are numpy arrays: choices and
+noise are computed on the CPU.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class LineProjector(Protocol[Array]):
 
 
 class VoxelDevice(Protocol[Array]):
-    """Operations on volumes and projections, in place where one of their arrays is named as the result.
+    """Operations on volumes and projections, in place if one of the arrays is named as the result.
 
-    Those of `recon.kernels.cpu.vectors`, `tv` and `patches` mean the same here.
+    Operations with the names of those in `recon.kernels.cpu.vectors`, `tv` and `patches` do the same.
     """
 
     def array(self, values: F32) -> Array:
@@ -61,7 +61,7 @@ class VoxelDevice(Protocol[Array]):
     def add_tents(self, x: Array, factor: float, cells: Array, width: int) -> None: ...
 
     def filtered(self, cells: Array, transfer: F32) -> Array:
-        """Cells [a, b, z] after a filter [a, b of rfft2] along a and b."""
+        """Cells [a, b, z], filtered along a and b with this transfer function [a, b of rfft2]."""
 
     def dual_field(self, shape: tuple[int, int, int]) -> Any: ...
     def dual_scratch(self, shape: tuple[int, int, int]) -> Any: ...
@@ -120,10 +120,10 @@ CPU: VoxelDevice[Any] = CpuVolumes()
 
 
 def voxel_device(device: str) -> VoxelDevice[Any]:
-    """The operations on "cpu", or on "cuda", the current CUDA device.
+    """The operations on "cpu", or on "cuda" (the current CUDA device).
 
     Raises:
-        ImportError, RuntimeError, ValueError: as `recon.kernels.gpu.require`.
+        ImportError, RuntimeError, ValueError: as for `recon.kernels.gpu.require`.
     """
     refuse_unknown_device(device)
     if device == "cpu":
@@ -138,7 +138,7 @@ def projector_on(device: VoxelDevice[Array], projector: Projector) -> LineProjec
 
 
 class _GpuProjector:
-    """A projector on a GPU. Views that lean, or whose rows have different angles, are projected on the CPU."""
+    """A projector on a GPU. Tilted projections, and those with a skew, are projected on the CPU."""
 
     def __init__(self, projector: Projector, device: Any) -> None:
         self._projector, self._device, geometry = projector, device, projector.geometry
@@ -161,7 +161,7 @@ class _GpuProjector:
         return self._mean(self._joseph.adjoint, self._spread(projections), out)
 
     def _mean(self, project: Any, source: Any, out: Any) -> Any:
-        """The mean over the moments of an exposure."""
+        """The mean over the angles within an exposure."""
         first, *others = self._moments
         project(source, first, out)
         for rays in others:

@@ -1,4 +1,4 @@
-"""Fbp: the direct method, FBP for a parallel beam, FDK for a cone, and views in any pose along their own rays."""
+"""Fbp: the direct method: FBP for a parallel beam, FDK for a cone, and a version for rolled and tilted projections."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
 _f = np.float32
-_SAMPLES = 4  # samples of a projector that take as long as a voxel in a view
-_LOOKED_AT = 32  # views, whose mean tells how rows go on: more are not in memory
-SLAB_BYTES = 128 * 2**20  # filtered views held at a time
+_SAMPLES = 4  # samples of a projector that take as long as one voxel in one projection
+_LOOKED_AT = 32  # number of projections in the mean that shows how rows continue; limits the memory
+SLAB_BYTES = 128 * 2**20  # filtered projections in memory at a time
 
 
 @njit(**OPTIONS)
@@ -90,63 +90,67 @@ def fdk(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> NDArray[np.float32]:
-    """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
+    """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612); projections in any order.
 
-    Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
-    interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
-    both (see `fan_shares`). A short scan, of 180 degrees and the fan's angle or more, must see it in every view (see
-    `cone_weights`). Rows that end in matter go on as in `fbp`. A voxel that a view does not see gets nothing from it.
+    The result is exact in the plane of the source. Above and below, values fall off with the square of the cone angle,
+    and flat interfaces perpendicular to the axis blur. A 360° scan must see the whole width of the object on one side
+    of the axis or on both (see `fan_shares`). A short scan (180° plus the fan angle, or more) must see the whole width
+    in every projection (see `cone_weights`). Rows that end in material are extrapolated as in `fbp`. A projection that
+    does not see a voxel adds nothing to it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
-        geometry: a cone, straight (no roll, no tilt); views may be shifted.
-        grid: of the volume; None: `Grid.matching(geometry)`.
-        filter: as of `fbp`.
-        on_block: called with how many of how many layers are done, counted by their views.
+        geometry: a cone beam without roll and tilt; projections may be shifted.
+        grid: grid of the volume; None: `Grid.matching(geometry)`.
+        filter: as for `fbp`.
+        on_block: function called with the number of finished layers (times projections) and their total number.
 
     Returns:
         float32 [z, y, x], 1/mm.
 
     Raises:
-        ValueError: for a parallel beam, rolled or tilted views, too short a scan, an unknown filter. Also for a shape
-            that does not belong to the geometry, values that are not finite, or a box that reaches the source.
+        ValueError: the beam is parallel, projections are rolled or tilted, the scan is too short, the filter is
+            unknown, the shape does not match the geometry, values are not finite, or the box reaches the source.
     """
     grid = Grid.matching(geometry) if grid is None else grid
     if not geometry.is_cone:
-        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
+        raise ValueError("FDK needs a cone beam; for a parallel beam use fbp")
     if not geometry.is_straight:
-        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
+        raise ValueError("FDK needs projections without roll and tilt; use `direct` for rolled or tilted ones")
     prepare = partial(_prepared_views, filter=filter)
     return _by_slabs(projections, geometry, grid, filter, prepare, _along_columns, on_block)
 
 
 Prepare = Callable[[F32, Geometry, F64, tuple[int, int], F32 | None], tuple[Any, tuple[Any, ...]]]
-"""Some views, weighed and filtered, by their geometry, the weights of their rays, columns of zeros beside them and what
-lies beyond; and what a kernel takes of the views before the voxels."""
+"""Function that weights and filters some projections, from their geometry, the weights of their rays, the columns of
+zeros and the extrapolation; and the arguments of a kernel that come before the voxels."""
 
 
 def _by_slabs(
     projections: F32, geometry: Geometry, grid: Grid, filter: Filter, prepare: Prepare,
     kernel: Callable[..., None], on_block: Callable[[int, int], None], device: str = "cpu",
 ) -> F32:  # fmt: skip
-    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device.
+    """Back-project projections [view, row, col], some at a time, to a volume [z, y, x], with a kernel of the device.
 
     Raises:
-        ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
-            values that are not finite.
+        ValueError: the shape does not match the geometry, the projections move along the axis, the box reaches the
+            source, or values are not finite.
     """
     require_views(geometry, projections)
-    if geometry.climbs:  # each voxel would miss the views that do not see it
+    if geometry.climbs:  # each voxel would lack the projections that do not see it
         raise ValueError(
-            f"views climb by {np.ptp(geometry.shifts[:, 1]):.4g} of {geometry.detector_shape[0]} rows. Direct methods "
-            "have weights for that in straight views of a parallel beam only: use an iterative method (fista-tv, sirt)"
+            f"use an iterative method (fista-tv, sirt): the projections move by {np.ptp(geometry.shifts[:, 1]):.4g} "
+            f"of {geometry.detector_shape[0]} rows along the rotation axis. Direct methods support this only for a "
+            "parallel beam without roll and tilt"
         )
     if (reach := float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))) >= geometry.sod:
         raise ValueError(
-            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
+            f"use a smaller box: it reaches {reach:.4g} mm from the rotation axis, and the source is at "
+            f"{geometry.sod:.4g}"
         )
     weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
-    weights *= np.cos(geometry.tilt)[:, None]  # the part of Fourier space between two views shrinks by it
+    # the part of Fourier space between two projections shrinks by this factor
+    weights *= np.cos(geometry.tilt)[:, None]
     looked_at = spread(np.arange(geometry.n_views), _LOOKED_AT)
     mean = sum(projections[view] / np.float32(looked_at.size) for view in looked_at)
     beyond, weights = continuation(mean, geometry, weights, zeros, filter)
@@ -158,8 +162,9 @@ def _by_slabs(
         some = slice(start, start + slab)
         part = geometry.select(some)
         prepared, of_views = prepare(projections[some], part, weights[some], zeros, beyond)
-        if not math.isfinite(float(prepared.max()) - float(prepared.min())):  # of any device; the filter spreads both
-            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+        # the filter would spread NaN and infinite values; works on any device
+        if not math.isfinite(float(prepared.max()) - float(prepared.min())):
+            raise ValueError("projections contain NaN or infinite values; correct them before the reconstruction")
         samples = _SAMPLES * part.n_views * x.size * z.size
         for layers in calls(y.size, samples) if device == "cpu" else [range(y.size)]:
             lines = slice(layers.start, layers.stop)
@@ -171,13 +176,14 @@ def _by_slabs(
 def _prepared_views(
     views: F32, geometry: Geometry, weights: F64, zeros: tuple[int, int], beyond: F32 | None, filter: Filter
 ) -> tuple[F32, tuple[Any, ...]]:
-    """Views times the weights [view, 1 + col + 1] and the cosine of each ray, filtered, with columns beyond them.
-    Shape [view, col + 2, row + 2], the rim twice."""
+    """Filtered projections, after multiplication by the weights [view, 1 + col + 1] and the cosine of each ray.
+
+    The shape is [view, col + 2, row + 2], with the edge columns and rows stored twice."""
     rows, cols = geometry.detector_shape
     out = np.empty((geometry.n_views, sum(zeros) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):
         cosine = _cosine(geometry, view)
-        # The ramp is that of a detector at the rotation axis.
+        # The ramp filter is that of a detector at the rotation axis.
         weighed = np.pad((views[view] * (weights[view, 1:-1] * cosine)).astype(np.float32), ((0, 0), zeros))
         filtered = filter_projections(weighed, geometry.sample_pitch, filter)
         if beyond is not None:
@@ -189,7 +195,7 @@ def _prepared_views(
 
 
 def _cosine(geometry: Geometry, view: int) -> F64:
-    """Cosine [row, col] of the rays of a cone to its central one."""
+    """Cosine [row, col] of the angle between the rays of a cone and its central ray."""
     (rows, cols), (col0, row0) = geometry.detector_shape, geometry.origin(view)
     u, v = (np.arange(cols) - col0) * geometry.pixel_pitch, (np.arange(rows) - row0) * geometry.pixel_pitch
     return np.asarray(geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2))
@@ -201,7 +207,7 @@ def _along_rays(
 ) -> None:  # fmt: skip
     """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth.
 
-    sod = 0: a parallel beam, where the factor is 1.
+    sod = 0: a parallel beam; then the factor is 1.
     """
     views, cols, rows = filtered.shape
     for j in prange(y.size):
@@ -236,18 +242,18 @@ def posed_direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     device: str = "cpu",
 ) -> F32:
-    """Reconstruct views in any pose [view, row, col]; see `fbp` and `fdk` for arguments, result and errors.
+    """Reconstruct rolled and tilted projections [view, row, col]; arguments, result and errors as for `fbp` and `fdk`.
 
-    Two things differ from them. The ramp runs along the direction of the detector that is across the rotation axis,
-    which a rolled detector's rows are not. Each voxel takes the filtered views where its own ray meets the detector, so
-    no view is resampled. A tilted view weighs cos(tilt). What lies beyond an edge is smooth from row to row.
-
-    Weights of columns that are measured twice count rolled and tilted views as straight ones.
+    There are two differences. The ramp filter acts perpendicular to the rotation axis, which on a rolled detector is
+    not the direction of the rows. Each voxel reads the filtered projections where its own ray meets the detector, so
+    that no projection is resampled. A tilted projection has the weight cos(tilt). The extrapolation beyond an edge is
+    smooth from row to row. In the weights of columns that are measured twice, rolled and tilted projections count as
+    straight.
     """
     if geometry.centres.any():
         raise ValueError(
-            "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
-            "iterative method or r2"
+            "use an iterative method or r2, because filtered back-projection needs sources on a circle about the "
+            "axis, and the sources of these projections are not on a circle"
         )
     gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
 
@@ -275,13 +281,14 @@ def posed_direct(
 
 
 Response = tuple[int, tuple[int, int], F32]
-"""Of a filter in two dimensions: rows added on either side, the shape of the transform, and the gain [row or 1, col]"""
+"""A filter in two dimensions: rows added on either side, the shape of the transform, and the gain [row or 1, col]."""
 
 
-@lru_cache(1)  # most detectors are rolled by one angle
+@lru_cache(1)  # most scans have the same roll in all projections
 def _response(rows: int, width: int, roll: float, pitch: float, filter: Filter) -> Response:
-    """The ramp across the rotation axis, for views of this roll, with `rows` rows and `width` columns with zeros."""
-    beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
+    """The ramp filter perpendicular to the axis, for this roll, `rows` rows and `width` padded columns."""
+    # rows that the line of the ramp crosses; outside, the last rows are repeated
+    beyond = math.ceil(width * abs(math.sin(roll)))
     m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
     along = fft.fftfreq(m)[:, None] if roll else np.zeros((1, 1))
     across = np.abs(fft.rfftfreq(n) * math.cos(roll) - along * math.sin(roll))
@@ -292,7 +299,7 @@ def _response(rows: int, width: int, roll: float, pitch: float, filter: Filter) 
 def _prepared(
     image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], response: Response
 ) -> F32:  # fmt: skip
-    """A view [row, col], weighed and filtered across the rotation axis: [col, row], with columns of zeros beside it."""
+    """A projection [row, col], weighted, padded with zeros and filtered perpendicular to the axis: [col, row]."""
     rows, cols = geometry.detector_shape
     weighed = image * weights
     if geometry.is_cone:
@@ -308,7 +315,7 @@ class Fbp(Direct):
     """Filtered back-projection (FDK for a cone).
 
     Attributes:
-        filter: the smooth one, "hann", is best for few or noisy views.
+        filter: window of the ramp filter; the smooth "hann" is best for few or noisy projections.
     """
 
     name: ClassVar[str] = "fbp"
@@ -328,9 +335,9 @@ class Fbp(Direct):
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All but offset views. ValueError for a cone's views that FDK does not take."""
+        """All except laterally offset projections. ValueError for a cone beam that FDK cannot use."""
         if geometry.is_cone and missing_arc(geometry) > 0:
-            cone_weights(geometry)  # says how many degrees they lack
+            cone_weights(geometry)  # the error says how many degrees are missing
         return super().views_wanted(geometry)
 
     def toy(self) -> Self:
@@ -351,9 +358,10 @@ def direct(
     out: F32 | None = None,
     device: str = "cpu",
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
-    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Offset views have no
-    part."""
+    """FBP of a parallel beam or FDK of a cone [z, y, x], also for rolled and tilted projections.
+
+    See `fbp`, `fdk` and `posed_direct`. Only `fbp` uses `out`. Projections of a parallel beam without roll and tilt are
+    reconstructed on the CPU. Laterally offset projections are not used."""
     if not (own := geometry.is_centred).all():
         projections, geometry = projections[own], geometry.select(np.flatnonzero(own))
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
@@ -364,9 +372,10 @@ def direct(
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: a cone needs a circle of sources, or a short scan (`missing_arc`).
+    """Whether FBP or FDK can use these projections: a cone needs a circle of sources, or a short scan (`missing_arc`).
 
-    Views that climb along the axis have weights of their own in each slice, which only straight parallel ones have.
+    Projections that move along the axis need weights for each slice. These exist only for a parallel beam without roll
+    and tilt.
     """
     if geometry.centres.any():
         return False

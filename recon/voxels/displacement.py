@@ -1,10 +1,10 @@
-"""Displacement: the shift and turn of a sample that slipped on its stage, from the views before and after.
+"""Displacement: shift and rotation of a sample that slipped on its stage, from the projections before and after.
 
-Views of one part of the scan predict those of another if both see the sample from near directions. So a volume of
-the longest part is projected into the views of the others. A shift and a turn of the sample explain the differences.
-Then all views together, corrected, give the next volume (joint reconstruction and reprojection: Gürsoy et al. 2017,
-Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view). Where the optics change
-between parts, a shift of the image and its magnification are found, too.
+Projections of one part of the scan predict those of another part if both see the sample from similar directions. So a
+volume from the longest part is projected into the directions of the other parts. A shift and a rotation of the sample
+are fitted to the differences. Then all projections together, corrected, give the next volume (joint reconstruction and
+reprojection: Gürsoy et al. 2017, Sci. Rep. 7, 11818; here with one rigid displacement per part instead of one shift per
+projection). If the optics change between parts, a shift of the image and its magnification are found, too.
 """
 
 from __future__ import annotations
@@ -28,24 +28,25 @@ F32 = NDArray[np.float32]
 Parts = NDArray[np.integer]
 
 SWEEPS = 10
-SMOOTH = 8.0  # columns: residuals are relative to means of this width, since air and matter beyond the field are smooth
-NEAR = math.radians(5)  # radians from the longest part's views: farther views are hardly predicted
-TRIAL = 0.25  # pixels by which the sample is moved for derivatives
-FARTHEST = 4.0  # most pixels of a step
-RELAXED = 1.5  # factor on a step: the corrected views are in the volume, too, and make steps too small
+# columns; residuals are relative to means of this width, because effects of air and outside material are smooth
+SMOOTH = 8.0
+NEAR = math.radians(5)  # radians from a projection of the longest part; farther projections are hardly predicted
+TRIAL = 0.25  # pixels; step of the sample for numerical derivatives
+FARTHEST = 4.0  # largest step in pixels
+RELAXED = 1.5  # factor on a step, because the corrected projections are also in the volume, which makes steps too small
 _STEPS = 4  # steps of the first registration
-_MEASURED = 0.99  # of the weight that interpolation gives a pixel: less, and a neighbour was not measured
+_MEASURED = 0.99  # least weight of measured pixels in an interpolated one
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """How the sample was moved on its stage, first turned about the axis, then shifted; and how the optics changed.
+    """How the sample moved on its stage (first rotated about the axis, then shifted), and how the optics changed.
 
     Attributes:
         x, y, z: mm, in the sample's frame.
-        turn: radians, in the sense in which angles grow.
-        image: mm by which the image is shifted along the rows, in all views alike.
-        magnification: of the image about the axis and the middle of the rows, over that of the other views.
+        turn: radians, in the direction in which angles grow.
+        image: mm by which the image is shifted along the rows, the same in all projections.
+        magnification: magnification of the image about the axis and the middle row, relative to the other parts.
     """
 
     x: float = 0.0
@@ -58,14 +59,14 @@ class Displacement:
 
 @dataclass(frozen=True)
 class DisplacementFit:
-    """How well a volume predicts held-out views, see `judge`.
+    """How well a volume predicts held-out projections, see `judge`.
 
     Attributes:
-        alone: deviation of the longest part's views from a volume of that part.
-        together: deviation of the same views from a volume of all parts.
-        others: deviation of the views of each part from a volume of all parts.
-        longest: the longest part.
-        overall: mean deviation of all views from a volume of all parts.
+        alone: deviation of the projections of the longest part from a volume of this part.
+        together: deviation of the same projections from a volume of all parts.
+        others: deviation of the projections of each part from a volume of all parts.
+        longest: number of the longest part.
+        overall: mean deviation of all projections from a volume of all parts.
     """
 
     alone: float
@@ -76,19 +77,22 @@ class DisplacementFit:
 
 
 def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -> Geometry:
-    """The geometry of views of a sample that was moved in some parts of the scan; parallel beam.
+    """The geometry of the projections of a sample that moved in some parts of the scan; parallel beam.
 
-    A magnification is no part of it: `unmagnified` corrects the views.
+    The geometry does not contain the magnification: `unmagnified` corrects the projections for it.
 
     Args:
-        parts: [view] number of the part that each belongs to.
-        moves: of each part.
+        parts: [view] number of the part of each projection.
+        moves: the displacement of each part.
 
     Raises:
-        ValueError: for a cone, whose rays a shift of the sample turns.
+        ValueError: the beam is a cone, in which a shift of the sample changes more than the position of the image.
     """
     if geometry.is_cone:
-        raise ValueError("shifts cannot correct projections of a cone beam, because they differ by more than shifts")
+        raise ValueError(
+            "displacements can be corrected only in a parallel beam; in a cone beam a displaced sample changes more "
+            "than the position of its image"
+        )
     x, y, z, turn, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)
     across, down = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch
@@ -96,11 +100,11 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
 
 
 def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: int = 3) -> F32:
-    """Images [view, row, col] with the magnification `factor` removed; 0 outside the field.
+    """Images [view, row, col] with the magnification `factor` removed; 0 outside the field of view.
 
     Args:
-        centre: row and column that keep their place.
-        order: of the interpolation, 3 cubic, 1 linear.
+        centre: row and column of the fixed point.
+        order: order of the interpolation: 3 cubic, 1 linear.
     """
     if factor == 1:
         return images
@@ -111,7 +115,7 @@ def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: 
 
 
 def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
-    """Pixels [view, row, col] of `unmagnified` that are determined by measured pixels only."""
+    """Mask [view, row, col] of the pixels of `unmagnified` that come from measured pixels only."""
     return unmagnified(there.astype(np.float32), factor, centre, order=1) > _MEASURED
 
 
@@ -126,17 +130,17 @@ def displacements(
 ) -> list[Displacement]:
     """The displacement of each part relative to the longest one.
 
-    Precise to some 0.1 pixel if matter has edges. Motion by more than a tenth of the field, or with deformation, is
-    not found, see `judge`.
+    The precision is about 0.1 pixel if the material has edges. Motion by more than a tenth of the field of view, or
+    with deformation, is not found, see `judge`.
 
     Args:
         projections: [view, row, col], line integrals.
-        geometry: of a parallel beam.
-        parts: [view] number of the part that each belongs to, from 0.
-        known: [row, col] pixels that were measured.
+        geometry: geometry of a parallel beam.
+        parts: [view] number of the part of each projection, from 0.
+        known: [row, col] True for pixels that were measured.
         start: displacements from coarser pixels; None: begin with the longest part alone.
-        rounds: number of volumes of all views.
-        optics: find shift and magnification of the image, too; else they stay those of `start`.
+        rounds: number of volumes from all projections.
+        optics: True: also find the shift and the magnification of the image; False: keep those of `start`.
     """
     problem = _Problem(projections, geometry, parts, known, optics)
     moves = list(start) if start is not None else [Displacement()] * problem.count
@@ -161,9 +165,10 @@ def displacements(
 def judge(
     projections: F32, geometry: Geometry, parts: Parts, known: NDArray[np.bool_], moves: Sequence[Displacement]
 ) -> DisplacementFit:
-    """Deviations of held-out views, for volumes of the longest part and of all parts; arguments as for `displacements`.
+    """Deviations of held-out projections, for volumes of the longest part and of all parts.
 
-    If the displacement is right, the other parts improve the prediction of the longest part's views.
+    The arguments are those of `displacements`. If the displacement is right, the other parts improve the prediction of
+    the projections of the longest part.
     """
     problem = _Problem(projections, geometry, parts, known)
     views = np.arange(geometry.n_views)
@@ -192,7 +197,7 @@ def judge(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Views in parts; the volume is that of the longest part."""
+    """Projections in parts; the volume has the position of the longest part."""
 
     projections: F32
     geometry: Geometry
@@ -217,7 +222,7 @@ class _Problem:
         return Grid.matching(self.geometry)
 
     def corrected(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, Geometry, F32]:
-        """Some views corrected for these displacements, their geometry, and the weights of their rays."""
+        """Some projections corrected for these displacements, their geometry, and the weights of their rays."""
         geometry, parts = self.geometry.select(views), self.parts[views]
         data = self.projections[views]
         known = np.repeat(self.known[None], views.size, 0)
@@ -231,12 +236,12 @@ class _Problem:
 
     def volume(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> Volume:
         data, geometry, weight = self.corrected(moves, views)
-        # The weight follows the noise: views held out would judge a sample that still stands in two places.
+        # The weight follows the noise. Held-out projections would judge a sample that is still in two positions.
         method, projector = OsSirtTv(SWEEPS, still=0.0), Projector(geometry, self.grid)
         return solve(method, projector, data, weight=weight, watch=Watch(on_trial=lambda: True))
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
-        """Views minus projections of the volume, without smooth differences, and the weights of their rays."""
+        """Measured minus computed projections, without smooth differences, and the weights of the rays."""
         data, geometry, weight = self.corrected(moves, views)
         return _without_smooth(data - Projector(geometry, self.grid).forward(volume.data), weight), weight
 
@@ -244,7 +249,7 @@ class _Problem:
         self, volume: Volume, move: Displacement, views: NDArray[np.integer], weight: NDArray[np.float64],
         relaxation: float = 1.0,
     ) -> Displacement:  # fmt: skip
-        """The displacement of these views after a step of least squares (Gauss-Newton) towards the volume's views."""
+        """The displacement of these projections after one least-squares step (Gauss-Newton) towards the volume's."""
         geometry = self.geometry.select(views)
         pitch, all_one = geometry.pixel_pitch, np.zeros(views.size, np.int64)
         half = geometry.detector_shape[1] / 2  # columns
@@ -277,7 +282,7 @@ class _Problem:
 
 
 def _outwards(image: F32, geometry: Geometry) -> F32:
-    """Derivative of views [view, row, col] by a magnification about the axis and the middle of the rows."""
+    """Derivative of projections [view, row, col] with respect to a magnification about the axis and the middle row."""
     rows, cols = geometry.detector_shape
     across, down = np.arange(cols) - geometry.axis_col, np.arange(rows)[:, None] - geometry.axis_row
     along_rows = -across * np.gradient(image, axis=2)
@@ -285,13 +290,13 @@ def _outwards(image: F32, geometry: Geometry) -> F32:
 
 
 def _apart(geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.integer]) -> NDArray[np.float64]:
-    """[view] radians from each view to the nearest of the others, views half a turn apart counting as the same."""
+    """Radians [view] from each projection to the nearest one of the others. Those 180° apart count as the same."""
     away = np.abs(np.subtract.outer(geometry.angles[views], geometry.angles[others])) % geometry.period
     return np.asarray(np.minimum(away, geometry.period - away).min(axis=1))
 
 
 def _without_smooth(images: F32, weight: F32) -> F32:
-    """Differences from the surroundings along the row, on rays that have weight."""
+    """Differences from the surroundings along the row, for rays with a weight above 0."""
     seen = images * weight
     smooth = gaussian_filter1d(seen, SMOOTH, axis=2) / np.maximum(gaussian_filter1d(weight, SMOOTH, axis=2), 1e-3)
     return np.asarray((seen - smooth * weight), np.float32)

@@ -1,8 +1,8 @@
 """Filtered back-projection for parallel beam: the fast baseline, in 1/mm.
 
-f(x, y) = ∫₀^π q_θ(x cos θ + y sin θ) dθ, where q_θ is a view convolved with the band-limited ramp
-(Kak & Slaney 1988, eq. 3.61 and 3.69). Rows are independent, so the work runs in blocks of sixteen slices, counted from
-the volume's first. Blocks computed one by one equal those of the whole volume to the bit.
+f(x, y) = ∫₀^π q_θ(x cos θ + y sin θ) dθ, where q_θ is a projection convolved with the band-limited ramp (Kak & Slaney
+1988, eq. 3.61 and 3.69). Rows are independent, so the computation runs in blocks of sixteen slices, counted from the
+first slice of the volume. Blocks that are computed one by one are bit-identical to those of the whole volume.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding,
 from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, sample_reach
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
-_VIEWS = 32  # filtered at a time
+_VIEWS = 32  # projections filtered at a time
 _FEW = 5  # columns
 
 
 def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
-    """Transfer function [n // 2 + 1] of the ramp for a transform of n samples, 1/mm."""
-    # The kernel is sampled in space and transformed: sampling |ω| instead would lose the mean value of the volume.
+    """Transfer function [n // 2 + 1] of the ramp filter for a transform of n samples, 1/mm."""
+    # The kernel is sampled in space and then transformed. Sampling |ω| would lose the mean value of the volume.
     k = np.minimum(np.arange(n), n - np.arange(n))
     kernel = np.zeros(n)
     kernel[0] = 1 / 4
     odd = k % 2 == 1
     kernel[odd] = -1 / (np.pi * k[odd]) ** 2
     response = fft.rfft(kernel).real / pixel_pitch
-    f = np.arange(response.size) / n  # cycles a sample; Nyquist is 1/2
+    f = np.arange(response.size) / n  # cycles per sample; Nyquist is 1/2
     if filter == "shepp-logan":
         response *= np.sinc(f)
     elif filter == "hann":
@@ -56,13 +56,13 @@ def filter_projections(
 
     Args:
         projections: float32 [..., col], line integrals.
-        filter: the window on the ramp, 1 at zero frequency: none (ram-lak), sinc (shepp-logan), raised cosine (hann).
+        filter: window of the ramp, 1 at zero frequency: no window (ram-lak), sinc (shepp-logan), raised cosine (hann).
 
     Returns:
         float32 of the same shape, 1/mm for dimensionless line integrals.
 
     Raises:
-        ValueError: for an unknown filter.
+        ValueError: the filter is unknown.
     """
     _known(filter)
     cols = projections.shape[-1]
@@ -80,16 +80,16 @@ def _known(filter: str) -> None:
 def continuation(
     mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter
 ) -> tuple[F32 | None, NDArray[Any]]:
-    """What filtering adds inside where rows go on beyond an edge as an ellipse does, for a level of 1 at the edge.
+    """What filtering adds inside the field if rows are extrapolated as an ellipse, for a level of 1 at the edge.
 
-    A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
-    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells. The ellipse ends at
-    the `sample_reach` of the mean of the views [row, col].
+    A row that ends in material makes a bright rim and too low values in the middle, because the filter treats
+    everything outside as air (Lewitt 1979, Med. Phys. 6, 412). The extrapolation corrects this. It does not replace a
+    wider field of view. The ellipse ends at the `sample_reach` of the mean projection [row, col].
 
     Returns:
-        float32 [row, side, col], zeros counted, 0 for rows that end in air; None if all do. And the weights
-        [view, 1 + col + 1] of `ray_weights`. If a row goes on, and one edge lies a few columns farther out, too few for
-        shares to change over, all are those at the axis.
+        float32 [row, side, col] including the columns of zeros, 0 for rows that end in air; None if all rows end in
+        air. Also the weights [view, 1 + col + 1] of `ray_weights`. If a row is extrapolated and one edge is only a few
+        columns farther out, which is too short for a transition of the shares, all columns have the share at the axis.
     """
     cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
     edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
@@ -114,8 +114,9 @@ def continuation(
 
 
 def continued(beyond: F32, views: F32, weights: NDArray[np.floating]) -> F32:
-    """What is added to filtered views, [..., row, col] with zeros: `continuation` times the edges of the views and
-    their weights."""
+    """The part to add to filtered projections [..., row, col] with columns of zeros, from `continuation`.
+
+    It is the `continuation` times the edge values of the projections and their weights."""
     levels = (edge_levels(views) * weights[..., None, (0, -1)]).astype(np.float32)
     return levels[..., :1] * beyond[:, 0] + levels[..., 1:] * beyond[:, 1]
 
@@ -127,11 +128,11 @@ class FbpPlan:
     Attributes:
         geometry, grid, filter: as given.
         share: float32 [view, 1, 1 + col + 1], quadrature weight of each ray, see `ray_weights`.
-        column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
-            holds for all slices.
-        zeros: columns of zeros to add before and after these.
-        rows: [z], detector rows at which an unshifted view sees the slices.
-        back_project: (columns [view, 1 + col + 1, 16], out [z, y, x]).
+        column_shares: shares of the columns if not all projections see all slices, so that weights differ from slice to
+            slice; None: `share` is valid for all slices.
+        zeros: number of columns of zeros to add before and after the columns.
+        rows: [z], detector rows at which an unshifted projection sees the slices.
+        back_project: function (columns [view, 1 + col + 1, 16], out [z, y, x]).
     """
 
     geometry: Geometry
@@ -149,7 +150,7 @@ class FbpPlan:
         return [slice(first, min(first + SLICES, self.rows.size)) for first in range(0, self.rows.size, SLICES)]
 
     def rows_of(self, part: slice) -> tuple[int, int]:
-        """First and end of the detector rows that show these slices in any view; one row at least."""
+        """The detector rows that show these slices in any projection, as (first, after the last); at least one row."""
         rows, shifts = self.rows[part], self.geometry.shifts[:, 1]
         last = self.geometry.detector_shape[0] - 1
         low = np.clip(math.floor(rows.min() + shifts.min()), 0, last)
@@ -157,16 +158,16 @@ class FbpPlan:
 
 
 def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
-    """The part of `fbp` that does not depend on the data; with a skew all rows are at the angle of the middle one.
+    """The part of `fbp` that does not depend on the data. With a skew, all rows have the angle of the middle row.
 
     Raises:
-        ValueError: as `fbp`, for the filter and the geometry.
+        ValueError: as for `fbp`, about the filter and the geometry.
     """
     _known(filter)
     if geometry.is_cone:
-        raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
+        raise ValueError("FBP needs a parallel beam; for a cone beam use fdk")
     if not geometry.is_straight:
-        raise ValueError("FBP takes straight views only; these are rolled or tilted: `direct` takes them")
+        raise ValueError("FBP needs projections without roll and tilt; use `direct` for rolled or tilted ones")
     geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
@@ -183,13 +184,13 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
 
 
 def fbp_memory(views: int, cols: int) -> int:
-    """Approximate bytes that FBP of slices [cols, cols] takes beside projections and volume: a plan and one block."""
+    """Approximate memory in bytes of the plan and a block for slices [cols, cols], without projections and volume."""
     samples, cells = round(1.4 * cols), (round(1.25 * cols) + 64) ** 2
     return 64 * views * (cols + 2 * samples) + 16 * views * samples + 64 * cells + 4 * 32 * 16 * 8 * cols
 
 
 def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:
-    """Whether FBP of these views grids the slices; never of a cone, or of rolled or tilted views."""
+    """Whether FBP of these projections uses gridding; False for a cone and for rolled or tilted projections."""
     if geometry.is_cone or not geometry.is_straight:
         return False
     response = partial(ramp, pixel_pitch=1.0, filter=filter)
@@ -202,7 +203,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
 
     Args:
         projections: float32 [view, row, col]: the detector rows `plan.rows_of(part)`, or more.
-        first: number of the first of these rows.
+        first: number of the first of the given rows.
         part: one of `plan.blocks`.
         out: float32 [z, y, x], the slices.
 
@@ -227,7 +228,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
             added = continued(beyond, projections[views, own], weights[views])
             filtered += _slab(added, geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
         if not np.isfinite(filtered).all():
-            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+            raise ValueError("projections contain NaN or infinite values; correct them before the reconstruction")
         columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)
     columns[:, 0], columns[:, -1] = columns[:, 1], columns[:, -2]
     plan.back_project(columns, out)
@@ -243,7 +244,7 @@ def _shares_of(plan: FbpPlan, rows: F64, shares: F64) -> F32:
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
-    """Views at fractional rows, linearly; rows off the detector are zero. They hold its rows from `first` on."""
+    """Projections at fractional rows, interpolated linearly; 0 outside the detector. The data begin at row `first`."""
     inside = (rows >= -0.5) & (rows <= height - 0.5)
     clamped = np.clip(rows, 0, height - 1)
     lower = np.floor(clamped).astype(np.intp)
@@ -256,7 +257,7 @@ def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
 
 
 def _slab(projections: F32, shifts: F64, rows: F64, first: int, height: int) -> F32:
-    """Views at the detector rows that show the same heights; each view has its own shift."""
+    """Projections at the detector rows that show the same heights; each projection has its own shift."""
     if not shifts.any():
         return _rows_at(projections, rows, first, height)
     moved = zip(projections, shifts, strict=True)
@@ -271,27 +272,28 @@ def fbp(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
 ) -> F32:
-    """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
+    """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3); projections in any order.
 
-    Voxels take the filtered views by linear interpolation at their centres, many of them by gridding. This is within
-    1e-3 of the peak (see `recon.voxels.back_project`): for voxels larger than a pixel bin the projections first. A
-    voxel that a view does not see gets nothing from that view, unless its opposite does; a slice that some views do not
-    see, since views are shifted along the axis, is that of the others. A full turn with the axis off
-    the middle of the detector, or beside it, covers the field out to the far columns.
+    The filtered projections are interpolated linearly at the centres of the voxels; many projections are gridded
+    instead. The two agree within 1e-3 of the peak (see `recon.voxels.back_project`). For voxels larger than a pixel,
+    bin the projections first. A projection that does not see a voxel adds nothing to it, unless its opposite projection
+    sees it. If projections are shifted along the axis, a slice is reconstructed from the projections that see it. A
+    360° scan with the axis off the middle of the detector, or outside it, covers the field of view out to the far
+    columns.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
-        grid: of the volume; None: one voxel a pixel, `Grid.matching(geometry)`.
+        grid: grid of the volume; None: one voxel per pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
-        on_block: called after each block of slices with how many of how many slices are there.
+        on_block: function called after each block with the number of finished slices and their total number.
         out: float32 [z, y, x] to write to; None: a new one.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
 
     Raises:
-        ValueError: the shape does not fit the geometry, values are not finite, the filter is unknown, or the geometry
-        is a cone, rolled or tilted.
+        ValueError: the shape does not match the geometry, values are not finite, the filter is unknown, or the beam is
+            a cone, rolled or tilted.
     """
     require_views(geometry, projections)
     grid = Grid.matching(geometry) if grid is None else grid

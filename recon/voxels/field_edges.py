@@ -1,4 +1,4 @@
-"""Field edges: whether a sample goes on beyond the edges of the field, which every reader of the views asks here."""
+"""Field edges: whether a sample continues beyond the edges of the field of view; the only place that decides this."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from recon.base.volume import Grid
 from recon.voxels.view_weights import covers_the_circle
 
 LEAST = 0.1
-"""Line integral at an edge above which matter is there: more than phase fringes, scatter and a drift of air leave."""
+"""Line integral at an edge above which there is material; phase fringes, scatter and a drift of air are lower."""
 
-_VIEWS, _ROWS, _PARTS = 32, 128, 4  # looked at, about; parts of the views
-_FEWEST = 2  # of the views looked at, in which matter goes out of the field
+_VIEWS, _ROWS, _PARTS = 32, 128, 4  # approximate numbers of projections and rows examined; parts of the scan
+_FEWEST = 2  # fewest of these projections in which material leaves the field of view
 _FULL = 0.5  # share of the fullest row's mass that a row needs
 
-CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
-FARTHEST = 10.0  # distances of the farther edge from the axis, to the end of a sample
-_EDGE = 3  # columns at least, whose mean is the level at an edge
-_OUTER = 0.25  # of the way to the farther edge: what lies within may be a core
-_ALIKE = 80  # times the variance of columns that err each by itself: 30 give 0.4 dB less in a can of 3 times the field
+CUT_SHARE, CUT_LEAST = 0.1, 0.02  # share of the value in the middle, and line integral; lower values at an edge are air
+FARTHEST = 10.0  # largest distance of the end of a sample, in distances of the farther edge from the axis
+_EDGE = 3  # least number of columns whose mean is the level at an edge
+# share of the distance to the farther edge that counts as outer columns; further in there may be a dense core
+_OUTER = 0.25
+_ALIKE = 80  # factor on the variance of independent columns; with 30, a can 3 times as wide as the field loses 0.4 dB
 
 
 def edge_levels(rows: F32) -> F32:
@@ -38,18 +39,19 @@ def edge_levels(rows: F32) -> F32:
 
 
 def ends_in_matter(mean: F32) -> NDArray[np.bool_]:
-    """Whether rows [row, side] of the mean of the views [row, col] end at a tenth of their depth, and not in noise."""
+    """Whether rows [row, side] of the mean projection [row, col] end above a tenth of their middle, and above noise."""
     level = edge_levels(mean)
     return np.asarray((level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST))
 
 
 def sample_reach(mean: F32, axis: float) -> F64:
-    """Columns [row] from the axis to where the mean of the views [row, col] ends, if it falls as an ellipse about it.
+    """Distance [row] in columns from the axis to the end of the mean projection [row, col], if it falls as an ellipse.
 
-    The square of an ellipse is a line over the square of the way from its middle. The outer columns show it beside a
-    dense core, all show it better among grains. So their slopes are averaged, by the variance of the outer columns'
-    slope and the square of their difference. By the edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385) FBP of packed
-    grains loses 0.4 dB where the can is twice as wide as the field (0.1 dB on two packings that nothing was tuned on).
+    The square of an ellipse is a straight line over the squared distance from its middle. For a sample with a dense
+    core, the outer columns show this line. For packed grains, all columns together show it better. So both slopes are
+    averaged, weighted by the variance of the outer columns' slope and the squared difference of the slopes. From the
+    edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385), FBP of packed grains loses 0.4 dB if the can is twice as wide
+    as the field of view (0.1 dB on two packings on which nothing was tuned).
     """
     squared_distance, squares = (np.arange(mean.shape[1]) - axis) ** 2, np.asarray(mean, np.float64) ** 2
     slopes = []
@@ -66,13 +68,14 @@ def sample_reach(mean: F32, axis: float) -> F64:
 
 @dataclass(frozen=True)
 class FieldEdges:
-    """Line integrals at the left and right edge of parallel or cone-beam views: where the sample exceeds the field.
+    """Line integrals at the left and right edge of the projections, which show whether the sample exceeds the field.
 
     Attributes:
-        levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
-        mean: of the views.
-        of_views: line integral at these edges [view] of the `views` that were looked at.
-        continued: whether some row ends in matter there, which FBP and FDK continue.
+        levels: line integral at each edge ("left", "right") that should show air: the smallest of the quarters of a
+            scan.
+        mean: mean of the projections.
+        of_views: line integral at these edges [view] in the examined projections `views`.
+        continued: True if a row ends in material at this edge, so that FBP and FDK extrapolate it.
     """
 
     levels: Mapping[str, float]
@@ -83,15 +86,16 @@ class FieldEdges:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, weights: F32 | None = None) -> FieldEdges:
-        """Edge levels of up to 32 views, in the rows that show matter.
+        """Edge levels of up to 32 projections, in the rows that show material.
 
-        Medians over views and rows: corners at some angles do not count. The least of the quarters: a beam drifts away
-        from its flats, a sample is there from the first to the last view. A full turn about an axis off the middle is
-        cut near the axis on purpose; the other half turn sees what is there.
+        Levels are medians over projections and rows, so that corners of a sample at some angles do not count. The
+        smallest quarter of the scan counts, because a beam drifts away from its flats, but a sample is there from the
+        first projection to the last. In a 360° scan with the axis off the middle, the edge near the axis is truncated
+        on purpose, because the other half of the scan sees the missing part. So this edge is ignored.
 
         Args:
             data: line integrals [view, row, col]; values that are not finite do not count.
-            weights: of these; those of weight 0 do not count, either. None: all count.
+            weights: weights of the values; values with weight 0 do not count. None: all count.
         """
         n, cols = len(data), data.shape[2]
         width = max(2, cols // 50)
@@ -119,14 +123,15 @@ class FieldEdges:
         """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.
 
         Args:
-            least: line integral that a beam which changes may leave; 0 of views whose air is at zero.
+            least: line integral that a changing beam may cause; 0: the air of these projections is at zero.
         """
         return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
 
     def passing(self) -> dict[str, tuple[int, int]]:
-        """The edges at which matter leaves the field in a part of the scan, with the first and last such view.
+        """The edges at which material leaves the field in a part of the scan, with the first and last such projection.
 
-        Empty where a view has matter at both edges: it is wider than the field, or the beam has changed.
+        Empty if a projection has material at both edges, because then the sample is wider than the field or the beam
+        changed.
         """
         least = max(LEAST, EMPTY * self.mean)
         at = {side: levels > least for side, levels in self.of_views.items()}
@@ -139,25 +144,25 @@ class FieldEdges:
 
 
 def _median(values: F32) -> float:
-    """Median over the rays that were measured; 0 where none was."""
+    """Median over the measured rays; 0 if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else 0.0
 
 
 def wider_than_field(projections: F32, geometry: Geometry) -> bool:
-    """Whether the sample is wider than the field, for views [view, row, col] whose air is at zero."""
+    """Whether the sample is wider than the field of view, for projections [view, row, col] whose air is at zero."""
     return bool(FieldEdges.of(projections, geometry).beyond(0.0))
 
 
 def taller_than_field(projections: F32, geometry: Geometry) -> bool:
-    """Whether matter goes on above or below the field of a cone, whose rays then meet it beyond the slices of its rows.
+    """Whether the sample continues above or below the slices of a cone, where the rays of its rows also cross it.
 
     Args:
         projections: line integrals [view, row, col]; values that are not finite do not count.
     """
     if not geometry.is_cone or not len(projections) or geometry.is_fan:
         return False
-    if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows of most views
+    if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows in most projections
         at = geometry.offsets[:, 1]
         lowest, highest = np.nan_to_num(projections[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
         return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
@@ -166,17 +171,20 @@ def taller_than_field(projections: F32, geometry: Geometry) -> bool:
 
 
 AIR = 0.03
-"""Of the largest line integral: trials leave out columns below it. Without: a tooth takes 129 CPU s instead of 55."""
+"""Share of the largest line integral; test reconstructions leave out columns below it.
+
+Without it, the tests of a tooth take 129 CPU s instead of 55.
+"""
 
 
 BESIDE_MATTER = 0.05
-"""Of the width of the matter: air on either side that they keep, so that no matter is cut at the edge."""
+"""Width of the air that test reconstructions keep on each side, as a share of the width of the material."""
 
 
 def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
-    """Rows first..stop of a parallel beam, and the slices that they see, as wide as `grid`.
+    """The geometry of rows first..stop of a parallel beam, and the grid of the slices that they see, as wide as `grid`.
 
-    If rows do not show slices, these are all slices that any ray to the rows meets.
+    If rows do not show slices, the grid contains all slices that any ray to these rows crosses.
     """
     views = geometry.rows(first, stop)
     slab = Grid.matching(views)
@@ -189,9 +197,9 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
 
 
 def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
-    """The columns of `images` [view, row, col] that show matter, with some air beside it, and the box that contains it.
+    """The columns of `images` [view, row, col] that show material (and some air), their geometry, and their box.
 
-    None: they are all columns, or rows do not show slices around the detector's middle.
+    None if these are all columns, or if rows do not show slices around the detector's middle.
     """
     if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
         return None
@@ -213,10 +221,10 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
 
 
 def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
-    """The middle `height` rows of a cone as a geometry, and the box that holds their rays.
+    """The middle `height` rows of a cone, their geometry, and the box that contains their rays.
 
-    None: views of a circle are displaced along the rows, or these rows show little of the matter in `data` [view, row,
-    col].
+    None if projections of a circular scan are displaced along the rows, or if these rows show little of the material in
+    `data` [view, row, col].
     """
     off, around = geometry.offsets[:, 1], not geometry.centres.any()
     first = round(geometry.axis_row + (0.0 if around else float(np.median(off))) - (height - 1) / 2)
@@ -226,7 +234,7 @@ def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tu
     some = data[:: max(1, len(data) // 8)]
     if np.abs(some[:, rows]).sum() < ENOUGH_MATTER * np.abs(some[:, busiest_rows(some, height)]).sum():
         return None
-    # At the far side of the field.
+    # at the far side of the field of view
     climb = 0.0 if around else float(np.ptp(off))
     tall = (height + 1 + climb) * geometry.sample_pitch + 2 * geometry.lean
     tall *= 1 + geometry.reach / geometry.source_distance
@@ -236,7 +244,7 @@ def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tu
 
 
 def busiest_rows(data: F32, height: int) -> slice:
-    """The neighbouring rows with most matter of line integrals [view, row, col]."""
+    """The `height` adjacent rows with the most material in line integrals [view, row, col]."""
     rows = data.shape[1]
     if rows <= height:
         return slice(0, rows)

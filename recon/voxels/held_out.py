@@ -1,4 +1,4 @@
-"""Views held out: what volumes of the others leave of them."""
+"""Held-out projections: how well volumes from the other projections predict them."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from recon.voxels.projector import Projector
 from recon.voxels.standstill import USUAL_SWEEPS
 
 TRIAL_SWEEPS = 20
-"""Sweeps of total variation in the trial of a finish, and of `EarlyTv`: a trial that gets less far than its volume
-prefers a heavier weight, one that gets further a lighter one."""
+"""Iterations of total variation in the test for a voxel refinement, and of `EarlyTv`.
+
+A test with fewer iterations than its volume prefers a larger weight, a test with more iterations a smaller one.
+"""
 
 LEAST_VIEWS = 2 * ONE_IN
 
 TRIAL_ROWS = 16
-"""Rows of the slab that trials of a prior see."""
+"""Number of rows in the tests that choose a prior."""
 
 CHOICE_SWEEPS, EARLY_CHOICE_SWEEPS = TRIALS * USUAL_SWEEPS, TRIALS * TRIAL_SWEEPS
-"""Sweeps of trials for a weight, as a rule: until volumes stand still, and of a finish."""
+"""Usual number of iterations to choose a weight: until the volumes converge, and for a voxel refinement."""
 
 
 def choice_sweeps(geometry: Geometry, early: bool = False) -> float:
-    """Cost of `choose_weight` in sweeps over all rows: four trials as a rule; 0 if no view is held out.
+    """Cost of `choose_weight` in iterations over all rows: usually four tests; 0 if no projection is held out.
 
     Args:
-        early: of a finish.
+        early: True: the tests for a voxel refinement.
     """
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
     sweeps = EARLY_CHOICE_SWEEPS if early else CHOICE_SWEEPS
@@ -43,9 +45,10 @@ def choice_sweeps(geometry: Geometry, early: bool = False) -> float:
 def predicted_views(
     method: Method, views: Views, grid: Grid, one_in: int, decide: Decisions | None = None
 ) -> tuple[NDArray[np.intp], F32]:
-    """Numbers of the held-out views, and their images [view, row, col] predicted by a volume of the others.
+    """Numbers of the held-out projections, and their images [view, row, col] predicted by a volume from the others.
 
-    They are those of `split_views`, but for a turn whatever the axis: geometries are compared by the same views.
+    They are chosen as by `split_views`, but with a period of 360° for any axis, so that geometries are compared by the
+    same projections.
     """
     seen, unseen = split_views(views.geometry, one_in, 2 * np.pi)
     volume = method.run(ReconProblem(views.select(seen), grid), RunControl(decide=decide)).volume

@@ -2,9 +2,9 @@
 
     volume = solve(FistaTv(), Projector(geometry, grid), projections)
 
-All work in float32. TV weights are fractions of the density unit (the 99.5th percentile of the positive voxels), so
-they hold for any unit of attenuation. Internally, lengths, line integrals and weights are scaled to about one:
-in other units sums of their squares could exceed the range of float32.
+All methods compute in float32. TV weights are fractions of the density unit (the 99.5th percentile of the positive
+voxels), so that they are valid for any unit of attenuation. Internally, lengths, line integrals and weights are scaled
+to about one, because in other units sums of their squares could exceed the range of float32.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import Buffers, Units, VoxelProblem, bytes_of, times_power
 
-UNITS = "units"  # name of the decision on them
+UNITS = "units"  # name of the decision on the units
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
-"""Name of the weight of total variation that a method chose, as its setting `tv_weight` would state it at the end."""
-_SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait for each other more than they work
+"""Name of the weight of total variation that a method chose, as a value of its setting `tv_weight`."""
+_SHARE = 2**16  # fewest voxels per thread in a single slice; with fewer, threads mostly wait for each other
 
 
 class Iterating(Protocol):
-    """What `solve` runs: a `VoxelMethod`, or a part of one."""
+    """What `solve` runs: a `VoxelMethod` or a part of it."""
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
@@ -51,13 +51,14 @@ def _silent(*_: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """Callbacks between iterations; a true result ends them.
+    """Callbacks between iterations; the result True ends the iterations.
 
     Attributes:
-        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
-            correction; the volume afterwards is better. CGLS, ASD-POCS: of the volume afterwards.
-        on_trial: called after each sweep of a trial; trials on some rows choose a method's weight. Where it ends them,
-            the iterations follow.
+        on_iteration: called with the number of each iteration, from 1, and the weighted ||A x - p|| / ||p|| before its
+            correction, so that the volume afterwards is better. For CGLS and ASD-POCS it is the residual of the volume
+            afterwards.
+        on_trial: called after each iteration of the test reconstructions that choose a method's weight on some rows. If
+            it ends them, the iterations of the volume follow.
     """
 
     on_iteration: Callable[[int, float], object] = _silent
@@ -68,10 +69,10 @@ _UNWATCHED = Watch()
 
 
 class TrialWatch:
-    """Reports the sweeps of trials, and asks whether to stop them: `Watch.on_trial`.
+    """Reports the iterations of test reconstructions, and asks whether to stop them: `Watch.on_trial`.
 
     Args:
-        usual: sweeps as a rule.
+        usual: usual number of iterations.
     """
 
     def __init__(self, control: RunControl, n_views: int, usual: int) -> None:
@@ -101,19 +102,20 @@ def solve(
 ) -> Volume:
     """Reconstruct line integrals on the projector's grid.
 
-    Memory: as each method's settings say, in volumes of the grid and in copies of the projections, float32.
+    The docstring of each method states its memory, in float32 volumes of the grid and copies of the projections.
 
     Args:
         projections: [view, row, col], line integrals, finite where their weight is not 0.
-        weight: of each ray, [view, row, col], 0 or more: 0 for invalid pixels, or the inverse variance; only
-            ratios of weights matter. None: one for all.
-        start: the volume to begin with; None: zero.
-        nonnegative: voxels below zero are clipped in every step (CGLS: at the end).
-        decide: keeps decisions that follow from the whole data, and has the seed of the order of views and subsets.
+        weight: weight of each ray, [view, row, col], 0 or more: 0 for invalid pixels, otherwise the inverse variance;
+            only ratios of weights matter. None: 1 for all rays.
+        start: the first volume; None: zero.
+        nonnegative: True: voxels below zero are clipped in every step (CGLS: at the end).
+        decide: stores decisions that follow from all data, and contains the seed of the order of projections and
+            subsets.
 
     Raises:
-        ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
-            that are zero everywhere.
+        ValueError: shapes do not match, values are not finite, weights are negative or all zero, or all projections are
+            zero.
     """
     views = Views(projections, projector.geometry, weight)
     return solve_views(method, projector, views, start=start, nonnegative=nonnegative, watch=watch, decide=decide)
@@ -130,8 +132,9 @@ def solve_views(
     decide: Decisions | None = None,
     wide: bool = False,
 ) -> Volume:
-    """`solve` of views in the projector's geometry, with their weights; `wide` as of `VoxelProblem`, other
-    arguments and errors as there."""
+    """`solve` for projections in the projector's geometry, with their weights.
+
+    `wide` is that of `VoxelProblem`; other arguments and errors are those of `solve`."""
     problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions(), wide)
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
@@ -140,7 +143,7 @@ def solve_views(
 
 @contextmanager
 def threads_for(grid: Grid) -> Iterator[None]:
-    """A context of as many threads as have work enough, of a single slice few."""
+    """A context that limits the threads to those with enough work; a single slice needs only a few."""
     threads = get_num_threads()
     try:
         if grid.shape[0] == 1:
@@ -159,7 +162,7 @@ def scaled_problem(
     decide: Decisions,
     wide: bool,
 ) -> tuple[VoxelProblem, F32]:
-    """The problem of these views in units of about one, and its first volume [y, x, z]; see `solve_views`."""
+    """The problem for these projections in units of about one, and its first volume [y, x, z]; see `solve_views`."""
     data, rays = _checked(projector, views.data, views.weights)
     lines = _start(projector, start)
     units = Units(*decide(UNITS, lambda: Units.of(projector, data, rays)))
@@ -182,8 +185,9 @@ class VoxelMethod(Iterative):
     """A method whose iterations improve a volume of voxels; a subclass adds its settings.
 
     Attributes:
-        buffers: at the peak of a run.
-        first_sweeps: over the views, for the first volume; they are counted before the iterations.
+        buffers: arrays in memory at the peak of a run.
+        first_sweeps: iterations over the projections for the first volume; they are counted before the other
+            iterations.
     """
 
     buffers: ClassVar[Buffers]
@@ -199,11 +203,11 @@ class VoxelMethod(Iterative):
 
     @property
     def usual_sweeps(self) -> int:
-        """Usual number of iterations; fewer than `iterations` if the volume stands still before."""
+        """Usual number of iterations; fewer than `iterations` if the volume converges earlier."""
         return self.iterations
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method with this share of its iterations, from a finished volume, as error bars need it."""
+        """The method with this share of its iterations, for error bars, which continue from a finished volume."""
         return replace(self, iterations=max(1, round(share * self.iterations)))
 
     def toy(self) -> Self:
@@ -213,7 +217,7 @@ class VoxelMethod(Iterative):
         """The volume with the history of its iterations.
 
         Raises:
-            ValueError: as `solve`.
+            ValueError: as for `solve`.
         """
         begin, views = control.now(), problem.geometry.n_views
         history: list[Progress] = []
@@ -236,7 +240,7 @@ class VoxelMethod(Iterative):
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:
-    """Data and weights as lines; values that weigh nothing are zero."""
+    """Data and weights as lines; values with weight 0 become 0."""
     require_views(projector.geometry, projections)
     finite = np.isfinite(projections)
     if weight is not None:
@@ -246,15 +250,15 @@ def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tupl
         finite |= weight == 0
     if not finite.all():
         raise ValueError(
-            f"{int((~finite).sum())} of {finite.size} projection values are not finite: correct them, or give them "
-            "weight 0"
+            f"correct the projections, or give bad values weight 0: {int((~finite).sum())} of {finite.size} values "
+            "are not finite"
         )
     data = projection_lines(projections)
     rays = None if weight is None else projection_lines(weight)
     if rays is not None:
         data[rays == 0] = 0
     if not data.any():
-        raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
+        raise ValueError("all projections are zero, so there is nothing to reconstruct")
     return data, rays
 
 
@@ -264,6 +268,6 @@ def _start(projector: Projector, start: Volume | None) -> F32:
         return np.zeros((ny, nx, nz), np.float32)
     if start.data.shape != projector.grid.shape or not np.isfinite(start.data).all():
         raise ValueError(
-            f"the starting volume must be finite and of shape {projector.grid.shape}, got {start.data.shape}"
+            f"the first volume must be finite and have shape {projector.grid.shape}, got {start.data.shape}"
         )
     return volume_lines(start.data)

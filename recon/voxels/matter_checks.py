@@ -1,4 +1,4 @@
-"""Checks of the matter in a volume: mass where views show none, structure left in the views, weak matter lost."""
+"""Checks of a volume: mass where projections show no material, structure in the residual, lost weak material."""
 
 from __future__ import annotations
 
@@ -24,27 +24,29 @@ from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.view_weights import seen_by
 
 STRAY_LIMIT = 0.05
-"""Share of the mass above which a warning is given, see docs/published.md."""
+"""Share of the mass above which there is a warning, see docs/published.md."""
 
-_VIEWS, _AGREE = 24, 2  # looked at; that must show a voxel empty
-_BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005  # pixels; of the blurred noise; of the 99th percentile of line integrals
-_WHOLE = 0.999  # share of a voxel's rays through air
-_MOST, _MOST_WHOLE = 2**18, 2**21  # voxels looked at, or one slice; where rows show no slices, those of a volume
-_WORK = 40  # bytes of a voxel that is looked at
-_LEAST_AIR = 100  # voxels, or blocks of them, whose level counts
-_MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it that counts
+_VIEWS, _AGREE = 24, 2  # projections examined; number of them that must show a voxel as empty
+# blur in pixels; limit in standard deviations of the blurred noise; and as a share of the 99th percentile
+_BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005
+_WHOLE = 0.999  # share of the rays of a voxel that pass through air only
+# most voxels examined (at least one slice); most voxels of a volume whose rows do not show slices
+_MOST, _MOST_WHOLE = 2**18, 2**21
+_WORK = 40  # bytes per examined voxel
+_LEAST_AIR = 100  # least number of voxels, or blocks, from which an air level is taken
+_MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it above which a density counts
 
 
 @dataclass(frozen=True, eq=False)
 class StrayMass:
-    """Mass of a volume in the voxels that views show to be empty.
+    """Mass of a volume in voxels that the projections show to be empty.
 
     Attributes:
-        share: of the volume's mass that lies in the voxels that are shown to be empty, counting densities above a
-            twentieth of the density unit.
-        map: float32 [y, x], the highest density above each other in these voxels.
-        first: number of the first slice that was looked at.
-        air: bool [slice, y, x], those of these voxels that every view looked at sees: beyond, FBP means nothing.
+        share: share of the mass of the volume in these voxels, counting densities above a twentieth of the density
+            unit.
+        map: float32 [y, x], the highest density along z in these voxels.
+        first: number of the first examined slice.
+        air: bool [slice, y, x], those of these voxels that all examined projections see; outside, FBP is meaningless.
     """
 
     share: float
@@ -53,7 +55,7 @@ class StrayMass:
     air: Mask
 
     def level(self, volume: Volume) -> tuple[float, float]:
-        """Mean and standard deviation of a volume on the same grid in `air`; NaN if that has under 100 voxels."""
+        """Mean and standard deviation of a volume on the same grid in `air`; NaN if `air` has fewer than 100 voxels."""
         values = volume.data[self.first : self.first + len(self.air)][self.air]
         if values.size < _LEAST_AIR:
             return math.nan, math.nan
@@ -61,10 +63,11 @@ class StrayMass:
 
 
 def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
-    """Density in the voxels that views show to be empty; of a large volume, of any method, in slices around its middle.
+    """Density in voxels that the projections show to be empty; in a large volume, only in slices around its middle.
 
     Returns:
-        None if no voxel is shown to be empty, the volume holds no matter, or it is large and its slices are no rows.
+        None if no voxel is shown to be empty, the volume contains no material, or it is large and rows do not show
+        slices.
     """
     nz, looked_at, first = volume.grid.shape[0], _looked_at(views.geometry, volume.grid), 0
     if looked_at == 0:
@@ -93,12 +96,12 @@ def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
 
 
 def stray_mass_share(geometry: Geometry, grid: Grid) -> float:
-    """Approximate number of projections of all rays that take as long as `stray_mass`."""
+    """Approximate duration of `stray_mass`, in units of projecting the volume once."""
     return 3 * min(1.0, _VIEWS / geometry.n_views) * _looked_at(geometry, grid) / grid.shape[0]
 
 
 def _looked_at(geometry: Geometry, grid: Grid) -> int:
-    """Slices of the volume; 0 if it is not looked at."""
+    """Number of examined slices; 0: the volume is not examined."""
     nz, slice_ = grid.shape[0], grid.shape[1] * grid.shape[2]
     if geometry.rows_show_slices and grid == Grid.matching(geometry):
         return min(nz, max(1, _MOST // slice_))
@@ -106,11 +109,10 @@ def _looked_at(geometry: Geometry, grid: Grid) -> int:
 
 
 def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
-    """Voxels whose rays in at least two of up to 24 views meet no matter, and those that are on the detector in all of
-    these views, [z, y, x] each.
+    """Voxels [z, y, x] that at least two of up to 24 projections show as empty, and voxels that all of these see.
 
-    A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
-    within 0.5 % of the thick parts. So matter much thinner than that counts as none.
+    A ray crosses no material if its line integral, blurred by a pixel, is within four standard deviations of the noise,
+    or within 0.5 % of the line integrals of the thick parts. So much thinner material counts as air.
     """
     part = views.select(spread(np.arange(views.geometry.n_views), _VIEWS)).masked()
     data, known = part.data, part.weights
@@ -133,27 +135,28 @@ def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
 
 
 UNEXPLAINED_LIMIT = 0.007
-"""Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
-edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes.
+"""Share of the material above which a volume hides structure. It is 0.01 to 0.05 in seven fits that fill cracks and
+round off edges, up to 0.004 in sixteen fits with voxel refinement, and up to 0.005 in true volumes.
 """
 
-_SIGNIFICANT = 4.0  # standard deviations of the noise, above which noise has a share below 1e-3
+_SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of noise is below 1e-3
 _FLIPS = 6
-_SMOOTH, _AROUND = 1.0, 4.0  # pixels: size of the detail, and of the map of the noise
-_ROWS, _COLS = 8, 256  # rows used, for so many columns; fewer for wider detectors
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and of the map of the noise
+_ROWS, _COLS = 8, 256  # rows used for this number of columns; fewer for wider detectors
 _LEAST_VIEWS = 16
-_DENSE, _CLOSED = 0.2, 2  # share of the 99th percentile; voxels: cracks belong to the matter
+# share of the 99th percentile that is material; voxels of closing, so that cracks belong to the material
+_DENSE, _CLOSED = 0.2, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Unexplained:
-    """The residual of the views, back-projected on some slices of a volume.
+    """The residual of the projections, back-projected on some slices of a volume.
 
     Attributes:
-        share: of the voxels of matter with a residual above four standard deviations of its noise.
+        share: share of the voxels of material with a residual above four standard deviations of its noise.
         first: number of the first of these slices.
-        significance: float32 [z, y, x], filtered back-projection of the residual over its noise; positive where the
-        volume is too low.
+        significance: float32 [z, y, x], filtered back-projection of the residual divided by its noise; positive where
+            the volume is too low.
     """
 
     share: float
@@ -162,18 +165,20 @@ class Unexplained:
 
 
 def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexplained | None:
-    """Filtered back-projection of the residual p - A x, over its noise: that of the views with random signs.
+    """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
-    Random signs of the views cancel structure, which all views share, and keep noise [our own; after the odd-even
-    differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around the middle of matter
-    (of views that climb, those that see most of it) are used, one row if the detector has 700 columns or more.
+    With random signs of the projections, structure cancels, because all projections share it, and noise remains [our
+    own; after the odd-even differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around
+    the middle of the material are used, or one row if the detector has 700 columns or more. If the projections move
+    along the axis, the rows that see most of the material are used.
 
     Args:
-        volume: on the slices of the detector rows, 1/mm.
-        seen: the views.
+        volume: the volume on the slices of the detector rows, 1/mm.
+        seen: the projections.
 
     Returns:
-        None for cones, rolled or tilted views, fewer than 16 views, other slices, or a volume without matter.
+        None for a cone, rolled or tilted projections, fewer than 16 projections, other slices, or a volume without
+        material.
     """
     geometry, slices = seen.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
@@ -183,7 +188,7 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
-    if geometry.climbs:  # few views see the slices in between
+    if geometry.climbs:  # few projections see the slices in between
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
         first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
     rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
@@ -196,7 +201,7 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
     unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
     if seen.weights is not None:
         unseen = unseen | (seen.weights[:, rows] == 0)
-    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, as the model is
+    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, like the model
     left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
     left = left - projector.forward(part.data)
     left[unseen] = 0
@@ -232,9 +237,9 @@ def _smoothed(images: F32) -> F32:
 
 
 def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
-    """The slices of the box, of the residual times each row of signs [kind, view].
+    """FBP of the slices of the box, from the residual times each row of signs [kind, view].
 
-    If views do not move along the axis, all are slices of one volume, which takes less time.
+    If projections do not move along the axis, all results are slices of one volume, which takes less time.
     """
     rows, cols = views.detector_shape
     kinds = len(signs)
@@ -248,21 +253,22 @@ def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[
     return list(images.reshape(kinds, rows, *images.shape[1:]))
 
 
-_BLOCKS = 96  # blocks of a volume along its longest side, at most
-_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # blocks; of air
+_BLOCKS = 96  # most blocks along the longest side of a volume
+_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # smoothing in blocks; least density of material, in standard deviations of air
 _MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
-_LEFT = 0.5  # share of FBP's density: a voxel with less has lost it
-_CORE, _LEAST_REGION = (3, 5, 5), 64  # blocks along z, y and x of the boxes of a region; blocks of a region
-_BESIDE = 2  # blocks beside slices without beam that these are smoothed into
+_LEFT = 0.5  # share of the density in FBP; a block with less has lost its material
+# blocks along z, y and x of the boxes of which a region consists; fewest blocks of a region
+_CORE, _LEAST_REGION = (3, 5, 5), 64
+_BESIDE = 2  # blocks next to slices without beam, which smoothing mixes with these slices
 
 
 @dataclass(frozen=True)
 class LostMatter:
-    """The largest region whose matter FBP of the same views shows, but a volume lacks.
+    """The largest region of material that FBP of the same projections shows, but that is missing in a volume.
 
     Attributes:
-        region: (z, y, x), first and end.
-        kept: mass in that region over the mass in FBP, each above its own air.
+        region: (z, y, x), each the first voxel and the one after the last.
+        kept: mass in this region divided by the mass in FBP, each relative to its own air level.
     """
 
     region: tuple[tuple[int, int], ...]
@@ -270,18 +276,19 @@ class LostMatter:
 
 
 def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> LostMatter | None:
-    """The largest region in which a volume lost weak matter that the reference shows above its own air.
+    """The largest region in which a volume lost weak material that the reference shows above its air level.
 
-    In blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
-    of 3 x 5 x 5 blocks [z, y, x]: streaks are thinner.
+    The check works on blocks of voxels, so that a volume on disk needs little memory. A region is a union of boxes of 3
+    x 5 x 5 blocks [z, y, x], because streaks are thinner.
 
     Args:
-        volume: [z, y, x], of any method.
+        volume: [z, y, x], from any method.
         reference: [z, y, x], FBP or FDK.
-        seen: [z], slices of rows that got beam, which alone are compared: in others FBP shows a filling. None: all.
+        seen: [z], True for slices whose rows had beam. Only these are compared, because in other slices FBP shows
+            filled values. None: all slices.
 
     Returns:
-        None if no region lost any, or the reference shows no air.
+        None if no region lost material, or the reference shows no air.
     """
     factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
     factor = min(factor, *volume.shape)

@@ -1,13 +1,14 @@
-"""The law of the error of a volume, measured in its views: what further views would bring, without a truth.
+"""Measures the law of the error of a volume, which tells the benefit of more projections, without ground truth.
 
-Where noise makes the error, the square error of a volume of total variation falls as n^-0.6 with the views; where edges
-between voxels, fringes, a motion or matter beside the field make it, as n^-0.3 or less. Which of the two holds is
-measured. A volume of seven eighths of the views stands for the sample, and in a copy of the scan noise alone is added
-to its projections (a parametric bootstrap; Efron & Tibshirani 1993, ch. 6.5). The copy tells the share of the noise in
-the error. Then volumes of half and of seven eighths of the views are judged by the eighth held out, in the scan and in
-the copy: by the power of their residual, filtered by the root of the ramp (which makes it the square error of the
-volume, by the theorems of Parseval and of the central slice), less that of the noise of the open beam. Where the error
-falls less in the scan than in the copy, it has parts that further views do not take away.
+If noise dominates the error, the square error of a volume of total variation falls as n^-0.6 with the number of
+projections. If edges between voxels, fringes, motion or material outside the field dominate, it falls as n^-0.3 or more
+slowly. This module measures which of the two is the case. A volume from seven eighths of the projections represents the
+sample. In a copy of the scan, only noise is added to the projections of this volume (a parametric bootstrap; Efron &
+Tibshirani 1993, ch. 6.5). The copy shows the share of noise in the error. Then volumes from half and from seven eighths
+of the projections are judged by the held-out eighth, in the scan and in the copy. The measure is the power of their
+residual, filtered by the root of the ramp, minus that of the noise of the open beam. (By the theorems of Parseval and
+of the central slice, this power is the square error of the volume.) If the error falls less in the scan than in the
+copy, it has parts that more projections do not reduce.
 """
 
 from __future__ import annotations
@@ -40,49 +41,54 @@ from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem
 
 LEAST_VIEWS = 40
-_NOISE_EXPONENT, _OTHER_EXPONENT = 0.6, 0.3  # on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
-_NOISE_PRODUCT = 0.08, 0.16  # noise x ratio of falls: below the first other errors rule, above the second noise does
-_EXPONENT_ERROR = 0.25  # over the exponent: a convention, by which a gain's range is half to one and a half times it
-_GAPS_ERROR = 0.46  # likewise with gaps between views, where exponents from 0.41 to 1.15 were found on ten scans
-_SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
-_VOLUME_OVER_VIEWS = 2.1  # times the fall that is measured: views show errors between voxels, too, which stay
-_ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
+# measured on ten scans: 0.5 to 0.7 and 0.1 to 0.4 (tests/bench/next_pass.py)
+_NOISE_EXPONENT, _OTHER_EXPONENT = 0.6, 0.3
+# noise share x ratio of falls: below the first value other errors dominate, above the second noise does
+_NOISE_PRODUCT = 0.08, 0.16
+_EXPONENT_ERROR = 0.25  # relative; a convention: the range of a gain is then from half to one and a half times the gain
+_GAPS_ERROR = 0.46  # the same if gaps between projections dominate; ten scans had exponents from 0.41 to 1.15
+# share of the error that falls with more light at the same angles, over the exponent; median of 14 pairs
+_SAME_ANGLES = 0.8
+# factor on the measured fall, because projections also show errors between voxels, which do not fall
+_VOLUME_OVER_VIEWS = 2.1
+_ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; projections times squared columns, above which columns are binned
 _TV_STEPS, _TRIAL_VIEWS = 3, 64
-_LEAST_FRAMES = 3  # of the open beam, at least
+_LEAST_FRAMES = 3  # fewest frames of the open beam
 _TINY = 1e-30
-_CIRCLE = 0.95  # of the field's radius, where errors count
+_CIRCLE = 0.95  # share of the radius of the field of view in which errors count
 
 
 def measured_law(
     data: F32, geometry: Geometry, views_at_ends: Sequence[int], rng: np.random.Generator, open_beam: F32
 ) -> tuple[ErrorLaw, float | None]:
-    """The law of the error of the volume of these views, and the dB that the views of the last pass gained (None: not
-    known).
+    """The law of the error of a volume of these projections, and the dB gained by the last pass (None: not known).
 
     Args:
-        data: line integrals [view, row, col] in the order taken; finite.
-        geometry: of these views: parallel beam, straight.
-        views_at_ends: numbers of views at the ends of passes so far, the last of all. Where the last two are alike,
-            none came in between, and what came there was not measured.
-        open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
-            binned as the views.
+        data: line integrals [view, row, col] in the order of acquisition; finite.
+        geometry: geometry of the projections: a parallel beam without roll and tilt.
+        views_at_ends: number of projections at the end of each pass so far; the last one is the number of all. If the
+            last two are equal, the last pass added no projections, and its gain is not measured.
+        open_beam: line integrals [frame, row, col] of successive frames of the open beam, which contain only noise,
+            binned as the projections.
 
     Raises:
-        ValueError: a cone, fewer than 40 views or 3 frames of the open beam, or views without matter.
+        ValueError: the beam is a cone, there are fewer than 40 projections or 3 frames of the open beam, or the
+            projections show no material.
     """
     n = len(data)
     if geometry.is_cone:
-        raise ValueError("the law of the error is not measured for a cone beam")
+        raise ValueError("the law of the error can be measured only for a parallel beam, and this is a cone beam")
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
             f"the law of the error needs {LEAST_VIEWS} projections and {_LEAST_FRAMES} frames of the open beam; "
             f"got {n} and {len(open_beam)}"
         )
     sample = sample_radius(Views(data, geometry))
-    width = 1.0 if sample is None else sample.radius / geometry.reach  # of the sample, over the field's
+    # width of the sample over that of the field of view
+    width = 1.0 if sample is None else sample.radius / geometry.reach
     slab = _Slab.of(data, geometry, width, open_beam)
     most, held_out = split_views(slab.geometry)
-    half = split_views(slab.geometry, 2)[1]  # every second one by angle, none of those held out
+    half = split_views(slab.geometry, 2)[1]  # every second projection by angle, without the held-out ones
     method = _TotalVariation(slab.chosen_weight())
     volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
     if not volumes[1].any():
@@ -95,7 +101,7 @@ def measured_law(
         [slab.unseen_power(volume, slab.views, held_out) for volume in volumes],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    # Fewer views than the sample is columns wide leave gaps between them, whose error falls as that by noise does.
+    # With fewer projections than the sample has columns there are gaps. Their error falls in the same way as noise.
     gaps = n < width * geometry.detector_shape[1]
     product = 1.0 if gaps else noise * (1.0 if fall_ratio is None else fall_ratio)
     exponent = float(np.interp(product, _NOISE_PRODUCT, (_OTHER_EXPONENT, _NOISE_EXPONENT)))
@@ -105,18 +111,19 @@ def measured_law(
     law = ErrorLaw(n, exponent, error, _SAME_ANGLES * exponent * (1 - offset), offset)
     if not fall_ratio or min(errors) <= 0 or (n, *views_at_ends)[-2] == n:
         return law, None
-    fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])  # of the scan, from half to most views
+    # fall of the error in the scan, from half to seven eighths of the projections
+    fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])
     return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])
 
 
 def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
-    """The fall of the error from the first volume to the second in the scan, over that in its copy, 0 to 1.
+    """The fall of the error from the first volume to the second in the scan, divided by that in its copy, 0 to 1.
 
     Args:
-        scan, copy: `_Slab.unseen_power` of the two volumes of each.
+        scan, copy: `_Slab.unseen_power` of the two volumes.
 
     Returns:
-        None: not known, as the error of the copy does not fall.
+        None if the ratio is not known, because the error of the copy does not fall.
     """
     if not copy[0] > copy[1] > 0:
         return None
@@ -126,9 +133,9 @@ def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class _TotalVariation:
-    """FISTA-TV with a weight that is stated for one view.
+    """FISTA-TV with a weight that is stated for one projection.
 
-    That of n views is as many times it as the noise in the gradient of the sum over them: √n.
+    For n projections the weight is √n times as large, like the noise in the gradient of the sum over them.
     """
 
     weight: float
@@ -142,7 +149,7 @@ class _TotalVariation:
 
 @dataclass(frozen=True)
 class _WeightByNoise:
-    """Decides the weight of total variation by the noise of the views, and makes no volume."""
+    """Decides the weight of total variation from the noise of the projections, and makes no volume."""
 
     iterations: int = MOST_SWEEPS
 
@@ -153,13 +160,13 @@ class _WeightByNoise:
 
 @dataclass(frozen=True, eq=False)
 class _Slab:
-    """Some rows of a scan, binned where they are many.
+    """Some rows of a scan, binned if there are many columns.
 
     Attributes:
         views: line integrals [view, row, col].
-        noise: of one frame of the open beam, [frame, row, col].
-        box: as wide as the sample.
-        decisions: of the volumes so far, which the next ones follow.
+        noise: noise of single frames of the open beam, [frame, row, col].
+        box: a box as wide as the sample.
+        decisions: decisions of the volumes so far, which the next volumes repeat.
     """
 
     views: F32
@@ -170,7 +177,7 @@ class _Slab:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32) -> _Slab:
-        """Rows with most matter of a scan whose sample is `width` times as wide as the field."""
+        """The rows with the most material in a scan whose sample is `width` times as wide as the field of view."""
         factor = 2 ** max(0, math.ceil(math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))))
         rows = busiest_rows(data, min(_ROWS * factor, data.shape[1]))
         views, geometry = np.ascontiguousarray(data[:, rows]), geometry.rows(rows.start, rows.stop)
@@ -183,7 +190,10 @@ class _Slab:
         return cls(views, geometry, box.reaching(width * geometry.reach, geometry) if width > 1 else box, noise)
 
     def volume(self, method: Iterating, views: F32, used: NDArray[np.intp]) -> F32:
-        """[z, y, x], made of the views that are used (their numbers), from filtered back-projection of them."""
+        """A volume [z, y, x] from the projections with the numbers `used`.
+
+        It starts from their filtered back-projection.
+        """
         geometry, images = self.geometry.select(used), np.ascontiguousarray(views[used])
         start = Volume(np.maximum(fbp(images, geometry, self.box, filter="hann"), 0), self.box)
         decide = Decisions(0, self.decisions)
@@ -192,7 +202,7 @@ class _Slab:
         return np.maximum(volume.data, 0)
 
     def chosen_weight(self) -> float:
-        """The weight of total variation for one view that predicts views held out best."""
+        """The weight of total variation, for one projection, that predicts held-out projections best."""
         by_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
         tried = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         self.volume(_WeightByNoise(), self.views, tried)
@@ -208,24 +218,24 @@ class _Slab:
         return first if best is None else best.strength
 
     def copies(self, sample: F32, rng: np.random.Generator) -> list[F32]:
-        """Two scans [view, row, col] of a sample, with different noise like that of the open beam."""
+        """Two simulated scans [view, row, col] of a sample, with different noise like that of the open beam."""
         clean = Projector(self.geometry, self.box).forward(sample)
-        photons = np.exp(clean, dtype=np.float64)  # the variance rises as the light falls
+        photons = np.exp(clean, dtype=np.float64)  # the variance grows as the light falls
         deviation = np.sqrt(photons * float(np.mean(np.square(self.noise, dtype=np.float64))))
         return [(clean + rng.normal(size=clean.shape) * deviation).astype(np.float32) for _ in range(2)]
 
     def square_error(self, volume: F32, other: F32) -> float:
-        """Mean square difference of two volumes within the field's circle."""
+        """Mean square difference of two volumes within the circle of the field of view."""
         y, x = np.meshgrid(*self.box.coordinates()[1:], indexing="ij")
         difference = np.subtract(volume, other)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
         return float(np.mean(np.square(difference, dtype=np.float64)))
 
     def unseen_power(self, volume: F32, views: F32, unseen: NDArray[np.intp]) -> float:
-        """Power of the error of a volume in views that it was not made of, without that of their noise."""
+        """Power of the error of a volume in projections that were not used for it, without the power of their noise."""
         projector, n = Projector(self.geometry.select(unseen), self.box), len(self.noise)
         lines = projection_lines(np.ascontiguousarray(views[unseen]))
         residual = at_voxel_resolution(lines, projector.resolution) - projection_lines(projector.forward(volume))
-        angles_of_noise = self.geometry.select(unseen[np.arange(n) * len(unseen) // n])  # it is smoothed as views are
+        angles_of_noise = self.geometry.select(unseen[np.arange(n) * len(unseen) // n])  # smoothed like the projections
         noise = at_voxel_resolution(projection_lines(self.noise), Projector(angles_of_noise, self.box).resolution)
         return _ramp_power(residual) - _ramp_power(noise) * float(np.exp(lines, dtype=np.float64).mean())
 

@@ -42,17 +42,17 @@ from recon.voxels.voxel_problem import (
 class FistaTv(VoxelMethod):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
 
-    The iterations end when the volume stands still: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
+    The iterations end when the volume has converged: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
     and 2 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
         tv_weight: None: μ follows from held-out projections, or from the noise of the data, see `choose_weight`. A
-            number: the threshold of one step of FISTA in density units, μ = tv_weight x density unit x ||A||².
+            number: the threshold of one FISTA step in density units, μ = tv_weight x density unit x ||A||².
         subsets: largest number of subsets in the first iterations, with one step each.
         tv_steps: dual steps of total variation in each step.
-        still: the volume stands still if four iterations together change it by less than this share of its norm; 0: all
-            iterations are made.
+        still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
+            all iterations are made.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -78,7 +78,7 @@ class FistaTv(VoxelMethod):
 
     @property
     def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume stands still."""
+        """Usual number of iterations until the volume has converged."""
         return min(self.iterations, USUAL_SWEEPS)
 
     def refit(self, share: float) -> VoxelMethod:
@@ -87,11 +87,11 @@ class FistaTv(VoxelMethod):
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The method that ends nearer to the minimum, or further from it."""
+        """The method that ends nearer to the minimum (or, for a preview, farther from it)."""
         return with_quality(self, quality)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best weight. If the method has a weight of its own: the prediction of its volume."""
+        """The prediction with the best weight. If `tv_weight` is given, the prediction of its own volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
@@ -126,7 +126,7 @@ class FistaTv(VoxelMethod):
 
 @dataclass(frozen=True)
 class EarlyTv(FistaTv):
-    """`FistaTv` with a fixed number of iterations on subsets, which end before the volume stands still.
+    """`FistaTv` with a fixed number of iterations on subsets, which end before the volume has converged.
 
     It is for volumes that are only compared with each other.
     """
@@ -138,26 +138,26 @@ class EarlyTv(FistaTv):
 
 
 _SHUFFLED = 12
-"""Sweeps of OS-SIRT-TV with the subsets in random order. Later ones have them in one order, since a volume that ends in
-another subset each time changes by 1 % in four sweeps, for ever (31 projections with 2 % noise)."""
+"""Number of sweeps of OS-SIRT-TV in which the subsets have a random order. Later sweeps use one order, because a volume
+never converges if each sweep ends with another subset: it changes by 1 % in four sweeps (31 projections, 2 % noise)."""
 
 
 @dataclass(frozen=True)
 class OsSirtTv(VoxelMethod):
-    """Ordered-subset SIRT with a proximal step of TV and momentum after each iteration, until the volume stands still.
+    """Ordered-subset SIRT with a proximal step of total variation and momentum after each iteration.
 
-    SIRT weighs rays by the inverse of their length in the volume. Rays that cross much material have fewer photons, so
-    the method suits projections of very few photons (10 to 30 a pixel: up to 2 dB better than FISTA-TV). In a cone beam
-    its weight follows the noise: 2.3 dB worse than FISTA-TV on a thorax, whose weight held-out projections choose. The
-    momentum is that of Kim, Ramani & Fessler (2015, IEEE Trans. Med. Imaging 34, 167). Memory: 9 volumes and 3 times
-    the projections.
+    The iterations end when the volume has converged. SIRT weighs rays by the inverse of their length in the volume.
+    Rays through much material carry fewer photons, so the method suits very few photons (10 to 30 per pixel: up to 2 dB
+    better than FISTA-TV). For a cone its weight follows the noise: on a thorax it is 2.3 dB behind FISTA-TV, whose
+    weight is chosen by held-out projections. The momentum is that of Kim, Ramani & Fessler (2015, IEEE Trans. Med.
+    Imaging 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
-        tv_weight: threshold of the proximal step in density units; None: by held-out projections or by the noise, see
-            `choose_weight`.
-        still: as of `FistaTv`.
-        momentum: False: without it, which takes about three times as many iterations.
+        tv_weight: threshold of the proximal step in density units; None: chosen by held-out projections or from the
+            noise, see `choose_weight`.
+        still: as in `FistaTv`.
+        momentum: False: without momentum; the volume then needs about three times as many iterations.
     """
 
     name: ClassVar[str] = "os-sirt-tv"
@@ -185,7 +185,7 @@ class OsSirtTv(VoxelMethod):
         return min(self.iterations, USUAL_SWEEPS)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """As of `FistaTv`."""
+        """As in `FistaTv`."""
         return with_quality(self, quality)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -206,7 +206,7 @@ class OsSirtTv(VoxelMethod):
                 threshold = float(mu * problem.decide("pace", lambda: sweeps.pace))
                 prox(x, threshold)
             else:
-                # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
+                # The unit follows the volume, because the volume is blurred and fainter after the first iterations.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
             prox.turn()
             if standstill.ends(x, k + 1, problem.go_on(k + 1, math.sqrt(error) / scale)):
@@ -221,11 +221,13 @@ class OsSirtTv(VoxelMethod):
 
 @dataclass(frozen=True)
 class PnpDct(VoxelMethod):
-    """Steps towards the views, and patches of 4 x 4 x 4 voxels with few cosine coefficients, in turn; see
-    `recon.voxels.priors`. The first volume is that of FISTA-TV, unless one is given. Memory: as `FistaTv`.
+    """Alternates steps towards the projections with a denoiser of patches of 4 x 4 x 4 voxels (PnP-DCT).
+
+    The denoiser keeps few cosine coefficients of each patch, see `recon.voxels.priors`. The first volume is that of
+    FISTA-TV, unless one is given. Memory: as for `FistaTv`.
 
     Attributes:
-        iterations: steps towards the views, five between two thresholds.
+        iterations: steps towards the projections, five for each threshold.
         patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
             `choose_patches`, or the noise sets it.
     """
@@ -245,23 +247,23 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
+        """Iterations for the weight of total variation and a first volume, and steps with four thresholds."""
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
     def trial_steps(self) -> int:
-        """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
+        """Steps with patches in a test reconstruction: as many as for the volume, but at most the usual number."""
         return min(self.iterations, PnpDct.iterations)
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """None: the steps are a schedule."""
+        """None, because the number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best threshold; with one of its own that of the method's volume.
+        """The prediction with the best threshold. If `patch_threshold` is given, the prediction of its own volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.wide`.
+        If the sample is wider than the field of view, it is not tried after simpler methods, see `Trial.wide`.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(
@@ -281,7 +283,7 @@ class PnpDct(VoxelMethod):
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not first.going:
             return x
-        for name in ENDED:  # of the first volume; patches follow
+        for name in ENDED:  # of the first volume; patches follow it
             problem.decide.settings.pop(name, None)
         share = self.patch_threshold
         if share is None:
@@ -294,7 +296,8 @@ class PnpDct(VoxelMethod):
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape
         patches = 4 * scratch_values((ny, nx, nz)) + bytes_of(self.buffers, geometry, grid, weighted)
-        # Beside the first volume, trials make total variation of copies of the views: where rows are few, of all.
+        # In addition to the first volume, tests make volumes from copies of the projections (of all if there are few
+        # rows).
         trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
         first = FistaTv().memory(geometry, grid, weighted) + trials
         return max(first, patches)

@@ -1,4 +1,4 @@
-"""odd_views: views with a part that differs from the volume made of them, compared with the views beside them."""
+"""odd_views: finds projections that differ in a part from the volume made from them, more than their neighbours do."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
 LIMIT = 12.0
-"""Limit, in usual differences (standard deviations): clean real scans stay below 9.4."""
+"""Limit of the score, in standard deviations of the usual differences. Clean real scans stay below 9.4."""
 
-_CELLS = 128  # least columns of cells, if the detector has so many pixels
-_BLUR = 4  # pixels: reach of a blur by one pixel
-_BAND, _TOGETHER = 16, 32  # rows that are projected together; views that are compared together
-_AT_A_TIME = 8  # views of a cone that are projected together
-_BROAD = 3  # cells a side, over which a difference is averaged
-_AROUND, _BESIDE = 12, 3  # views on either side that define the usual difference; nearest ones left out
-_LEAST_NOISE = 2e-3  # of a pixel, of a view's largest line integral: neither a frame nor the end of a fit has less
-_OUTLIER = 3.0  # times their median: largest contribution of one view
+_CELLS = 128  # least number of columns of cells, if the detector has that many pixels
+_BLUR = 4  # pixels; reach of a blur by one pixel
+_BAND, _TOGETHER = 16, 32  # rows that are projected together; projections that are compared together
+_AT_A_TIME = 8  # projections of a cone that are computed together
+_BROAD = 3  # side, in cells, of the area over which a difference is averaged
+# projections on either side that define the usual difference; number of nearest ones that are left out
+_AROUND, _BESIDE = 12, 3
+# least noise of a pixel, as a share of the largest line integral; frames and residuals of fits have no less
+_LEAST_NOISE = 2e-3
+_OUTLIER = 3.0  # largest contribution of one projection, in medians of all
 _SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
 _EXTENT = 0.5  # share of the limit above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
@@ -35,12 +37,12 @@ _LEAST_VIEWS = 2 * _AROUND + 1
 
 @dataclass(frozen=True)
 class OddView:
-    """A part of a view that differs from the volume.
+    """A part of a projection that differs from the volume.
 
     Attributes:
         view: index in the projections.
-        score: difference in standard deviations; above 0 if the view absorbs more than the volume.
-        rows, cols: pixels of the projections, first and one after the last.
+        score: difference in standard deviations; above 0 if the projection shows more absorption than the volume.
+        rows, cols: rows and columns of the part: the first one, and the one after the last.
     """
 
     view: int
@@ -52,19 +54,21 @@ class OddView:
 def odd_views(
     volume: Volume, views: Views, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> tuple[OddView, ...]:
-    """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
+    """Projections in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
-    The check takes each view's difference from the volume's projection, less the common change of its pixels (light).
-    It averages over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
-    fully at edges that it blurs, at rings, or outside the field. So a difference counts relative to the 18 views of the
-    nearest angles at the same place. It also counts relative to the edges of the volume in the view itself. A face or a
-    crack parallel to the rays is sharp in few views only [our own].
+    The check takes the difference of each projection from that of the volume, minus the common change of its pixels
+    (light). It averages the difference over 3 x 3 cells, in standard deviations of the projection's noise and finest
+    detail. No volume fits its projections perfectly at edges that it blurs, at rings, or outside the field of view. So
+    a difference is compared with the same place in the 18 projections at the nearest angles. It is also compared with
+    the edges of the volume in the projection itself, because a face or a crack parallel to the rays is sharp only in a
+    few projections [our own].
 
     Args:
-        progress: how many of how many views were compared, of bands of rows by their share.
+        progress: function called with the number of projections compared so far, and their total number. In bands of
+            rows, each band counts with its share.
 
     Returns:
-        In the order of the views; empty for fewer than 25 views.
+        The parts in the order of the projections; empty for fewer than 25 projections.
     """
     n, side = views.geometry.n_views, _side(views.geometry)
     if n < _LEAST_VIEWS:
@@ -102,21 +106,24 @@ def _side(geometry: Geometry) -> int:
 
 
 def _band(geometry: Geometry) -> int:
-    """Rows that are projected together: whole cells."""
+    """Number of rows that are projected together; a whole number of cells."""
     return _side(geometry) * max(1, _BAND // _side(geometry))
 
 
 def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slice, F32, F32]]:
-    """Views, rows, the volume's projection [view, row, col] there and its sharp part: in bands if rows are slices."""
+    """Yields projections, rows, the volume's projection [view, row, col] and its sharp part.
+
+    In bands if rows are slices.
+    """
     rows, band = geometry.detector_shape[0], _band(geometry)
     if not geometry.rows_show_slices or volume.grid != Grid.matching(geometry):
-        lines = volume_lines(volume.data)  # once: of a large volume that takes as long as a view
+        lines = volume_lines(volume.data)  # only once, because for a large volume it takes as long as a projection
         for view in range(0, geometry.n_views, _AT_A_TIME):
             some = slice(view, view + _AT_A_TIME)
             model = projection_images(Projector(geometry.select(some), volume.grid).forward_lines(lines))
             yield some, slice(0, rows), model, _sharp(model)
         return
-    whole = rows - rows % _side(geometry)  # rows at the end that fill no cell do not count
+    whole = rows - rows % _side(geometry)  # rows at the end that do not fill a cell do not count
     for first in range(0, whole, band):
         part = slice(first, min(first + band, whole))
         around = slice(max(first - _BLUR, 0), min(part.stop + _BLUR, rows))
@@ -129,20 +136,20 @@ def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slic
 
 
 def _sharp(models: F32) -> F32:
-    """Projections [view, row, col] minus their blur by a pixel."""
+    """Projections [view, row, col] minus the same projections blurred by a pixel."""
     return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
 
 
 def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[int, int], None]) -> tuple[F32, F32]:
-    """The difference of the views from the volume, and its part that edges explain.
+    """The difference of the projections from the volume, and the part of it that edges explain.
 
-    [view, cell, cell] each, averaged over cells, in standard deviations of noise.
+    Both are [view, cell, cell], averaged over cells, in standard deviations of the noise.
     """
     geometry, weights = whole.geometry, whole.weights
     rows, cols = (n // side for n in geometry.detector_shape)
-    # Means over cells. `weight` is the square root of the intensity, 0 in unknown pixels. The means are those of: the
-    # weighted difference, its part that edges explain, the known pixels, the weighted projection, the weight, and the
-    # difference without weight.
+    # `weight` is the square root of the intensity, 0 in unknown pixels. Means over cells are computed of the weighted
+    # difference, its part that edges explain, the known pixels, the weighted projection, the weight, and the difference
+    # without weight.
     cells, edges, known_cells, weighted_cells, weight_cells, mean_difference = (
         np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6)
     )

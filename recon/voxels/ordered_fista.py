@@ -1,11 +1,12 @@
-"""FISTA with ordered subsets and total variation, which ends when the volume stands still.
+"""FISTA with ordered subsets and total variation, which ends when the volume has converged.
 
     min ½||A x - p||² + μ TV(x), x >= 0
 
-The steps of the first sweeps use subsets of the projections. They are faster by about the number of subsets, but end
-only near the minimum. The steps of the other sweeps use all projections, and end at the minimum (Kim, Ramani & Fessler
-2015, IEEE Trans. Med. Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183; O'Donoghue & Candès 2015).
-Steps are damped where that pays, see `recon.voxels.damping`.
+The steps of the first sweeps (passes over all projections) use subsets of the projections. They converge faster by
+about the number of subsets, but only to the neighbourhood of the minimum. The steps of the later sweeps use all
+projections and converge to the minimum (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34, 167; Beck & Teboulle
+2009, SIAM J. Imaging Sci. 2, 183; O'Donoghue & Candès 2015). Steps are damped if this saves time, see
+`recon.voxels.damping`.
 """
 
 from __future__ import annotations
@@ -40,19 +41,27 @@ from recon.voxels.voxel_problem import (
 )
 
 SUBSETS, MANY_SUBSETS = 3, 9
-"""Largest number of subsets of sweeps that go to the end, and of sweeps that do not."""
+"""Largest number of subsets: for sweeps until the volume has converged, and for a fixed number of sweeps."""
 _LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset: see `SUBSETS`
-# Subsets save time and do not change where the damped steps end. With one subset: 45 sweeps of 30 projections instead
-# of 31, and 29 of 180 instead of 23; 0 to 15 % more CPU time. With subsets up to the end: -0.1 to -1.0 dB.
+# Subsets save time and do not change the volume at which the damped steps end. With one subset, 30 projections need 45
+# sweeps instead of 31, and 180 projections 29 instead of 23, with 0 to 15 % more CPU time. With subsets up to the end:
+# -0.1 to -1.0 dB.
 _LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540  # sweeps, and projections in sweeps, on subsets: the larger of the two
 _MOST_MOMENTUM = 0.9
-"""Largest momentum of damped steps. A larger one adds up the errors of the proximal steps, which make three dual steps
-only: if the air weighs five times as much as the sample, the volume then changes by 1 % in four sweeps, for ever."""
+"""Largest momentum of damped steps.
+
+A larger one accumulates the errors of the proximal steps, which have only three dual steps. If the air then weighs five
+times as much as the sample, the volume never converges: it changes by 1 % in four sweeps.
+"""
 _LEAST_PACE = 0.5
-"""Least ratio of the damped step of the coarsest shapes to their step without damping, for which steps are damped. The
-ratio is small if single rays weigh much more than others. There 60 damped sweeps end further from the minimum than 20
-sweeps without damping. (0.9 without weights; 0.6 if the sample is three times as wide as the field.)"""
-_LEAST_COVERED = 0.9  # of half a turn, for which steps are damped: coarse shapes of the missing wedge come last
+"""Steps are damped only if the damped step of the coarsest shapes is at least this share of their step without damping.
+
+The share is small if single rays weigh much more than others. Then 60 damped sweeps end farther from the minimum than
+20 sweeps without damping. (It is 0.9 without weights, and 0.6 if the sample is three times as wide as the field of
+view.)
+"""
+# least covered share of 180° for damped steps, because coarse shapes of a missing wedge converge last
+_LEAST_COVERED = 0.9
 _LOOKED_AT = 9  # number of projections of a sweep whose residual is kept
 
 
@@ -65,10 +74,10 @@ class Subsets:
         projectors: for each subset.
         step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
         plain_norm: the same eigenvalue, for the projector that is not sharpened.
-        to_the_end: the sweeps end when the volume stands still, and not after a number of them.
-        damping: of steps from a subset; its gain is 1 if steps are not damped.
+        to_the_end: True: the sweeps end when the volume has converged; False: after a fixed number.
+        damping: damping of the steps from a subset; its gain is 1 if steps are not damped.
         damped_step: like `step`, for damped steps and the columns of the problem.
-        damping_of_all: of steps from all projections.
+        damping_of_all: damping of the steps from all projections.
     """
 
     views: Sequence[NDArray[np.intp]]
@@ -82,7 +91,9 @@ class Subsets:
 
     @classmethod
     def of(cls, problem: VoxelProblem, count: int, to_the_end: bool = True) -> Subsets:
-        """So many subsets, see `subsets_of`. Steps are damped if the sweeps go to the end, and if damping pays."""
+        """Subsets, at most `count` of them, see `subsets_of`.
+
+        Steps are damped if the sweeps continue until the volume has converged, and if damping saves time."""
         projector, weight = problem.projector, problem.weight
         views = interleaved(projector, count)
         projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
@@ -102,7 +113,7 @@ class Subsets:
         if not to_the_end or of_subset.gain == 1 or covered < _LEAST_COVERED:
             return made
         longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], of_subset)
-        if longest == 0 or longest < _LEAST_PACE * own:  # 0: no ray meets the box
+        if longest == 0 or longest < _LEAST_PACE * own:  # 0: no ray crosses the box
             return made
         return replace(made, damping=of_subset, damped_step=longest, damping_of_all=of_all)
 
@@ -112,10 +123,10 @@ class Subsets:
 
 
 def subsets_of(geometry: Geometry, most: int = SUBSETS, to_the_end: bool = True) -> int:
-    """Number of subsets, `most` at most: each has `_LEAST_OF_SUBSET` projections or more.
+    """Number of subsets, at most `most`; each has `_LEAST_OF_SUBSET` projections or more.
 
-    If the sweeps do not go to the end, each has twelve or more, and there are two from twelve projections on, because
-    with one subset the sweeps stop far from the minimum.
+    With a fixed number of sweeps, each subset has twelve or more. From twelve projections on there are at least two
+    subsets, because with one subset these sweeps stop far from the minimum.
     """
     if to_the_end:
         return max(1, min(most, geometry.n_views // _LEAST_OF_SUBSET))
@@ -124,35 +135,35 @@ def subsets_of(geometry: Geometry, most: int = SUBSETS, to_the_end: bool = True)
 
 
 RENEWED = 2
-"""After this many sweeps the volume is made anew towards which steps are pulled."""
+"""Number of sweeps after which the volume is recomputed towards which steps are pulled."""
 
 
-# Methods with a pull that held-out projections may prefer, also in the refinement of a fit, see `Discrete`.
+# methods with a pull that held-out projections may prefer, also in the voxel refinement of a fit; see `Discrete`
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
 
 
 def pull_methods(**settings: Any) -> list[Any]:
-    """The methods of `PULLS`, with these settings."""
+    """The methods in `PULLS`, with these settings."""
     return [getattr(loaded(entry.module), entry.cls)(**settings) for entry in PULLS.values()]
 
 
 class Pull(Protocol):
-    """A volume z that follows x, towards which each step of `ordered_fista` moves a share of the way.
+    """A volume z that is computed from x, and towards which each step of `ordered_fista` moves x a share of the way.
 
     Attributes:
-        share: c of c (z - x), of a step that is not damped.
+        share: the factor c in c (z - x), for a step without damping.
     """
 
     @property
     def share(self) -> float: ...
 
     def target(self, x: F32) -> F32:
-        """z [y, x, z] for a volume x, which is not changed."""
+        """The volume z [y, x, z] for a volume x, which is not changed."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The projections that a step uses: their projector, and their numbers, or all."""
+    """The projections that a step uses: their projector, and their numbers or all of them."""
 
     projector: LineProjector[Any]
     views: NDArray[np.intp] | slice
@@ -183,17 +194,17 @@ class _Descent:
         self.x = device.array(x)
         most = _MOST_MOMENTUM if subsets.is_damped else 1.0
         self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
-        self._slope: Any = None  # cells of the force of the prior (total variation, x >= 0) at the last point
+        self._slope: Any = None  # cells of the force of the prior (total variation and x >= 0) at the last point
         self._target: Any = None
         self.error, self.seen = 0.0, list[F32]()
 
     def renew_target(self) -> None:
-        """Make the volume anew towards which steps are pulled."""
+        """Compute the volume again towards which steps are pulled."""
         if self._pull is not None:
             self._target = self._device.array(self._pull.target(self._device.numpy(self.x)))
 
     def sweep(self, weight: NoiseBalance | float, on_subsets: bool, looked_at: bool) -> None:
-        """One pass over all projections; the momentum after its last step is left to `go_ahead`."""
+        """One pass over all projections. `go_ahead` adds the momentum after its last step."""
         self.error, self.seen = 0.0, []
         parts = self._parts if on_subsets else [self._all]
         count, made = len(parts), self._subsets
@@ -206,11 +217,11 @@ class _Descent:
                 self._ahead(self.x)
 
     def go_ahead(self) -> None:
-        """Move the volume on by the momentum, to the start of the next step."""
+        """Add the momentum to the volume: the start of the next step."""
         self._ahead(self.x)
 
     def _residual(self, part: _Part, count: int, looked_at: bool) -> None:
-        """Put the gradient of these projections into `_gradient`, downhill."""
+        """Write the negative gradient for these projections into `_gradient`."""
         device, residual = self._device, part.projector.forward_lines(self.x)
         data, rays = self._data[part.views], None if self._rays is None else self._rays[part.views]
         self.error += device.replace_by_residual(data, residual, rays)
@@ -223,7 +234,7 @@ class _Descent:
         part.projector.adjoint_lines(residual, self._gradient)
 
     def _step(self, mu: float, count: int, damping: Damping, step: float, damped_step: float) -> None:
-        """x <- prox of total variation after a step along the gradient; see `ordered_fista`."""
+        """One step: x <- proximal point of total variation after a gradient step; see `ordered_fista`."""
         device, x, length = self._device, self.x, damping.gain * damped_step
         if self._pull is not None:
             pull = self._pull.share / step
@@ -253,25 +264,24 @@ def ordered_fista(
     problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
     pull: Pull | None = None, still: float = STANDS_STILL,
 ) -> F32:  # fmt: skip
-    """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume stands still.
+    """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume has converged.
 
         x <- prox_{gain t μ TV}(x + gain t (g - L (g - v))),    g = A_sᵀ W (p_s - A_s x), downhill
 
-    with m subsets s of the projections, μ / m for μ, and t the safe step of gain (1 - L) AᵀWA of a subset. v is μ times
-    the slope of total variation at the last point, by the last proximal step: if the volume stands still, g = v, and
-    the steps end at the minimum whatever L is. Without damping (gain 1, L = 0) these are the steps of FISTA.
-
-    After `_VIEWS_ON_SUBSETS` projections, and six sweeps at least, each damped step uses all projections; steps that
-    are not damped stay on subsets. The sweeps end when four of them together change the volume by less than `still` of
-    its norm; the settings `ENDED` say how they ended. Sweeps of `subsets` that do not go to the end are `sweeps` in
-    number. Memory: 8 volumes, 2 x the projections.
+    with m subsets s of the projections, μ / m instead of μ, and t the safe step of gain (1 - L) AᵀWA of a subset. v is
+    μ times the slope of total variation at the last point, from the last proximal step. When the volume has converged,
+    g = v, so that the steps end at the minimum for any L. Without damping (gain 1, L = 0) these are the steps of FISTA.
+    After `_VIEWS_ON_SUBSETS` projections, but at least six sweeps, each damped step uses all projections. Steps without
+    damping always use subsets. The sweeps end when four of them together change the volume by less than `still` of its
+    norm; the settings `ENDED` say how they ended. If `subsets` are for a fixed number of sweeps, there are `sweeps` of
+    them. Memory: 8 volumes, 2 x the projections.
 
     Args:
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
-        sweeps: largest number.
+        sweeps: largest number of sweeps.
         tv_steps: dual steps of each proximal step, which continue from the last ones.
-        pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is minimised, too.
+        pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is also minimised.
         still: share of the norm of the volume; 0: all sweeps are made.
     """
     descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)

@@ -1,4 +1,4 @@
-"""Priors: the weight of total variation by the noise, and steps with sparse patches."""
+"""Priors: the weight of total variation from the noise, and the denoiser of sparse patches (PnP-DCT)."""
 
 from __future__ import annotations
 
@@ -30,28 +30,30 @@ from recon.voxels.voxel_problem import (
     whitened,
 )
 
-MATTER = 0.05  # of the density unit: voxels above it count
+MATTER = 0.05  # share of the density unit above which a voxel is material
 
 
 @dataclass(eq=False)
 class NoiseBalance:
     """The weight μ of total variation in min ½||A x - p||² + μ TV(x), x >= 0, adapted after each sweep over the views.
 
-    It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its voxels of matter and σ the noise
-    of a ray: as if each voxel's change were drawn from a Laplace distribution of the mean change. After each sweep it
-    is the first weight times (σ / s)², at least once and at most four times it, where s is the noise-like part of the
-    residual. It rises where the residual has less noise than the data, since then the volume has taken it up. Rings and
-    errors of the geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So
-    when three eighths of the sweeps are done, an s larger than σ takes its place: the weight is (s / σ)² times the
-    first one, at most four times. Here s is the least so far, so that the weight only falls.
+    It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its number of voxels of material and
+    σ the noise of a ray. This assumes a Laplace distribution, with the mean change, for the change of each voxel. After
+    each sweep the weight is the first weight times (σ / s)², limited to 1 to 4 times the first weight, where s is the
+    noise-like part of the residual. The weight rises if the residual has less noise than the data, because then the
+    volume has fitted the noise. Rings, and errors of the geometry or of the air, which no volume explains, make s large
+    and change the volume like noise. So after three eighths of the sweeps, s replaces σ if it is larger: the weight is
+    (s / σ)² times the first one, at most four times. Here s is the smallest value so far, so that the weight can only
+    fall.
 
     Attributes:
-        first: the weight to begin with.
-        noise: of a ray, with which the residual is compared: `noise_beside_structure` of the data. For many views it is
-            up to 1.3 times that (π / 2 times the columns determine a slice). Then little of it fits into a volume.
-        sweeps: of the method. After three eighths of them the residual is looked at. Before, a method that has not
-            converged seems to leave what no volume explains. Then the weight would be too heavy, and the residual
-            large, up to the end.
+        first: the first weight.
+        noise: noise of a ray, with which the residual is compared: `noise_beside_structure` of the data. With many
+            projections it is up to 1.3 times as large, because then little of the noise fits into a volume (π / 2 times
+            the number of columns determine a slice).
+        sweeps: number of sweeps of the method. The residual is used after three eighths of them. Before, the residual
+            of a method that has not converged would look unexplainable, and the weight and the residual would stay too
+            large up to the end.
     """
 
     first: float
@@ -69,9 +71,8 @@ class NoiseBalance:
         """The weight for a problem.
 
         Args:
-            start: [y, x, z], not zero, the volume that it follows from where no direct method makes one; None: without
-                one the weight is 0.
-            sweeps: of the method.
+            start: [y, x, z], not zero; the volume x₀ if no direct method can make one. None: then the weight is 0.
+            sweeps: number of sweeps of the method.
         """
 
         def noise_of(views: F32) -> float:
@@ -88,7 +89,7 @@ class NoiseBalance:
         return cls(share, left * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
-        """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""
+        """Adapt the weight to the residual (some whitened projections [view, col, row]), and return the weight."""
         self._done += 1
         deviation = median_deviation(residual)
         if not (deviation > 0 and self.noise > 0):
@@ -102,33 +103,33 @@ class NoiseBalance:
 
 
 def _by_views(geometry: Geometry) -> float:
-    """Factor on the noise by the number of views, over those that determine a slice: π / 2 a column."""
+    """Factor on the noise from the number of projections; π / 2 projections per column determine a slice."""
     determined = min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
     return 1 + MANY_VIEWS * min(max(determined / HALF_OF_MANY - 1, 0.0), 1.0)
 
 
 STEPS = 5
-"""Steps towards the views between two thresholds."""
+"""Number of steps towards the projections between two thresholds."""
 
 
 def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F32:
-    """The volume that explains the views and whose 4 x 4 x 4 patches have few cosine coefficients.
+    """The volume that fits the projections and whose patches of 4 x 4 x 4 voxels have few cosine coefficients.
 
         z <- D(x, strength 1.25^(rounds to come)),    x <- some steps towards min ½||A x - p||² + m/2 |x - z|², x >= 0
 
-    and D(x, strength) in the end. D is the mean of all overlapping patches, each without coefficients up to the
+    and D(x, strength) at the end. D is the mean of all overlapping patches, each without the coefficients below the
     threshold (the first stage of BM4D without groups: Maggioni et al. 2013, IEEE Trans. Image Process. 22, 119). The
     rounds are half-quadratic splitting (Geman & Yang 1995, IEEE Trans. Image Process. 4, 932) with a denoiser plugged
-    in (Venkatakrishnan, Bouman & Wohlberg 2013, IEEE GlobalSIP, 945). The steps are Chebyshev's on the known bounds of
-    the eigenvalues, m to L + m with m = 0.03 L, so that no scalar product decides: a slice depends on those near it
-    alone, three further ones a round. A step that would leave x >= 0 ends there, and its momentum, too.
+    in (Venkatakrishnan, Bouman & Wohlberg 2013, IEEE GlobalSIP, 945). The steps are Chebyshev steps on the known bounds
+    of the eigenvalues, m to L + m with m = 0.03 L. They need no scalar products, so that a slice depends only on slices
+    near it: three more on each side per round. A step that would leave x >= 0 ends at 0, and so does its momentum.
 
     Memory: 4 volumes, two more that reach three voxels beyond the faces, and the projections once more.
 
     Args:
         x: [y, x, z], overwritten. Far from the sample, more steps are needed.
         strength: last threshold, in the unit of the volume.
-        steps: towards the views, five a round.
+        steps: number of steps towards the projections, five per round.
     """
     bound = problem.decide("bound", lambda: problem.norm)
     device, rounds = voxel_device(problem.projector.device), -(-steps // STEPS)
@@ -147,11 +148,11 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
 
 
 ViewsOnDevice = tuple[LineProjector[Any], Any, Any]
-"""Projector, line integrals and weights of a problem, the arrays on its device."""
+"""Projector, line integrals and weights of a problem; the arrays are on its device."""
 
 
 def views_on_device(problem: VoxelProblem) -> ViewsOnDevice:
-    """What `towards_views` compares a volume with; on the CPU the problem's own arrays."""
+    """The data with which `towards_views` compares a volume; on the CPU the arrays of the problem."""
     device = voxel_device(problem.projector.device)
     weight = None if problem.weight is None else device.array(problem.weight)
     return projector_on(device, problem.projector), device.array(problem.data), weight
@@ -162,8 +163,8 @@ def towards_views(
 ) -> bool:
     """Steps of Chebyshev's semi-iteration from x towards min ½||A x - p||² + m/2 |x - z|², in place.
 
-    Golub & Varga 1961, Numer. Math. 3, 147. Whether `problem.go_on` was content, which is told `done` and more steps.
-    `views` are the problem's, and x and z [y, x, z] arrays of its device.
+    Golub & Varga 1961, Numer. Math. 3, 147. The result is that of `problem.go_on`, which gets the number of steps,
+    counted from `done`. `views` are those of the problem; x and z [y, x, z] are arrays of its device.
     """
     device, pull = voxel_device(problem.projector.device), PULL * bound
     projector, data, rays = views
@@ -185,7 +186,7 @@ def towards_views(
 
 
 def noise_of_volume(problem: VoxelProblem) -> float:
-    """Standard deviation that the noise of the views leaves in a volume after the steps of a round."""
+    """Standard deviation that the noise of the projections causes in a volume after the steps of one round."""
     rng = np.random.default_rng(0)
     data = rng.normal(0, 1, problem.data.shape).astype(np.float32)
     if problem.weight is not None:

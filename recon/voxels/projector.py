@@ -1,14 +1,15 @@
 """The voxel projector: line integrals through a volume, and the exact transpose.
 
-Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. A caller
-that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
-and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
+Both directions compute on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. A
+caller that applies them many times keeps this layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...). `forward`
+and `adjoint` use the normal layout and need a copy each way (256³ voxels: about 0.05 s on two cores).
 
-A projection has the resolution of the views, see `ViewResolution`: of pixels one pitch wide, or of `Geometry.width`.
-With an arc, a view is the mean of views at angles within it. Both are linear and transposed exactly. Pixels should not
-be much larger than voxels, or voxels between the rays are not seen.
+A computed projection has the resolution of the measured ones, see `ViewResolution`: that of pixels one pitch wide, or
+that of `Geometry.width`. With an arc, a projection is the mean of projections at angles within the arc. Both operations
+are linear and are transposed exactly. Pixels should not be much larger than voxels, because otherwise no ray crosses
+some voxels.
 
-With `Geometry.skew`, bands of slices are seen at the angles of their rows.
+With `Geometry.skew`, bands of slices are projected at the angles of their rows.
 """
 
 from __future__ import annotations
@@ -36,20 +37,21 @@ from recon.kernels.cpu.spread import spread
 from recon.kernels.cpu.vectors import combine
 from recon.voxels.resolution import ViewResolution, levels, on_rows
 
-_TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
-_EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
-_LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
+_TALL = 0.25  # share of the box's height; if projections move along the axis by more, rays that leave the box are kept
+_EDGE_ROWS = 0.01  # distance in slices beyond the outer ones that still counts as seen
+_LOOK = 1.0  # px at the edge of the field of view between two angles within an exposure
 _MOST_LOOKS = 16
-_LOOKED_AT = 32  # views, about, that tell which rows see a voxel
-_FEW_SLICES = 2  # of a parallel beam, one by one in 0.4 to 0.7 of the time of the kernel of sixteen
-_STEEP = 1e-8  # of a squared cosine: columns along the rotation axis
+_LOOKED_AT = 32  # approximate number of projections from which the rows that see a voxel are found
+# slices of a parallel beam that are computed one by one, in 0.4 to 0.7 of the time of the kernel for sixteen
+_FEW_SLICES = 2
+_STEEP = 1e-8  # squared cosine below which columns run along the rotation axis
 
 
 class _Rays(NamedTuple):
-    """Rays of all views at one moment of their exposures, through a band of slices: the kernels' `ray_table`."""
+    """Rays of all projections at one time within their exposures, through a band of slices; see `ray_table`."""
 
     table: NDArray[np.float64]
-    axes: NDArray[Any]  # of the planes that sample each ray, as the kernels count them
+    axes: NDArray[Any]  # of the planes in which each ray is sampled, numbered as in the kernels
     views: NDArray[np.float64] = np.empty(0)  # of a cone
 
 
@@ -58,15 +60,16 @@ class Projector:
     """Line integrals A through the voxels of `grid` along the rays of `geometry`, and their transpose Aᵀ.
 
     Joseph's interpolation (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192): a ray is sampled once in each plane
-    of voxels, bilinearly. The volume is 0 outside the box. In mm times the volume's unit, float32.
+    of voxels, bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
 
     Attributes:
-        matched: projections are sharpened to the resolution of the views.
-        device: that loops over it compute on, see `recon.voxels.devices`; its own methods take the CPU.
-        sharpened: [view, 2] px² of variance that this takes off along columns and rows; None: nothing.
+        matched: True if projections are sharpened to the resolution of the measured ones.
+        device: device on which loops with this projector compute, see `recon.voxels.devices`; its own methods use the
+            CPU.
+        sharpened: [view, 2] variance in px² that the sharpening removes along columns and rows; None: no sharpening.
 
     Raises:
-        ValueError: for a box that reaches the source, or a wide cone seen under a large tilt (see `posed.ray_table`).
+        ValueError: the box reaches the source, or a wide cone has a large tilt (see `posed.ray_table`).
     """
 
     geometry: Geometry
@@ -83,8 +86,8 @@ class Projector:
         reach = float(np.hypot(*(np.abs(self.grid.edges[:, :2]).max(0) + beyond)))
         if self.geometry.is_cone and reach >= self.geometry.source_distance:
             raise ValueError(
-                f"the box reaches {reach:.4g} mm from the rotation axis, with half a voxel beyond it, but the source "
-                f"stands at {self.geometry.source_distance:.4g} mm: give a smaller grid"
+                f"use a smaller grid: with half a voxel beyond it, the box reaches {reach:.4g} mm from the rotation "
+                f"axis, and the source is at {self.geometry.source_distance:.4g} mm"
             )
         found = [
             (band, [self._rays(at) for at in views_of_exposure(views)])
@@ -110,16 +113,17 @@ class Projector:
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
-        """An upper estimate of the largest eigenvalue of AᵀWA over that of `plain`; `weight`: W, of each ray.
+        """An upper estimate of the largest eigenvalue of AᵀWA, divided by that of `plain`; `weight`: W, of each ray.
 
-        Sharpening by s raises the finest detail by 1 + 2 s. Along rows, all views see it. Along columns only views do
-        whose columns differ by less than a voxel at the edge of the field, and all see the largest eigenvector, unless
-        few rays weigh more than the others.
+        Sharpening by s raises the finest detail by the factor 1 + 2 s. Along rows, this concerns all projections. Along
+        columns, it concerns only projections whose columns differ by less than a voxel at the edge of the field of
+        view. The largest eigenvector contributes to all projections, unless a few rays weigh more than the others.
         """
         if self.sharpened is None:
             return 1.0
         cols, rows = ((1 + 2 * max(float(most), 0.0)) ** 2 for most in self.sharpened.max(0))
-        turned = 1 - np.square(np.sin(self.geometry.roll) * np.cos(self.geometry.tilt)).max()  # by a turn of the sample
+        # by a rotation of the sample
+        turned = 1 - np.square(np.sin(self.geometry.roll) * np.cos(self.geometry.tilt)).max()
         angles = np.sort(np.mod(self.geometry.angles, np.pi))
         turns, alike = np.concatenate((angles, angles + np.pi)), 2 / self.geometry.detector_shape[1]
         last = np.searchsorted(turns, turns + alike / math.sqrt(max(turned, _STEEP)), "right")
@@ -129,11 +133,11 @@ class Projector:
         return rows * (1 + (cols - 1) * min(share, 1.0))
 
     def subset(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Projector:
-        """The same for some views only, in that order."""
+        """The projector for some of the projections, in this order."""
         return replace(self, geometry=self.geometry.select(views))
 
     def __call__(self, volume: F32) -> F32:
-        """A x, as `forward`."""
+        """A x, see `forward`."""
         return self.forward(volume)
 
     @property
@@ -175,7 +179,7 @@ class Projector:
         return result
 
     def _mean(self, direction: Literal["forward", "adjoint"], source: F32, out: F32) -> None:
-        """The mean over the moments of an exposure, band by band of slices, from `source` into `out`."""
+        """The mean over the angles within an exposure, band of slices by band, from `source` into `out`."""
         for band, moments in self._bands:
             whole = band == slice(0, self.grid.shape[0])
             part = source if whole else np.ascontiguousarray(source[..., band])
@@ -192,7 +196,7 @@ class Projector:
 
     @property
     def _kernels(self) -> Any:
-        """The module of the kernels that take these rays."""
+        """The module with the kernels for these rays."""
         if not self.geometry.is_straight:
             return posed_cpu
         return one_slice_cpu if self._slice_by_slice() else cone_cpu if self.geometry.is_cone else joseph_cpu
@@ -202,7 +206,7 @@ class Projector:
         return _Rays(*kernels.ray_table(views, self.grid))
 
     def _apply(self, direction: Literal["forward", "adjoint"], source: F32, rays: _Rays, out: F32) -> None:
-        """One kernel at one moment of the exposures, from `source` into `out`."""
+        """One kernel at one time within the exposures, from `source` into `out`."""
         kernels = self._kernels
         if kernels is one_slice_cpu:
             for k in range(source.shape[2]):
@@ -213,26 +217,30 @@ class Projector:
         getattr(kernels, direction)(source, *(rays if kernels is cone_cpu else rays[:2]), out)
 
     def _spread(self, lines: F32) -> F32:
-        """Lines [view, col, row] at the resolution of the views, see `ViewResolution`; its own transpose."""
+        """Lines [view, col, row] at the resolution of the measured projections, see `ViewResolution`.
+
+        It is its own transpose.
+        """
         if self.sharpened is None:
             return lines
         return spread(lines, -self.sharpened[:, 0], -self.sharpened[:, 1])
 
     def _slice_by_slice(self) -> bool:
-        """All rays of straight views run in the planes of a few slices: a parallel beam, or a fan and its slice."""
+        """Whether all rays are in the planes of a few slices: a parallel beam without tilt, or a fan and its slice."""
         if self.geometry.is_cone:
             return self.geometry.is_fan and self.grid.shape[0] == 1 and self.grid.centre[0] == 0
         return self.grid.shape[0] <= _FEW_SLICES
 
     @cached_property
     def _to_rows(self) -> bool:
-        """The kernels give rows of the detector, not lines of slices: each ray has a height of its own, or slice k lies
-        on row k of every view."""
+        """Whether the kernels return rows of the detector and not lines of slices.
+
+        They do if each ray has its own height, or if slice k is on row k of every projection."""
         return not self.geometry.is_straight or self.geometry.is_cone or on_rows(self.geometry, self.grid)
 
 
 def views_of_exposure(geometry: Geometry) -> list[Geometry]:
-    """The views at angles spread evenly over their exposures (midpoint rule); one where the stage stands."""
+    """The projections at angles spread evenly over their exposures (midpoint rule); one if the stage does not turn."""
     arc = geometry.width.arc
     if arc == 0:
         return [geometry]
@@ -243,13 +251,13 @@ def views_of_exposure(geometry: Geometry) -> list[Geometry]:
 
 
 def volume_lines(volume: F32) -> F32:
-    """[z, y, x] to a new [y, x, z]."""
+    """Copies [z, y, x] to a new array [y, x, z]."""
     nz, ny, nx = volume.shape
     return projection_lines(_plain(volume).reshape(1, nz, ny * nx)).reshape(ny, nx, nz)
 
 
 def measured_share(known: Mask, geometry: Geometry, grid: Grid) -> F32:
-    """Share [z, y, x] of the rays through each voxel that are of known rows [row] of the detector; 0 where none are."""
+    """Share [z, y, x] of the rays through each voxel that end on known rows [row] of the detector; 0 if none does."""
     some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _LOOKED_AT)))
     projector, rays = Projector(some, grid, matched=False), np.ones((some.n_views, *some.detector_shape), np.float32)
     every = projector.adjoint(rays)
@@ -257,13 +265,13 @@ def measured_share(known: Mask, geometry: Geometry, grid: Grid) -> F32:
 
 
 def volume_slices(lines: F32) -> F32:
-    """[y, x, z] to a new [z, y, x]."""
+    """Copies [y, x, z] to a new array [z, y, x]."""
     ny, nx, nz = lines.shape
     return projection_lines(lines.reshape(1, ny * nx, nz)).reshape(nz, ny, nx)
 
 
 def projection_lines(projections: F32) -> F32:
-    """[view, row, col] to a new [view, col, row]."""
+    """Copies [view, row, col] to a new array [view, col, row]."""
     views, rows, cols = projections.shape
     out = np.empty((views, cols, rows), np.float32)
     swap_last(_plain(projections), out)
@@ -271,7 +279,7 @@ def projection_lines(projections: F32) -> F32:
 
 
 projection_images = projection_lines
-"""[view, col, row] to a new [view, row, col]: the same exchange."""
+"""Copies [view, col, row] to a new array [view, row, col] (the same exchange of axes)."""
 
 
 def project(volume: Volume, geometry: Geometry) -> F32:
@@ -280,10 +288,11 @@ def project(volume: Volume, geometry: Geometry) -> F32:
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
-    """[view, row, col] rays of a parallel beam between the outer slices of the grid, which the volume can explain.
+    """Mask [view, row, col] of the rays of a parallel beam that stay between the outer slices of the grid.
 
-    One column stands for all where views are straight. A ray that roll or tilt takes beyond these slices within the
-    field is not among them. Of views that climb by a quarter of the box or more, the middle of each ray decides.
+    Only these rays can be explained by the volume. Without roll and tilt, one column represents all columns. A ray that
+    leaves these slices within the field of view because of roll or tilt is excluded. If projections move along the axis
+    by a quarter of the box or more, the middle of each ray decides.
     """
     rows, cols = geometry.detector_shape
     down = np.arange(rows)[:, None] - geometry.axis_row - geometry.shifts[:, 1, None, None]
@@ -304,5 +313,5 @@ def _plain(array: F32) -> F32:
 
 def _fitting(array: F32, shape: tuple[int, ...], name: str) -> F32:
     if np.shape(array) != shape:
-        raise ValueError(f"the {name} has shape {np.shape(array)}, the projector expects {shape}")
+        raise ValueError(f"the {name} must have the shape {shape} of the projector, got {np.shape(array)}")
     return array

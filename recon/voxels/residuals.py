@@ -1,4 +1,4 @@
-"""Residuals: what a volume leaves of views, view by view, at the resolution of its voxels."""
+"""Residuals: the difference between a volume and each projection, at the resolution of the voxels."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import whitened
 
-RAYS, _ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
-_GROUPS = 4  # of views that are projected one after the other, where rows show no slices
+RAYS, _ROWS = 2**17, 16  # most pixels used of a projection; rows of a band. Bands of rows represent a large detector
+_GROUPS = 4  # groups of projections that are computed one after the other, if rows do not show slices
 
 
 class SquaresLeft(NamedTuple):
-    """Sums over the measured rays of each view [view]: squares of what a volume leaves, squares of the view itself, and
-    the number of these rays."""
+    """Sums over the measured rays of each projection [view].
+
+    The sums are squares of the residual, squares of the projection itself, and the number of these rays."""
 
     left: F64
     own: F64
@@ -31,10 +32,10 @@ class SquaresLeft(NamedTuple):
 
     @property
     def residual(self) -> float:
-        """The data residual of all these views, for every command that states one.
+        """The data residual of all these projections, as every command reports it.
 
         Raises:
-            ValueError: the views are zero everywhere.
+            ValueError: all projections are zero.
         """
         if not self.own.any():
             raise ValueError("all projections are zero, so no residual can be computed")
@@ -42,29 +43,31 @@ class SquaresLeft(NamedTuple):
 
 
 def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> SquaresLeft:
-    """What a volume leaves of each view, at the resolution of voxels.
+    """Squares of the residual of each projection, at the resolution of voxels.
 
-    The truth leaves the noise alone, by that; of views as measured it would leave more than a sharper volume does.
+    At this resolution the residual of the true volume is only the noise. At the resolution of the measured projections,
+    the true volume would have a larger residual than a sharper one.
 
     Args:
         model: [view, col, row], the projection of the volume by a `Projector` of this resolution.
-        views: line integrals as measured, less what no voxel can explain. Values that are not finite do not count.
-        weight: of the rays; None: one for all.
+        views: measured line integrals, minus the part that no voxel can explain. Values that are not finite do not
+            count.
+        weight: weights of the rays; None: 1 for all.
     """
     counts = np.isfinite(views) if weight is None else np.isfinite(views) & (weight > 0)
     return _summed(whitened(model - at_voxel_resolution(views, resolution, counts), weight), views, counts)
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """[view] root mean square of what a volume leaves, see `squares_left`, of views with a measured ray; [inf] if there
-    is none.
+    """Root mean square [view] of the residuals, see `squares_left`, for projections with a measured ray; [inf] if none
+    has.
     """
     left, _, rays = squares_left(model, views, weight, resolution)
     return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
-    """`unseen_residuals` of a volume in views."""
+    """`unseen_residuals` of a volume in these projections."""
     projector = Projector(views.geometry, volume.grid)
     weights = None if views.weights is None else projection_lines(views.weights[...])
     model = projector.forward_lines(volume_lines(volume.data))
@@ -80,19 +83,20 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
 def left_by_volume(
     volume: Volume, views: Views, most: int, progress: Callable[[int, int], None], *, beside_uniform: bool = False
 ) -> tuple[SquaresLeft, tuple[float, float] | None]:
-    """What a volume leaves of at most `most` views, evenly spread.
+    """The residual of a volume in at most `most` projections, evenly spread.
 
-    Of a detector with more than 2^17 pixels only bands of rows with so many pixels are used.
+    If a detector has more than 2^17 pixels, only bands of rows with about this number of pixels are used.
 
     Args:
-        progress: how many of how many views were compared.
-        beside_uniform: compare it with volumes of one density, too.
+        progress: function called with the number of projections compared so far, and their total number.
+        beside_uniform: True: also compare the volume with volumes of uniform density.
 
     Returns:
-        The sums of these views, and where it is compared the residual in the differences of rays from the mean of their
-        row: of the volume, and the lesser one of two uniform volumes with the density of least residual, a box and a
-        cylinder that fill the slices. A volume that leaves more shows nothing of the sample yet. The means tell
-        nothing: they hold matter beyond the field, too, which a right volume lacks. Both are 0 where views have no such
+        The sums of these projections. With `beside_uniform`, also two residuals of the differences of rays from the
+        mean of their row. The first is that of the volume. The second is that of a uniform box or cylinder that fills
+        the slices, with the best density; the smaller of the two counts. A volume with a larger residual than this
+        shows nothing of the sample yet. The means of rows are left out, because they also contain material outside the
+        field of view, which a correct volume does not contain. Both residuals are 0 if the projections have no such
         differences.
     """
     some, grid = spread(np.arange(views.geometry.n_views), most), volume.grid
@@ -101,7 +105,7 @@ def left_by_volume(
     uniform = [Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True)]
     volumes = [volume, *uniform] if beside_uniform else [volume]
     bands = _bands(views, some, grid)
-    # What is not looked at in bands of rows takes less memory in groups of views.
+    # Without bands of rows, groups of projections save memory.
     groups = np.array_split(np.arange(some.size), 1 if views.geometry.rows_show_slices else min(some.size, _GROUPS))
     sums, products, total = np.zeros((3, some.size)), np.zeros((4, 4)), 0.0
     for n, (group, rows) in enumerate(((group, rows) for group in groups for rows in bands), 1):
@@ -126,7 +130,7 @@ def left_by_volume(
 
 
 def _along_rows(products: F64, total: float) -> tuple[float, float]:
-    """The residuals along rows from the products of the views, the volume and the two uniform ones."""
+    """The residuals along rows, from the products of the projections, the volume and the two uniform volumes."""
     if total == 0:
         return 0.0, 0.0
     squares = products[0, 0] - 2 * products[0, 1] + products[1, 1]
@@ -136,15 +140,15 @@ def _along_rows(products: F64, total: float) -> tuple[float, float]:
 
 
 def _without_means(lines: F32, known: Mask) -> F64:
-    """The differences of known rays [view, col, row] from the mean of their row; 0 of the others."""
+    """The differences of known rays [view, col, row] from the mean of their row; 0 for unknown rays."""
     values, n = np.where(known, lines, np.float64(0)), np.maximum(known.sum(axis=1, keepdims=True), 1)
     return np.where(known, values - values.sum(axis=1, keepdims=True) / n, 0)
 
 
 def _bands(views: Views, some: I64, grid: Grid) -> list[slice]:
-    """Bands of rows that represent the detector, at equal shares of the matter that these views show.
+    """Bands of rows that represent the detector, at equal shares of the material that these projections show.
 
-    All rows, unless the detector is large; one band if rows are not slices.
+    All rows if the detector is not large; one band if rows do not show slices.
     """
     rows, cols = views.geometry.detector_shape
     bands = max(1, RAYS // (_ROWS * cols))

@@ -1,15 +1,17 @@
-"""How much blurrier projections of voxels are than measured views, and where that is corrected.
+"""How much more blurred projections of voxels are than measured projections, and the correction of this blur.
 
-A pixel of a view is the mean of line integrals over its area, of variance p²/12 along columns and along rows. A voxel
-of a volume is the mean of the object over its edges h, of variance h²/12 along every direction. Its projection by
-Joseph's samples interpolates between the voxels of a plane. At a distance d of a voxel from the nearest one, this has
-the variance d (1 - d) h², h²/6 on average, along the two axes in the plane. So a projection is blurrier than a view by
+A pixel of a measured projection is the mean of line integrals over its area, with the variance p²/12 along columns and
+along rows. A voxel is the mean of the object over its edges h, with the variance h²/12 along every direction. The
+projection of voxels by Joseph's method interpolates between the voxels of a plane. At a distance d (in voxels) from the
+nearest voxel, this adds the variance d (1 - d) h², on average h²/6, along the two axes in the plane. So the variance of
+the blur of a computed projection is larger than that of a measured one by
 
-    e = Σ U_k² h_k² / 12 + Σ U_k² h_k² / 6 - (w² / 12 + b²)      k: axes of the grid; the second sum without that across
-                                                                 the planes
+    e = Σ U_k² h_k² / 12 + Σ U_k² h_k² / 6 - (w² / 12 + b²) k: axes of the grid; the second sum without the axis
+    perpendicular to the planes
 
-along the columns, whose direction is U, and as much with V in place of U along the rows. h is in pixels at the middle
-of the box, w and b are those of `RayWidth`, where w is 1 if nothing else is known. docs/numerics.md derives it.
+along the columns, whose direction is U, and by the same with V instead of U along the rows. h is in pixels at the
+middle of the box. w and b are the pixel and the blur of `RayWidth`; w is 1 if it is not known. docs/numerics.md derives
+it.
 """
 
 from __future__ import annotations
@@ -27,26 +29,28 @@ from recon.kernels.cpu.spread import passes_of, spread
 
 _MOST = (
     1 / 6
-)  # px² of excess that sharpening corrects, as voxels as wide as pixels have; views are smoothed by the rest
-_ALL = 1 / 6  # of an edge squared: variance of interpolation at all distances, on average
-_ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
-_NOTHING = 1e-9  # px²: rounding
-_STILL = 0.1  # voxels: rays that drift by less within the box meet all planes alike
-_DIGITS = 4  # of a variance: where a slab begins does not change it
-_PAD = 16  # px beyond the edges of views, to which the outer ones are repeated
+)  # px²; excess that sharpening corrects, which is that of voxels as wide as pixels. The rest smooths the projections
+_ALL = 1 / 6  # variance of the interpolation in squared edges, averaged over all distances
+_ON_ROWS = 1e-6  # distance in slices up to which slices count as being on the rows
+_NOTHING = 1e-9  # px²; rounding error
+_STILL = 0.1  # voxels; if a ray drifts by less than this within the box, it crosses all planes at the same position
+_DIGITS = 4  # digits of a variance, so that it does not depend on where a slab begins
+_PAD = 16  # px beyond the edges to which the outer pixels are repeated
 
 
 @dataclass(frozen=True, eq=False)
 class ViewResolution:
-    """The blur of line integrals through voxels, beside that of the views, along (columns, rows) of each view.
+    """The blur of line integrals through voxels and of the measured projections, along (columns, rows).
 
     Attributes:
         voxels: [view, 2, 3], edges of a voxel along the axes (x, y, z), in px as seen along columns and rows.
-        interpolation: [view, 3], variance along these axes of a ray's interpolation, in squares of an edge: 1/6, the
-            mean over all distances d, but for a parallel view along a grid axis, where all rays have one: d (1 - d).
-        views: variance of a pixel in px², and of the detector's blur.
-        sharpens_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are
-            not: a slab would depend on the rows beside it, and views that lean a little on how much.
+        interpolation: [view, 3], variance of the interpolation along these axes, in squared edges: 1/6 (the mean over
+            all distances d). For a parallel projection along a grid axis, all rays have the same d, and it is d (1 -
+            d).
+        views: variance of a pixel and of the detector's blur in px².
+        sharpens_rows: True for a cone, whose rows all interpolate between slices: rows are also sharpened. False for a
+            parallel beam, because otherwise a slab would depend on the rows next to it, and slightly tilted projections
+            would depend on the tilt.
     """
 
     voxels: F64
@@ -68,12 +72,15 @@ class ViewResolution:
         return cls(np.abs(axes[:, :2]) * edges[:, None], interpolation, views, geometry.is_cone)
 
     def select(self, views: NDArray[np.intp]) -> ViewResolution:
-        """The resolution of these views, in their order."""
+        """The resolution of these projections, in their order."""
         return replace(self, voxels=self.voxels[views], interpolation=self.interpolation[views])
 
     @property
     def excess(self) -> F64:
-        """[view, 2] px², by which projections of a volume are blurrier than views; negative: sharper."""
+        """Variance [view, 2] in px² by which computed projections are more blurred than measured ones.
+
+        Negative: less.
+        """
         squares = self.voxels**2
         own = squares.sum(2) / 12 + (squares * self.interpolation[:, None]).sum(2)
         excess = own - sum(self.views)
@@ -81,23 +88,26 @@ class ViewResolution:
 
     @property
     def sharpened(self) -> F64:
-        """[view, 2] px² of variance that the model takes off its projections; negative: that it adds to them."""
+        """Variance [view, 2] in px² that the model removes from its projections by sharpening.
+
+        Negative: that it adds.
+        """
         most = self._most[:, None] * (1.0, float(self.sharpens_rows))
         return np.minimum(np.where(self.excess > 0, SHARPENED * self.excess, self.excess), most)
 
     @property
     def _most(self) -> F64:
-        """[view] px² of excess of voxels as wide as pixels."""
+        """Excess [view] in px² of voxels as wide as pixels."""
         return np.maximum(self.interpolation.max(1), _MOST)
 
     @property
     def smoothed(self) -> F64:
-        """[view, 2] px² of variance added to the views, whose edges are sharper than coarse voxels can show."""
+        """Variance [view, 2] in px² added to measured projections, because coarse voxels show no sharp edges."""
         beyond = self.excess - self._most[:, None]
         return np.where(beyond > _NOTHING, beyond, 0.0)
 
     def transfer(self, axis: int, f: F64) -> F64:
-        """[view, frequency] what a projection by the model keeps of a view at f cycles a pixel."""
+        """Transfer function [view, frequency] of the model relative to measured projections, at f cycles per pixel."""
         edges, variance = self.voxels[:, axis, :, None] * f, self.interpolation[..., None]
         at = np.sinc(edges)
         d = (1 - np.sqrt(np.maximum(1 - 4 * variance, 0))) / 2
@@ -111,7 +121,7 @@ class ViewResolution:
 
 
 def on_rows(geometry: Geometry, grid: Grid) -> bool:
-    """Slice k lies on row k of every view of a parallel beam."""
+    """Whether slice k is on row k in every projection of a parallel beam."""
     if geometry.is_cone or not geometry.is_straight:
         return False
     first, step = levels(geometry, grid)
@@ -120,17 +130,17 @@ def on_rows(geometry: Geometry, grid: Grid) -> bool:
 
 
 def levels(geometry: Geometry, grid: Grid) -> tuple[F64, float]:
-    """The slice (fractional) that the first row of each view sees, and slices a row; parallel beam."""
+    """The (fractional) slice that the first row of each projection sees, and slices per row; parallel beam."""
     middle = (grid.shape[0] - 1) / 2 - grid.centre[0] / grid.spacing[0]
     step = geometry.pixel_pitch / grid.spacing[0]
     return middle - (geometry.axis_row + geometry.shifts[:, 1]) * step, step
 
 
 def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
-    """`ViewResolution.interpolation`; `axes`: those of the views."""
+    """`ViewResolution.interpolation`; `axes`: the axes of the projections."""
     (columns, rows, beam), views = axes.swapaxes(0, 1), np.arange(geometry.n_views)
     run = np.abs(beam)
-    across = np.where(run[:, 1] >= run[:, 0], 1, 0)  # the planes that sample a ray
+    across = np.where(run[:, 1] >= run[:, 0], 1, 0)  # the planes in which a ray is sampled
     across = np.where(run[:, 2] > run[:, :2].max(1), 2, across)
     found = np.where(across[:, None] != np.arange(3), _ALL, 0.0)
     if geometry.is_cone:
@@ -142,7 +152,7 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     at = first[across][:, None] * lean - geometry.pixel_pitch * (origin[:, :1] * col + origin[:, 1:] * row) - first
     scale = geometry.pixel_pitch / edges
     steps = (
-        (scale * row, 1 / _ON_ROWS * _STILL),  # slabs agree
+        (scale * row, 1 / _ON_ROWS * _STILL),  # so that slabs agree
         (scale * col, geometry.detector_shape[1]),
         (edges[across][:, None] * lean / edges, count[across][:, None]),
     )
@@ -153,9 +163,9 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
 
 
 def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
-    """Views [view, col, row] at the resolution of projections of a volume by the model; only rays that count have part.
+    """Measured projections [view, col, row] at the resolution of computed ones, from rays that count only.
 
-    A ray that does not count, or has few beside it that do, keeps its value.
+    A ray that does not count, or has few neighbours that do, keeps its value.
     """
     sizes = enumerate(views.shape[1:])
     filters = [resolution.transfer(axis, np.asarray(np.fft.rfftfreq(n + 2 * _PAD), np.float64)) for axis, n in sizes]
@@ -167,7 +177,7 @@ def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[
 
 
 def _filtered(views: F32, filters: list[F64]) -> F32:
-    """Views [view, col, row] filtered along columns and rows, one after the other, so that few are held in float64."""
+    """Projections [view, col, row] filtered along columns and rows, a few at a time, to save memory in float64."""
     out = np.empty_like(views)
     for at, view in enumerate(views):
         found = view.astype(np.float64)
@@ -185,9 +195,10 @@ def _filtered(views: F32, filters: list[F64]) -> F32:
 
 
 def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
-    """Views [view, col, row], low-pass filtered to the resolution of coarse voxels; the same array for fine ones.
+    """Projections [view, col, row], low-pass filtered to the resolution of coarse voxels; for fine voxels the same
+    array.
 
-    Rays that do not count have no part.
+    Rays that do not count are not used.
     """
     along = resolution.smoothed
     if not along.any():
@@ -200,7 +211,7 @@ def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] |
 
 
 def _axes(geometry: Geometry) -> F64:
-    """[view, 3, 3], `Geometry.axes` of all views."""
+    """`Geometry.axes` of all projections, [view, 3, 3]."""
     c, s, ct, st, cr, sr = (f(a) for a in (geometry.angles, geometry.tilt, geometry.roll) for f in (np.cos, np.sin))
     zero = np.zeros_like(c)
     u, v = np.stack((c, s, zero), 1), np.stack((-s * st, c * st, ct), 1)

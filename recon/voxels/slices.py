@@ -1,4 +1,4 @@
-"""orthogonal_slices: three slices through the sample by FBP of the views so far, in a fraction of a second."""
+"""orthogonal_slices: three slices through the sample, by FBP of the projections so far, in a fraction of a second."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from recon.base.volume import Grid
 from recon.voxels.fbp import continuation, continued, fbp, filter_projections
 from recon.voxels.view_weights import angular_weights, ray_weights
 
-_SIDE = 511  # voxels: of more, views are binned
-_VIEWS = 400  # enough for slices of that side; of more, some are left out evenly by angle
-_BRIGHT = 0.5  # of the 99th percentile: the slices cross in the middle of what is brighter
-_AT_ONCE = 32  # views that are filtered together
+_SIDE = 511  # largest side in voxels; wider projections are binned
+_VIEWS = 400  # most projections used, enough for this side; of more projections, some are left out, evenly by angle
+_BRIGHT = 0.5  # share of the 99th percentile; the slices cross in the middle of the voxels above it
+_AT_ONCE = 32  # projections that are filtered together
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +27,9 @@ class OrthogonalSlices:
 
     Attributes:
         images: float32 [y, x], [z, x] and [z, y], 1/mm.
-        at: their z, y and x, in mm.
+        at: z, y and x of the slices in mm.
         pixel: side of a voxel in mm.
-        covered: radians of the half turn that the views cover; π where no wedge is missing.
+        covered: radians of the 180° that the projections cover; π if no wedge is missing.
     """
 
     images: tuple[F32, F32, F32]
@@ -39,25 +39,25 @@ class OrthogonalSlices:
 
 
 def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSlices:
-    """The middle slice across the axis, and two along it through the middle of what is bright there.
+    """The middle slice perpendicular to the axis, and two slices along the axis through the middle of its bright part.
 
-    Each view weighs its share of the half turn, so views come in any order. Nothing but the slices is back-projected.
-    Time grows with the views up to 400 and no further.
+    Each projection has a weight for its share of the 180°, so projections may come in any order. Only the slices are
+    back-projected. The time grows with the number of projections up to 400.
 
     Args:
-        views: line integrals [row, col], one for each of the geometry.
-        geometry: of a parallel beam; views are straight and not shifted along the axis.
+        views: line integrals [row, col], one for each projection of the geometry.
+        geometry: geometry of a parallel beam, without roll, tilt and shifts along the axis.
 
     Raises:
-        ValueError: fewer than two views, or another geometry.
+        ValueError: there are fewer than two projections, or the geometry is another one.
     """
     if len(views) != geometry.n_views or len(views) < 2:
         raise ValueError(
-            f"{len(views)} views for {geometry.n_views} angles: slices need at least two views, and one angle for "
-            "each view"
+            f"slices need at least two projections and one angle for each, got {len(views)} projections and "
+            f"{geometry.n_views} angles"
         )
     if geometry.is_cone or not geometry.is_straight or geometry.shifts[:, 1].any():
-        raise ValueError("slices of the views so far need a parallel beam with straight views at one height")
+        raise ValueError("slices during a scan need a parallel beam without roll, tilt and shifts along the axis")
     covered = float(angular_weights(geometry.angles).sum())
     some = spread_views(geometry.angles, _VIEWS, np.arange(len(views)))
     factor = math.ceil(max(geometry.detector_shape) / _SIDE)
@@ -77,7 +77,7 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
 
 
 def _binned(view: F32, factor: int) -> F32:
-    """Means [row, col] of factor x factor pixels; what is left over at the ends is left out."""
+    """Means [row, col] of factor x factor pixels; pixels at the ends that do not fill a bin are dropped."""
     rows, cols = (n // factor * factor for n in view.shape)
     down = np.add.reduce([view[k:rows:factor, :cols] for k in range(factor)])
     return np.asarray(np.add.reduce([down[:, k::factor] for k in range(factor)]) / np.float32(factor**2))
@@ -86,7 +86,7 @@ def _binned(view: F32, factor: int) -> F32:
 def _along(data: F32, geometry: Geometry, points: F64) -> F32:
     """FBP float32 [point, row] (1/mm) of line integrals [view, row, col], with the weights of `fbp`.
 
-    It is on lines along the axis, through points (x, y) [2, point] in mm.
+    The values are on lines along the axis through the points (x, y) [2, point] in mm.
     """
     weights, zeros = ray_weights(geometry)
     out = np.zeros((points.shape[1], data.shape[1]), np.float32)

@@ -1,4 +1,4 @@
-"""Whether iterations end because the volume stands still, and what the settings of a volume say about their end."""
+"""Decides whether iterations end because the volume has converged, and records how they ended."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from recon.base.decisions import Decisions
 from recon.voxels.devices import CPU, VoxelDevice
 
 MOST_SWEEPS, USUAL_SWEEPS = 60, 30
-"""Largest number of sweeps, and the usual number until the volume stands still."""
+"""Largest number of sweeps, and the usual number until the volume has converged."""
 ENDED = "ended", "ended_after", "last_change"
-"""Names of the settings that say how the sweeps ended ("still": the volume stood still; "stopped"; "bound": all were
-made), after how many sweeps, and by which share four sweeps changed the volume before (left out if not known)."""
+"""Names of the settings that say how the sweeps ended ("still": the volume converged; "stopped"; "bound": all were
+made), after how many sweeps, and by which share the last four sweeps changed the volume (left out if not known)."""
 MIRRORED = 4
-"""After this many sweeps total variation takes the same differences again, see `TotalVariationProx`. Therefore volumes
-that are compared lie this many sweeps apart."""
-_STILL = "still"  # name of the decision whether the volume stands still
+"""After this many sweeps, total variation uses the same differences again, see `TotalVariationProx`. Therefore the
+volumes that are compared are this many sweeps apart."""
+_STILL = "still"  # name of the decision whether the volume has converged
 _QUALITIES: dict[Quality, tuple[float, int]] = {"preview": (4.0, 1), "standard": (1.0, 1), "best": (0.25, 4)}
-# factors on the change of a volume that stands still, and on the largest number of iterations
+# factors of the presets on `still`, and on the largest number of iterations
 
 MethodT = TypeVar("MethodT")
 
@@ -30,7 +30,7 @@ MethodT = TypeVar("MethodT")
 class Standstill:
     """Decides after each sweep whether the sweeps end.
 
-    The volume stands still if four sweeps together change it by less than `still` of its norm. Memory: one volume.
+    The volume has converged if four sweeps together change it by less than `still` of its norm. Memory: one volume.
 
     Args:
         still: share of the norm of the volume; 0: all sweeps are made.
@@ -74,7 +74,7 @@ class Standstill:
 
 
 def with_quality(method: MethodT, quality: Quality) -> MethodT:
-    """The method, which has `still` and `iterations`, with an end nearer to the minimum, or further from it."""
+    """The method (with `still` and `iterations`) that ends nearer to the minimum, or farther from it for a preview."""
     still, longer = _QUALITIES[quality]
     settings: Any = method
     made: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)

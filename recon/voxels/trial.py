@@ -1,7 +1,7 @@
-"""Trial: volumes made of seven in eight views on some rows, judged by the views held out, and priors chosen so.
+"""Trial: test reconstructions from seven of every eight projections on some rows; they choose methods and priors.
 
-A trial makes each candidate's volume from the views that are not held out, measures its residual of each one that is,
-and compares candidates by the rule of `recon.voxels.choice`.
+A trial makes the volume of each candidate from the projections that are not held out. It measures the residual in each
+held-out projection, and compares candidates by the rule of `recon.voxels.choice`.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from recon.voxels.residuals import unseen_residuals
 from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
-_WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
-TV_STEPS = 3  # of a trial, and of the finish of a fit
+_WIDE, _FEWEST_ROWS = 0.9, 4  # largest width of the field over that of a wide box; fewest rows of a trial in such a box
+TV_STEPS = 3  # dual steps of total variation in a trial, and in the voxel refinement of a fit
 _LEVELS_PREDICT = "discrete levels predict the held-out projections better"
 PATCH_STEPS = 35
-"""Steps with sparse patches of a trial, and by default of `PnpDct`."""
+"""Number of steps with sparse patches in a trial; also the default of `PnpDct`."""
 
 
 def _share_in_field(geometry: Geometry, grid: Grid) -> float:
-    """Width of the field over that of the box."""
+    """Width of the field of view divided by that of the box."""
     return 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
 
 
 def _is_wide(problem: VoxelProblem) -> bool:
-    """Whether the sample goes on beyond the field, or the box is wider than that by a tenth.
+    """Whether the sample is wider than the field of view, or the box is wider than the field by a tenth.
 
-    FBP is a poor first volume there: it leaves out the matter beside the field, and later steps put that into the
-    field. A disc three times as wide as the field came out at 1.16 to 1.32 times its density after twenty sweeps, and
-    at 0.97 to 0.98 from a sweep of OS-SIRT.
+    Then FBP is a poor first volume, because it does not contain the outside material, and later steps put this material
+    into the field. A disc three times as wide as the field had 1.16 to 1.32 times its density after twenty iterations
+    from FBP, and 0.97 to 0.98 times from an iteration of OS-SIRT.
     """
     return problem.wide or _share_in_field(problem.projector.geometry, problem.projector.grid) <= _WIDE
 
 
 def _trial_rows(geometry: Geometry, grid: Grid) -> int:
-    """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
+    """Number of rows of a trial: fewer in a box that is wider than the field, so that it does not take longer."""
     share = _share_in_field(geometry, grid)
     return TRIAL_ROWS if share > _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
 
@@ -65,15 +65,16 @@ def _trial_rows(geometry: Geometry, grid: Grid) -> int:
 def choose_weight(
     problem: VoxelProblem, start: F32 | None, sweeps: int, trial: Callable[[], Trial | None] | None = None
 ) -> NoiseBalance | float:
-    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by held-out views, if there are any, else by the noise.
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, from held-out projections if there are any, or from the
+    noise.
 
-    μ over the number of views follows the noise of a volume, which falls with the root of that number. So μ is √(8/7)
-    times that of the trial. It is sought from the trial's first volume: a fit knows the views held out, and any weight
-    takes it away from them.
+    μ divided by the number of projections follows the noise of a volume, which falls with the root of this number. So μ
+    is √(8/7) times that of the trial. The search starts from the first volume of the trial and not from a fit, because
+    a fit has used the held-out projections, and any weight would then raise their residual.
 
     Args:
-        start, sweeps: as of `NoiseBalance.of`.
-        trial: gives that of this problem; None: `Trial.of`.
+        start, sweeps: as for `NoiseBalance.of`.
+        trial: function that returns the trial of this problem; None: `Trial.of`.
     """
 
     def chosen() -> list[float]:
@@ -89,11 +90,11 @@ def choose_weight(
 
 
 class Patches(NamedTuple):
-    """The settings of sparse patches chosen by held-out views.
+    """The settings of sparse patches that held-out projections chose.
 
     Attributes:
-        strength: of `pnp_dct`.
-        better: patches predict these views better than total variation alone.
+        strength: the strength of `pnp_dct`.
+        better: True if patches predict these projections better than total variation alone.
     """
 
     strength: float
@@ -103,13 +104,13 @@ class Patches(NamedTuple):
 def choose_patches(
     problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None], steps: int
 ) -> Patches:
-    """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
+    """The strength of `pnp_dct` chosen by held-out projections, starting from volumes of total variation with a weight
+    μ.
 
-    Trials take as many steps as the volume will: noise enters with each, so that few steps prefer a weaker prior.
-
-    The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
-    views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
-    matter beside metal keeps its detail.
+    Trials make as many steps as the volume will, because each step adds noise, so that fewer steps would prefer a
+    weaker prior. The search begins at the noise that a volume from all projections has without a prior. This is also
+    the strength if no projections can be held out; then total variation alone counts as equally good. The densest
+    material affects neither of them, so that weak material next to metal keeps its detail.
     """
 
     def chosen() -> list[float]:
@@ -130,13 +131,14 @@ def choose_patches(
 
 @dataclass(frozen=True)
 class TrialSettings:
-    """The run that a trial belongs to.
+    """Settings of the run to which a trial belongs.
 
     Attributes:
-        all_rows: words for the rows of a trial of all of them, as of a cone whose middle shows little matter. Pixels
-            may be joined for it, so that its priors are not those of the volume. Empty: a trial of some rows.
+        all_rows: description of the rows, for a trial of all rows (a cone whose middle shows little material). Its
+            pixels may be binned, and then its priors are not valid for the volume. Empty: a trial of some rows.
         now: the clock.
-        early: sweeps as of a finish, which begins with a fit and ends early; else until volumes stand still.
+        early: True: iterations as in a voxel refinement, which begins with a fit and ends early; False: until volumes
+            have converged.
     """
 
     all_rows: str = ""
@@ -149,19 +151,19 @@ _USUAL = TrialSettings()
 
 @runtime_checkable
 class Predicting(Protocol):
-    """A method that tells by a part of its work how well its volume predicts views held out."""
+    """A method that finds out with a part of its work how well its volume predicts held-out projections."""
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction of its volume; `so_far` has those of simpler candidates."""
+        """The prediction of its volume; `so_far` contains the predictions of simpler candidates."""
 
 
 class AllColumns(NamedTuple):
-    """The rows of a trial with all columns, including air: a fit of narrower views is poorer.
+    """The rows of a trial with all columns, including air, because a fit of narrower projections is worse.
 
     Attributes:
-        cols: those of the trial.
-        seen: makes the problem of the views that are not held out.
-        unseen: the geometry of those that are.
+        cols: the columns of the trial.
+        seen: function that makes the problem of the projections that are not held out.
+        unseen: geometry of the held-out projections.
     """
 
     cols: slice
@@ -170,16 +172,17 @@ class AllColumns(NamedTuple):
 
 
 class Trial:
-    """Volumes of a slab, made of seven in eight views and judged by the others, which they should predict.
+    """Volumes of a slab, made from seven of every eight projections and judged by how well they predict the others.
 
     Attributes:
-        problem: of the slab.
+        problem: the problem of the slab.
         scan: the problem of all rows.
-        start: [y, x, z], the first volume: FBP, or zeros where no direct method takes the views; if `wide`, a sweep.
-        unseen: the views held out.
+        start: [y, x, z], the first volume: FBP, or zeros if no direct method can use the projections; if `wide`, an
+            iteration of OS-SIRT.
+        unseen: the held-out projections.
         all_columns: the same rows with all columns.
-        smooth: the volume of total variation that predicts these best, of those made so far.
-        settings: of the run that the trial belongs to.
+        smooth: the volume of total variation that predicts the held-out projections best so far.
+        settings: settings of the run to which the trial belongs.
     """
 
     def __init__(
@@ -197,12 +200,12 @@ class Trial:
 
     @classmethod
     def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL) -> Trial | None:
-        """The trial of the rows with most matter; for a cone beam of those in the middle.
+        """The trial of the rows with the most material; for a cone beam, of the rows in the middle.
 
-        Columns of air far beside the sample are left out.
+        Columns of air far from the sample are left out.
 
-        None: fewer than 16 views, a cone for which `middle_of_cone` gives None, views held out that weigh nothing in
-        these rows, or `problem.trial_goes_on` ends it.
+        None if there are fewer than 16 projections, `middle_of_cone` returns None for a cone, the held-out projections
+        have weight 0 in these rows, or `problem.trial_goes_on` ends the trial.
         """
         geometry, grid = problem.projector.geometry, problem.projector.grid
         if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
@@ -244,7 +247,7 @@ class Trial:
             return None
         wide = _is_wide(problem)
         first = None if wide else seen.filtered("hann")
-        if first is None:  # no direct method takes these views
+        if first is None:  # no direct method can use these projections
             depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
         if wide:
@@ -260,11 +263,11 @@ class Trial:
 
     @property
     def ended(self) -> bool:
-        """Whether the trials were stopped; no further volume is assessed."""
+        """Whether the trials were stopped; then no further volume is judged."""
         return self._ended
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
-        """Residuals for this prior and strength; each volume is made once."""
+        """Residuals for this prior and strength; each volume is made only once."""
         if (prior, strength) not in self._known:
             x = volume(strength)
             residuals = self._known[prior, strength] = self.residuals(x)
@@ -273,7 +276,7 @@ class Trial:
         return self._known[prior, strength]
 
     def best_weight(self, first: float) -> BestStrength | None:
-        """The weight μ of total variation for all views, searched from `first`; None: the trials were ended."""
+        """The weight μ of total variation for all projections, searched from `first`; None: the trials were stopped."""
         best = preferred_strength(self.residuals_of_weight, first)
         if best is None:
             return None
@@ -282,7 +285,10 @@ class Trial:
         return of_all
 
     def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
-        """The strength of `steps` steps with patches after total variation, searched from `first`; None: as above."""
+        """The strength of `steps` steps with patches after total variation, searched from `first`.
+
+        None: they were stopped.
+        """
         smooth = self.volume_of_weight(weight) if self.smooth is None else self.smooth
 
         def made(strength: float) -> F32:
@@ -295,16 +301,16 @@ class Trial:
 
     @cached_property
     def weight(self) -> float | None:
-        """The weight of total variation of all views, in the units of the problem; None: by the noise."""
+        """The weight of total variation for all projections, in the units of the problem; None: the noise decides."""
         weight = choose_weight(self.scan, None, 0, lambda: self)
         return None if isinstance(weight, NoiseBalance) else weight
 
     @property
     def smooth_residuals(self) -> F64:
-        """Residuals for total variation of the weight chosen.
+        """Residuals for total variation with the chosen weight.
 
         Raises:
-            ValueError: none was chosen.
+            ValueError: no weight was chosen.
         """
         if self.weight is None:
             raise ValueError("no weight of total variation could be chosen")
@@ -312,22 +318,25 @@ class Trial:
 
     @cached_property
     def early_weight(self) -> float | None:
-        """The weight of total variation for a finish, which ends early: a heavier one. None: as of `weight`."""
+        """The weight of total variation for a voxel refinement; it is larger, because the refinement ends early.
+
+        None: as `weight`.
+        """
         early = Trial.of(self.scan, replace(self.settings, early=True))
         return None if early is None else early.weight
 
     @property
     def wide(self) -> bool:
-        """Whether the sample goes on beyond the field, or the box is wider than that by a tenth: patches are not tried.
+        """Whether the sample is wider than the field of view, or the box is wider than the field by a tenth.
 
-        What lies beside the field is in all views. So patches leave less of those held out where total variation is
-        closer to the truth, by 0.4 and 0.6 dB of two samples.
+        Then patches are not tried. The outside material is in all projections. So patches have a lower residual in the
+        held-out projections although total variation is closer to the truth, by 0.4 and 0.6 dB for two samples.
         """
         return _is_wide(self.scan)
 
     @cached_property
     def prior(self) -> Prior | None:
-        """The weight of all views, and patches after it unless the sample is `wide`; None: as of `weight`."""
+        """The weight for all projections, and patches after it unless the sample is `wide`; None: as for `weight`."""
         if self.weight is None:
             return None
         if self.wide:
@@ -335,14 +344,15 @@ class Trial:
         return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
 
     def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> TrialChoice:
-        """Which candidate predicts the views held out; one that does not take them is not tried.
+        """Which candidate predicts the held-out projections best; a candidate that cannot use the projections is not
+        tried.
 
-        A candidate is run as it is, on the views that are not held out, unless it has a method `predict`, which tells
-        its residuals by a part of the work; after few materials that predict these views it is not run, unless the best
-        is asked for.
+        A candidate is run unchanged on the projections that are not held out. If it has a method `predict`, this method
+        finds its residuals with a part of the work. If discrete levels already predict these projections better,
+        further candidates are not run, unless the best one is requested (`least_gain` 0).
 
         Args:
-            candidates: the simplest and cheapest first.
+            candidates: the candidates, the simplest and cheapest first.
         """
         rows = self.unseen.projector.geometry.detector_shape[0]
         choice = TrialChoice(self.settings.all_rows or f"{rows} rows", least_gain)
@@ -359,55 +369,55 @@ class Trial:
         return choice
 
     def predicted(self, method: Method) -> Prediction:
-        """The prediction of a method's own volume of the views that are not held out."""
+        """The prediction of a method's own volume, made from the projections that are not held out."""
         views = self.views_of(method)
         made = method.run(views, self.control)
         return self.prediction(method.name, self.residuals(self.lines_of(made.volume)))
 
     def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
-        """A prediction in the units of the scan; `prior` in those of the problem."""
+        """A prediction in the units of the scan; `prior` is in the units of the problem."""
         weighed = self.problem.weight is not None
         of_scan = None if prior is None or self.settings.all_rows else self.problem.units.prior(prior, weighed, 1)
         left = None if residuals is None else self.in_line_integrals(residuals).tolist()
         return Prediction(name, left, of_scan, remark)
 
     def in_line_integrals(self, residuals: F64) -> F64:
-        """Residuals in the units of the scan, the root of weights included."""
+        """Residuals in the units of the scan, including the root of the weights."""
         units, weighed = self.problem.units, self.problem.weight is not None
         return np.asarray(residuals * 2.0 ** (units.integral + weighed * units.weight / 2))
 
     @property
     def control(self) -> RunControl:
-        """The control of a run that counts as one of the trials."""
+        """The control for a run that is one of the trials."""
         return RunControl(lambda: not self._go_on(0, 0.0), now=self.settings.now)
 
     def views_of(self, method: Method) -> ReconProblem:
-        """The views that are not held out as a method gets them, with all columns and in the units of the scan."""
+        """The projections that are not held out, as methods get them: with all columns, in the units of the scan."""
         problem = self.all_columns.seen().of_scan
         return replace(problem, device=method.device_of(problem))
 
     def lines_of(self, volume: Volume) -> F32:
-        """A volume made of `views_of` as one of the trial, [y, x, z]."""
+        """A volume made from `views_of`, converted to one of the trial, [y, x, z]."""
         shape = self.problem.projector.grid.shape
         y, x = ((many - few) // 2 for many, few in zip(volume.data.shape[1:], shape[1:], strict=True))
         part = np.maximum(volume.data[:, y : y + shape[1], x : x + shape[2]], 0)
         return times_power(volume_lines(part), -self.problem.units.density)
 
     def residuals_of_weight(self, weight: float) -> F64:
-        """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
+        """Residuals for total variation with this weight. `smooth` becomes the best volume of all weights."""
         return self.residuals_of("weight", weight, self.volume_of_weight)
 
     def residuals_of_patches(self, strength: float) -> F64 | None:
-        """Residuals for patches of this strength; None: it was not tried."""
+        """Residuals for patches with this strength; None: it was not tried."""
         return self._known.get(("patches", strength))
 
     def volume_of_weight(
         self, weight: float, start: F32 | None = None, sweeps: int | None = None, pull: Pull | None = None
     ) -> F32:
-        """The volume of total variation with this weight, `start` and `pull` as of `volume_by` and `ordered_fista`.
+        """The volume of total variation with this weight; `start` as for `volume_by`, `pull` as for `ordered_fista`.
 
         Args:
-            sweeps: at most; None: until the volume stands still, or as of a finish.
+            sweeps: largest number; None: until the volume has converged, or as for a voxel refinement.
         """
         most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         return self.volume_by(lambda part, x: ordered_fista(
@@ -415,17 +425,17 @@ class Trial:
         ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
-        """The volume that `make` computes from a copy of the first one; that copy once the trials ended."""
+        """The volume that `make` computes from a copy of the first volume; after the trials were stopped, this copy."""
         x = (self.start if start is None else start).copy()
         if self._ended:
             return x
-        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all
+        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all volumes
 
     def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
         """`unseen_residuals` of a volume [y, x, z]; infinite if the trials were stopped.
 
         Args:
-            beyond: [view held out, col, row], what its model adds to its projection.
+            beyond: [held-out view, col, row], the part that its model adds to its projection.
         """
         unseen = self.unseen
         if self._ended:

@@ -1,4 +1,4 @@
-"""Quadrature weights of views, and of their rays, for back-projection: angles in any order, gaps, rays seen twice."""
+"""Quadrature weights of projections and their rays for back-projection: any angles, gaps, rays measured twice."""
 
 from __future__ import annotations
 
@@ -12,35 +12,38 @@ from recon.base.arrays import F64
 from recon.base.geometry import Geometry
 
 _GAP_LIMIT = 8.0  # an angular gap this many times the usual one may be missing data, not coarse sampling
-_FAR = np.pi / 6  # a gap beyond this is missing data, however many are like it, unless most views are as far apart
-_THINNED = 2.5  # usual steps between the views of a part of a scan, at most
-_ALIKE = 0.4  # standard deviation of gaps over their mean: 0.24 of golden angles, about 0.7 of random ones
-_SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
+# a wider gap is missing data, even if there are many such gaps, unless most projections are as far apart
+_FAR = np.pi / 6
+_THINNED = 2.5  # most usual steps between the projections of a part of a scan
+_ALIKE = 0.4  # standard deviation of gaps over their mean: 0.24 for golden angles, about 0.7 for random ones
+_SAME_ANGLE = 1e-3  # share of the mean step; projections that are closer share one weight
 
 
 def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
+    """Quadrature weight of each projection in radians: its Voronoi cell on the half circle.
 
-    Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
-    where the half circle is covered, also by views in groups, and by views of which a part is repeated finely. Views
-    beside a missing wedge (see `_missing`) weigh as if the sampling continued, and the sum is the covered angle.
+    Projections at θ and θ + π see the same rays, so angles count modulo π; projections with equal angles share their
+    cell. The weights sum to π if the half circle is covered, also by projections in groups, and if a part is repeated
+    with finer steps. Projections next to a missing wedge (see `_missing`) have weights as if the sampling continued,
+    and the sum is the covered angle.
 
     Args:
         angles: [view], radians, any order and range.
-        of: angles of a scan whose views these are a part of; its usual step then tells a missing wedge.
+        of: angles of the scan of which these projections are a part. A missing wedge is then judged by the usual step
+            of that scan.
 
     Raises:
-        ValueError: for no angles, or some that are not finite.
+        ValueError: there are no angles, or some are not finite.
     """
     theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
     if theta.size == 0 or not np.isfinite(theta).all():
-        raise ValueError(f"weights need at least one angle, all finite, got {theta.size}")
+        raise ValueError(f"weights need at least one angle, and all angles must be finite; got {theta.size} angles")
     whole = None if of is None else np.asarray(of, np.float64).ravel()
     if theta.size == 1:
         return np.full(1, np.pi if whole is None else _usual_step(whole))
     order = np.argsort(theta, kind="stable")
     ordered = theta[order]
-    # Group equal angles; the circle closes, so a last group just below π may be the first one.
+    # Group equal angles. Angles are periodic, so a last group just below π may belong to the first group.
     tolerance = _SAME_ANGLE * np.pi / theta.size
     group = np.concatenate([[0], np.cumsum(np.diff(ordered) > tolerance)])
     starts = ordered[np.concatenate([[True], np.diff(group) > 0])]
@@ -75,35 +78,38 @@ def _different(angles: F64) -> F64:
 
 
 def _half_step(gaps: F64) -> float:
-    """The gap up to which gaps make up half of the angle, without the widest: of views in groups, that between them."""
+    """The gap up to which gaps make up half of the angle, without the widest one.
+
+    For groups, it is that between groups.
+    """
     most = np.sort(gaps)[:-1] if gaps.size > 1 else gaps
     total = np.cumsum(most)
     return float(most[np.searchsorted(total, total[-1] / 2)])
 
 
 def covers_the_circle(angles: ArrayLike) -> bool:
-    """Whether the views cover the full circle, without a missing arc."""
+    """Whether the projections cover the full circle, without a missing arc."""
     gaps = _gaps(np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi))[1]
     return gaps.size > 1 and not _leave_an_arc(gaps)
 
 
 def circle_weights(angles: ArrayLike) -> F64:
-    """Quadrature weight of each view: its Voronoi cell on the full circle, in radians; they sum to 2π.
+    """Quadrature weight of each projection in radians: its Voronoi cell on the full circle. The weights sum to 2π.
 
     Args:
-        angles: [view], radians, any order and range; equal ones share their cell.
+        angles: [view], radians, any order and range; projections with equal angles share their cell.
 
     Raises:
-        ValueError: for no angles, some that are not finite, or a missing arc.
+        ValueError: there are fewer than two angles, some are not finite, or an arc is missing.
     """
     theta = np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi)
     if theta.size < 2 or not np.isfinite(theta).all():
-        raise ValueError(f"FDK needs at least two angles, all finite, got {theta.size}")
+        raise ValueError(f"FDK needs at least two angles, and all angles must be finite; got {theta.size} angles")
     order, gaps = _gaps(theta)
     if _leave_an_arc(gaps):
         raise ValueError(
-            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; these weights need the full circle: "
-            "`cone_weights` has those of a short scan"
+            f"the angles have a gap of {np.rad2deg(gaps.max()):.4g} degrees, and these weights need the full circle. "
+            "For a short scan use `cone_weights`"
         )
     weights = np.empty_like(theta)
     weights[order] = (gaps + np.roll(gaps, 1)) / 2
@@ -111,21 +117,21 @@ def circle_weights(angles: ArrayLike) -> F64:
 
 
 def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Quadrature weight of each ray of a parallel beam, in radians, on a detector made wider by some columns of zeros.
+    """Quadrature weight of each ray of a parallel beam in radians, on a detector extended by columns of zeros.
 
-    Over a full turn the ray at u in a view is measured again at -u half a turn on, if the detector reaches so far. The
-    two share their weight. If the axis stands off the middle, the rays of the far columns are measured once and have
-    all. In between shares rise from 0 to 1 as sin² does. They rise over as many columns as are seen once, at most
-    half of those seen twice. So columns just off the middle stay means of two (Wang 2002, Med. Phys. 29, 1634, for cone
-    beams). Views that end before -u need zeros up to there: the part that filtering spreads into them belongs
-    to the integral.
+    In a 360° scan, the ray at u in a projection is measured again at -u in the opposite projection, if the detector
+    reaches that far. The two measurements share the weight. If the axis is off the middle, the rays of the far columns
+    are measured once and have the full weight. In between, shares rise from 0 to 1 like sin². They rise over as many
+    columns as are measured once, but at most half of those measured twice. So columns just off the middle remain means
+    of two (Wang 2002, Med. Phys. 29, 1634, for cone beams). Projections that end before -u need zeros up to -u, because
+    the part that filtering spreads into them belongs to the integral.
 
-    Views that do not cover the full turn have the weights of `angular_weights` in all columns. For a far column, the
-    view from the other side would be missing.
+    Projections that do not cover 360° have the weights of `angular_weights` in all columns, because for a far column
+    the opposite projection would be missing.
 
     Returns:
-        [view, 1 + col + 1], first and last of what lies beyond the edges (0 where an opposite view sees it), and the
-        columns of zeros to add before and after the others.
+        Weights [view, 1 + col + 1], the first and the last for values beyond the edges (0 if an opposite projection
+        sees them), and the numbers of columns of zeros to add before and after.
     """
     both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1] + 2, axis=1)
     if not covers_the_circle(geometry.angles):
@@ -135,29 +141,30 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Weight [view, 1 + col + 1] of each ray of a full turn, shared with its opposite ray, and zeros beside."""
+    """Weight [view, 1 + col + 1] of each ray in a 360° scan, shared with its opposite ray, and the columns of zeros."""
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     return _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
 
 
 def seen_by(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
-    """Which straight views of a parallel beam see slices [view, slice].
+    """Which projections of a parallel beam without roll and tilt see which slices, [view, slice].
 
     Args:
-        rows: [slice], detector rows at which an unshifted view sees them.
+        rows: [slice], detector rows at which an unshifted projection sees the slices.
     """
     at = rows + geometry.shifts[:, 1:]
     return (at >= -0.5) & (at <= geometry.detector_shape[0] - 0.5)
 
 
 def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F64:
-    """Weights [view, 1 + col + 1] of the rays of one slice, from the views alone that see it; 0 for the others.
+    """Weights [view, 1 + col + 1] of the rays of one slice, from the projections that see it; 0 for the others.
 
-    As `ray_weights`: views that step along the axis see each slice from angles of its own, some of them more often.
+    The weights are those of `ray_weights`. If projections step along the axis, each slice is seen from its own set of
+    angles, some of them several times.
 
     Args:
-        seen: [view].
-        share: `column_shares` of all views.
+        seen: [view], True for projections that see the slice.
+        share: `column_shares` of all projections.
     """
     weights = np.zeros(share.shape)
     if not seen.any():
@@ -169,10 +176,10 @@ def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F6
 
 
 def partly_seen(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
-    """Which slices [slice] are seen over less than half a turn, of views that see others over more.
+    """Mask [slice] of the slices that are seen over less than 180° while other slices are seen over more.
 
     Args:
-        rows: as of `seen_by`, of straight views of a parallel beam.
+        rows: as for `seen_by`.
     """
     keys, known = list[bytes](), dict[bytes, float]()
     for some in seen_by(geometry, rows).T:
@@ -189,13 +196,14 @@ def _weighed(share: F64, both: F64, alone: F64) -> F64:
 
 
 def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Share of each column of a cone beam's detector in a full circle, 1/2 where a ray is measured twice.
+    """Share of each column of a cone beam's detector in a full circle; 1/2 if a ray is measured twice.
 
-    As `ray_weights` for a parallel beam (Wang 2002, Med. Phys. 29, 1634): the ray at u is measured again at -u by
-    another view of the circle. The axis of all views is taken to be their mean; near the detector's middle all is 1/2.
+    It is computed as in `ray_weights` for a parallel beam (Wang 2002, Med. Phys. 29, 1634): the ray at u is measured
+    again at -u by another projection of the circle. All projections are assumed to have the mean axis. Near the
+    detector's middle, all shares are 1/2.
 
     Returns:
-        [1 + col + 1] and columns of zeros, as `ray_weights`.
+        Shares [1 + col + 1] and columns of zeros, as for `ray_weights`.
     """
     cols = geometry.detector_shape[1]
     if not geometry.is_off_middle:
@@ -206,17 +214,17 @@ def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Quadrature weight of each ray of a cone, in radians, on a detector made wider by some columns of zeros.
+    """Quadrature weight of each ray of a cone in radians, on a detector extended by columns of zeros.
 
-    A full circle: `circle_weights` times `fan_shares`. A short scan, from 180 degrees and the fan's angle on: the two
-    measurements of a ray share its weight. One share rises smoothly as the other one falls (Parker 1982). A longer arc
-    spreads this over all of it (Silver 2000, Med. Phys. 27, 773).
+    For a full circle it is `circle_weights` times `fan_shares`. In a short scan (180° plus the fan angle, or more) the
+    two measurements of a ray share its weight: one share rises smoothly while the other one falls (Parker 1982). If the
+    arc is longer, the transition extends over all of the excess (Silver 2000, Med. Phys. 27, 773).
 
     Returns:
-        [view, 1 + col + 1] and columns of zeros, as `ray_weights`.
+        Weights [view, 1 + col + 1] and columns of zeros, as for `ray_weights`.
 
     Raises:
-        ValueError: no view sees some rays of the field.
+        ValueError: some rays of the field of view are not seen by any projection.
     """
     if covers_the_circle(geometry.angles):
         shares, beyond = fan_shares(geometry)
@@ -224,10 +232,14 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     order, beta, cells = _arc(geometry.angles)
     lacking = missing_arc(geometry)
     if lacking > 0:
-        need = f"a gap: {np.rad2deg(lacking):.4g} degrees more are needed" if lacking < math.inf else "several gaps"
+        need = (
+            f"another {np.rad2deg(lacking):.4g} degrees are"
+            if lacking < math.inf
+            else "angles without several gaps are"
+        )
         raise ValueError(
-            f"the angles leave {need}, or some rays of the field are seen by no view. FDK takes a full circle, or a "
-            "short scan of 180 degrees and the angle of the fan: use an iterative method (fista-tv, sirt)"
+            f"use an iterative method (fista-tv, sirt): for FDK {need} needed, because no projection sees some rays of "
+            "the field of view. FDK needs a full circle, or a short scan of 180 degrees plus the fan angle"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
     most = (arc - np.pi) / 2
@@ -239,9 +251,9 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def missing_arc(geometry: Geometry) -> float:
-    """Radians that the views of a cone lack, so that each ray of the field in the plane of the source is seen.
+    """Radians that are missing in a cone-beam scan, so that each ray of the field in the plane of the source is seen.
 
-    0 for a short scan that suffices. Infinite where views leave more than one gap.
+    0 if a short scan is long enough; infinite if the projections have more than one gap.
     """
     if covers_the_circle(geometry.angles):
         return 0.0
@@ -252,23 +264,24 @@ def missing_arc(geometry: Geometry) -> float:
 
 
 class Wedge(NamedTuple):
-    """Rays that no view shows: those of missing views, from the angle `first` on over `size` radians."""
+    """Rays that no projection shows: those of the missing projections from the angle `first` over `size` radians."""
 
     first: float
     size: float
 
     @property
     def rays(self) -> tuple[float, float]:
-        """Directions of the first and the last ray, degrees from x towards y: a view's rays run across its columns."""
+        """Directions of the first and the last ray in degrees from x towards y, each at right angles to u."""
         first = (math.degrees(self.first) + 90) % 180
         return first, first + math.degrees(self.size)
 
 
 def unseen_wedges(geometry: Geometry) -> list[Wedge]:
-    """Rays that no view shows, as angles of the views that are missing, modulo π; none where views suffice.
+    """Rays that no projection shows, as angles of the missing projections modulo π; empty if nothing is missing.
 
-    Of a parallel beam, and of a cone whose views leave several gaps, these are rays through the rotation axis. Of a
-    short scan of a cone the wedge is `missing_arc`: rays at the rim of the field are missing before those at the axis.
+    For a parallel beam, and for a cone whose projections have several gaps, these are rays through the rotation axis.
+    For a short scan of a cone, the wedge is `missing_arc`, because rays at the rim of the field are missing before
+    those at the axis.
     """
     lacking = missing_arc(geometry) if geometry.is_cone else math.inf
     if lacking == 0 or (geometry.is_off_middle and covers_the_circle(geometry.angles)):
@@ -287,26 +300,27 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
 
 
 def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
-    """In which gaps of a circle views are missing: wider than random views leave by chance, and than 8 usual ones.
+    """Mask of the gaps of a circle in which projections are missing: wider than by chance, and than 8 usual gaps.
 
-    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): 1 in 1000 is
-    allowed for, or 1 in 20 where the other gaps are so alike that views are not at random.
+    One of n random gaps exceeds a share x of the circle with a probability of at most n (1 - x)^(n - 1). The limit is 1
+    in 1000, or 1 in 20 if the other gaps are so similar that the angles are not random.
     """
     chance = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _ALIKE * others.mean() else 0.05
     return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1))))
 
 
 def _usual(gaps: F64) -> float:
-    """The usual gap: by the angle that gaps take, as views in groups, or a part repeated finely, have a small median.
+    """The usual gap, weighted by the angle of the gaps, because the median is small if projections are in groups.
 
-    It is an eighth of 30 degrees at most, or the median: views are missing in wider gaps, however many there are.
+    The median is also small if a part is repeated with finer steps. The usual gap is at most an eighth of 30 degrees,
+    or the median if that is larger. So projections are missing in wider gaps, even if there are many such gaps.
     """
     median = float(np.median(gaps))
     return min(max(_half_step(gaps), median), max(_FAR / _GAP_LIMIT, median))
 
 
 def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
-    """The order of views from behind the widest gap on, their angles from half a step before the first, their cells."""
+    """The order of projections after the widest gap, their angles from half a step before the first, their cells."""
     theta = np.mod(angles, 2 * np.pi)
     order, gaps = _gaps(theta)
     order = np.roll(order, -1 - int(np.argmax(gaps)))
@@ -318,13 +332,16 @@ def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
 
 
 def _fan_angles(geometry: Geometry) -> F64:
-    """Angle of each column's rays to the beam's axis [view, col], radians."""
+    """Angle in radians of each column's rays to the central ray, [view, col]."""
     u = np.arange(geometry.detector_shape[1]) - geometry.axis_col - geometry.shifts[:, :1]
     return np.arctan(u * geometry.pixel_pitch / geometry.sdd)
 
 
 def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
-    """Shares [view, 1 + col + 1] about `axis` [view], opposite views about `opposite`; zeros before and after."""
+    """Shares [view, 1 + col + 1] about `axis` [view], for opposite projections about `opposite`.
+
+    Zeros before and after.
+    """
     left, right = -0.5 - axis, cols - 0.5 - axis
     mirrored_left, mirrored_right = opposite + 0.5 - cols, opposite + 0.5
     low, high = np.maximum(left, mirrored_left), np.minimum(right, mirrored_right)
@@ -332,21 +349,24 @@ def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
     share = 0.5 + _rise(u - high[:, None], right - mirrored_right, high - low)
     share += _rise(low[:, None] - u, mirrored_left - left, high - low)
     share[high <= low] = 1
-    far = np.where(right > mirrored_right, share[:, -1], 1 - share[:, 0])  # of what lies beyond the right edge
+    far = np.where(right > mirrored_right, share[:, -1], 1 - share[:, 0])  # for the values beyond the right edge
     share = np.column_stack((1 - far, share, far))
     before, after = (math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right))
-    most = 2 * cols  # an axis farther off leaves a hole in the middle that no filter fills
+    most = 2 * cols  # if the axis is farther away, the hole in the middle cannot be filled
     return share, (min(max(0, before), most), min(max(0, after), most))
 
 
 def _rise(beyond: F64, excess: F64, overlap: F64) -> F64:
-    """0 inside the overlap, ± 1/2 at its edge, where `beyond` [view, col] is 0; + where a view sees `excess` more."""
+    """0 inside the overlap, ± 1/2 at its edge, where `beyond` [view, col] is 0.
+
+    + if a projection sees `excess` more.
+    """
     ramp = np.clip(np.minimum(np.abs(excess), overlap / 2), 1e-9, None)[:, None]
     return np.asarray(np.sign(excess)[:, None] * np.sin(np.pi / 2 * np.clip(1 + beyond / ramp, 0, 1)) ** 2 / 2)
 
 
 def _nearest(angles: F64, wanted: F64) -> NDArray[np.intp]:
-    """Index of the view nearest to each wanted angle on the circle."""
+    """Index of the projection nearest to each wanted angle on the circle."""
     theta, target = np.mod(angles, 2 * np.pi), np.mod(wanted, 2 * np.pi)
     order = np.argsort(theta, kind="stable")
     around = np.concatenate((theta[order[-1:]] - 2 * np.pi, theta[order], theta[order[:1]] + 2 * np.pi))
@@ -356,7 +376,7 @@ def _nearest(angles: F64, wanted: F64) -> NDArray[np.intp]:
 
 
 def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
-    """The order of angles on the circle, and the gap behind each."""
+    """The order of angles on the circle, and the gap after each angle."""
     order = np.argsort(theta, kind="stable")
     return order, np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
 

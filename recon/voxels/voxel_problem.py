@@ -26,31 +26,35 @@ from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.resolution import ViewResolution
 
 # Rays shorter than this share of the longest ray, and voxels with a column sum below this share of the largest, are
-# left out: their corrections would be divided by almost zero.
+# left out, because their corrections would be divided by almost zero.
 _LEAST_SUM = 1e-3
 
-_LOOKED_AT = 9  # views of a sweep whose residual is kept
+_LOOKED_AT = 9  # number of projections of a sweep whose residual is kept
 
 
 def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
-    """View indices of each subset: neighbours in angle are in different subsets, so that each covers all directions."""
+    """Indices of the projections of each subset.
+
+    Neighbours in angle are in different subsets, so that each covers all directions.
+    """
     order = np.argsort(np.mod(projector.geometry.angles, projector.geometry.period), kind="stable")
     count = min(subsets, order.size)
     return [order[start::count] for start in range(count)]
 
 
 class Sweeps:
-    """Passes over all views, subset by subset. Memory: two volumes, and twice the projections.
+    """Sweeps: passes over all projections, subset by subset. Memory: two volumes, and twice the projections.
 
     Attributes:
-        pace: a typical step of a sweep along the gradient of ½||A x - p||² (rays weighed).
-        residual: p - A x of some views of the last sweep [view, col, row], times the root of their weight (NaN: 0).
+        pace: typical step of a sweep along the gradient of the weighted ½||A x - p||².
+        residual: p - A x of some projections of the last sweep [view, col, row], times the root of their weight (NaN:
+            0).
     """
 
     def __init__(
         self, projector: Projector, data: F32, weight: F32 | None, subsets: Sequence[NDArray[np.intp]]
     ) -> None:
-        """Set up for `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
+        """Prepare sweeps over `data` [view, col, row] with `weight` for each ray (None: 1), in `subsets`."""
         (nz, ny, nx), device = projector.grid.shape, voxel_device(projector.device)
         self._device, self._parts, scales = device, list[tuple[LineProjector[Any], Any, Any, Any]](), 0.0
         self._step = device.zeros((ny, nx, nz))  # largest column sums, then their inverse
@@ -60,7 +64,7 @@ class Sweeps:
             measured = device.array(data[views] if len(subsets) > 1 else data)
             rays = None if weight is None else device.array(weight[views] if len(subsets) > 1 else weight)
             self._gradient[...] = 1
-            plain = projector_on(device, part.plain)  # sums of absolute values, but for less than 2 in a step
+            plain = projector_on(device, part.plain)  # sums of absolute values, except if a step is below 2
             scale = _inverse(plain.forward_lines(self._gradient))
             plain.adjoint_lines(
                 device.array(np.ones(scale.shape, np.float32)) if rays is None else rays, self._gradient
@@ -76,17 +80,17 @@ class Sweeps:
         self.pace = float(steps[steps > 0].mean(dtype=np.float64)) * scales / weights if scales > 0 else 0.0
 
     def run(self, x: F32, relaxation: float, nonnegative: bool, rng: np.random.Generator | None) -> float:
-        """One sweep over x [y, x, z], in place, the subsets in random order (None: as given).
+        """One sweep over x [y, x, z], in place, with the subsets in random order (`rng` None: in the given order).
 
         Returns:
-            Σ weight (A x - p)², each ray counted before its own correction.
+            Σ weight (A x - p)², each ray before its own correction.
         """
         order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
         total, seen, device = 0.0, [], self._device
         volume = device.array(x)
         for index in order:
             part, data, weight, scale = self._parts[index]
-            residual = part.forward_lines(volume)  # the model, until the data are subtracted
+            residual = part.forward_lines(volume)  # the model; the data are subtracted next
             some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
             weights_of_rays = None if weight is None else device.numpy(weight[some])
             seen.append(whitened(device.numpy(data[some] - residual[some]), weights_of_rays))
@@ -100,21 +104,24 @@ class Sweeps:
 
 
 def whitened(residual: F32, weight: F32 | None) -> F32:
-    """The residual times the root of each ray's weight; NaN where that is 0."""
+    """The residual times the root of each ray's weight; NaN if the weight is 0."""
     if weight is None:
         return residual
     return np.where(weight > 0, residual * np.sqrt(weight), np.float32(np.nan)).astype(np.float32, copy=False)
 
 
 def _inverse(sums: Any) -> Any:
-    """1 / sums, 0 where they are too small, of an array of any device, which is overwritten."""
+    """1 / sums, or 0 if they are too small; the array, of any device, is overwritten."""
     least = max(_LEAST_SUM * float(sums.max()), float(np.finfo(np.float32).tiny))
     sums[sums <= least] = math.inf
     return 1 / sums
 
 
 class Units(NamedTuple):
-    """Powers of two near the lengths, line integrals and weights of the data: changing to these units is exact."""
+    """Units that are powers of two near the lengths, line integrals and weights of the data.
+
+    The conversion is exact.
+    """
 
     length: int = 0
     integral: int = 0
@@ -131,7 +138,7 @@ class Units(NamedTuple):
         return self.integral - self.length
 
     def projector(self, other: Projector, sign: int = -1) -> Projector:
-        """The projector in these units; with a sign of 1 back in those of the scan."""
+        """The projector in these units; with sign 1, converted back to the units of the scan."""
         box, power = other.grid, sign * self.length
         edge, slices = (math.ldexp(n, power) for n in (box.voxel_size, box.spacing[0]))
         z, y, x = (math.ldexp(n, power) for n in box.centre)
@@ -139,7 +146,10 @@ class Units(NamedTuple):
         return replace(other, geometry=other.geometry.scaled(math.ldexp(1.0, power)), grid=grid)
 
     def prior(self, prior: Prior, weighed: bool, sign: int = -1) -> Prior:
-        """The prior in these units, of rays that are `weighed` or not; with a sign of 1 back in those of the scan."""
+        """The prior in these units, for rays with (`weighed`) or without weights.
+
+        With sign 1, back in those of the scan.
+        """
         weight = math.ldexp(prior.weight, sign * (self.length + self.integral + weighed * self.weight))
         materials = prior.materials and prior.materials.scaled(sign * self.density)
         return prior._replace(
@@ -160,7 +170,7 @@ def times_power(array: F32, power: int) -> F32:
 
 
 NORM = "norm"  # name of the decision on the largest eigenvalue, which does not depend on the data
-POWER_ROUNDS = 6  # of power iteration
+POWER_ROUNDS = 6  # rounds of the power iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +179,18 @@ class VoxelProblem:
 
     Attributes:
         data: [view, col, row], finite.
-        weight: of each ray, [view, col, row], or None.
-        nonnegative: voxels below zero are clipped.
-        rng: for the order of views and subsets.
+        weight: weight of each ray, [view, col, row], or None.
+        nonnegative: True: voxels below zero are clipped.
+        rng: random generator for the order of projections and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
-        decide: keeps decisions that follow from sums over the whole volume or all rays.
-        trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
-        measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
-        with_all_columns: makes the problem with all columns, where these are some; steps are as long as of that one.
-        units: of all lengths, line integrals and weights here.
-        wide: the grid holds a sample beyond the field.
+        decide: stores decisions that follow from sums over the whole volume or all rays.
+        trial_goes_on: called after each sweep of a test reconstruction on some rows; False ends this test and the next
+            ones.
+        measured: the measured projections if `data` were smoothed because the voxels are coarse; otherwise None.
+        with_all_columns: if the problem has only some columns, a function that makes the problem with all columns,
+            which determines the length of the steps.
+        units: units of all lengths, line integrals and weights.
+        wide: True: the grid contains a sample that is wider than the field of view.
     """
 
     projector: Projector
@@ -193,7 +205,8 @@ class VoxelProblem:
     with_all_columns: Callable[[], VoxelProblem] | None = None
     units: Units = _NO_UNITS
     wide: bool = False
-    _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
+    # shared by copies of the problem
+    _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)
 
     @property
     def norm(self) -> float:
@@ -213,7 +226,7 @@ class VoxelProblem:
 
     @property
     def of_scan(self) -> ReconProblem:
-        """The same views in the units of the scan, as methods get them."""
+        """The same projections in the units of the scan, as methods get them."""
         projector, rays = self.units.projector(self.projector, 1), self.weight
         data = times_power(projection_images(self.views).copy(), self.units.integral)
         weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
@@ -222,16 +235,16 @@ class VoxelProblem:
 
     @property
     def views(self) -> F32:
-        """The views [view, col, row] as measured."""
+        """The measured projections [view, col, row]."""
         return self.data if self.measured is None else self.measured
 
     @property
     def scale(self) -> float:
-        """||p||, rays weighed."""
+        """The weighted norm ||p||."""
         return math.sqrt(replace_by_residual(self.data, np.zeros_like(self.data), self.weight))
 
     def filtered(self, filter: Filter) -> F32 | None:
-        """FBP or FDK [y, x, z] of the weighted views, rays of weight 0 filled in; None if neither applies."""
+        """FBP or FDK [y, x, z] of the projections, with rays of weight 0 filled; None if neither can be used."""
         images, geometry = projection_images(self.views), self.projector.geometry
         if self.weight is not None:
             seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
@@ -242,10 +255,10 @@ class VoxelProblem:
         return volume_lines(direct(images, geometry, self.projector.grid, filter, device=self.projector.device))
 
     def first_sweep(self, x: F32, rng: np.random.Generator | None) -> None:
-        """Run a sweep of OS-SIRT on x [y, x, z], which is zero, in place: iterations go on better from it.
+        """Run a sweep of OS-SIRT on x [y, x, z], which is zero, in place, because it is a better start for iterations.
 
         Args:
-            rng: for the order of subsets; None: as they are.
+            rng: random generator for the order of subsets; None: their given order.
         """
         self.sweeps(interleaved(self.projector, 9)).run(x, 1.0, self.nonnegative, rng)
 
@@ -253,24 +266,24 @@ class VoxelProblem:
         return Sweeps(self.projector, self.data, self.weight, subsets)
 
     def single_views(self) -> Sweeps:
-        """Sweeps with one view per step."""
+        """Sweeps with one projection per step."""
         return self.sweeps([np.array([view]) for view in range(self.projector.geometry.n_views)])
 
 
 def density_unit(x: F32) -> float:
-    """A typical high density: the 99.5th percentile of the positive values, from some 10⁵ of them; 0 for none."""
+    """A typical high density: the 99.5th percentile of about 10⁵ of the positive values; 0 if there are none."""
     sample = some_values(x, 100_003)
     positive = sample[sample > 0]
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 
 
 class Momentum:
-    """Nesterov's extrapolation between the steps of a descent; it starts anew when it points uphill.
+    """Nesterov's extrapolation between the steps of a descent; it restarts when it points uphill.
 
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes. Arrays are those of a device.
 
     Args:
-        most: share of the last step that is added, at most.
+        most: largest share of the last step that is added.
     """
 
     def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU, most: float = 1.0) -> None:
@@ -289,10 +302,12 @@ class Momentum:
 def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
 
-    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
-    So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side. A
-    matched projector has negative entries: the bound is that of the plain one, times `Projector.gain`.
-    Where each row sees one slice, and all rows are alike, it is computed on one row: a half to a fifth of the time.
+    For a matrix B with non-negative entries and a positive x, the largest (B x)_i / x_i is an upper bound (Collatz
+    1942). So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would be too low. A matched
+    projector has negative entries. Its bound is that of the plain projector, times `Projector.gain`.
+
+    If each row sees one slice and all rows are alike, the bound is computed on one row, in a half to a fifth of the
+    time.
     """
     projector = one_of_like_rows(projector, weight)
     gain, projector, device = projector.gain(weight), projector.plain, voxel_device(projector.device)
@@ -308,13 +323,13 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
         ratio = np.divide(product, x, out=np.zeros_like(x), where=x > 0)
         bound = min(bound, float(ratio.max()))
         if bound == 0:
-            return math.inf  # no ray meets the box
+            return math.inf  # no ray crosses the box
         x = product / product.max()
     return gain * bound
 
 
 def one_of_like_rows(projector: Projector, weight: F32 | None) -> Projector:
-    """The projector of one row, where rays have no `weight` and all rows are alike; else the projector itself."""
+    """The projector of one row if rays have no `weight` and all rows are alike; otherwise the projector itself."""
     geometry, slices = projector.geometry, projector.grid.shape[0]
     alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
     if not (alike and slices > 1):
@@ -325,7 +340,7 @@ def one_of_like_rows(projector: Projector, weight: F32 | None) -> Projector:
 
 
 def slices_are_rows(projector: Projector) -> bool:
-    """Whether each slice of the grid is seen by one row of the views."""
+    """Whether each slice of the grid is seen by exactly one row of the projections."""
     geometry, grid = projector.geometry, projector.grid
     rows = Grid.matching(geometry)
     same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
@@ -337,8 +352,8 @@ class Buffers:
     """Arrays of float32 that are in memory at the peak of a run.
 
     Attributes:
-        volumes, rays, weights: copies of the volume, of the projections and of their weights.
-        filtered: a filtered back-projection is made, too.
+        volumes, rays, weights: number of copies of the volume, of the projections and of their weights.
+        filtered: True if a filtered back-projection is also made.
     """
 
     volumes: float
@@ -348,10 +363,10 @@ class Buffers:
 
 
 def bytes_of(buffers: Buffers, geometry: Geometry, grid: Grid, weighted: bool = True) -> int:
-    """Bytes of these buffers for some views and voxels, without weights unless rays are `weighted`."""
+    """Size of these buffers in bytes for some projections and voxels; weights count only if rays are `weighted`."""
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
     wide = max(geometry.detector_shape[1], grid.shape[2])
-    volumes = buffers.volumes + (geometry.width.arc > 0)  # of the moments of an exposure
+    volumes = buffers.volumes + (geometry.width.arc > 0)  # for the angles within an exposure
     rays = buffers.rays + bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
     rays += buffers.weights * weighted
     beside = fbp_memory(geometry.n_views, wide) if buffers.filtered else 0
@@ -359,21 +374,22 @@ def bytes_of(buffers: Buffers, geometry: Geometry, grid: Grid, weighted: bool = 
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:
-    """Weights of the differences along (y, x, z), so that TV does not depend on the shape of the voxels."""
+    """Weights of the differences along (y, x, z) that make total variation independent of the voxels' shape."""
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 
-_BACK = (0, 0), (1, 0), (0, 1), (1, 1)  # the four mirror images, but for reflections in a point
+_BACK = (0, 0), (1, 0), (0, 1), (1, 1)  # the four mirror images, without reflections in a point
 
 
 class TotalVariationProx:
-    """argmin_y ½|y - x|² + threshold TV(y), y >= 0 if wanted; isotropic TV, differences of voxels in 1/voxel.
+    """argmin_y ½|y - x|² + threshold TV(y), if wanted with y >= 0; isotropic TV, differences of voxels in 1/voxel.
 
-    A few steps of the dual problem a call (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck &
-    Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
+    Each call makes a few steps of the dual problem (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck
+    & Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field is kept from one call to the next. In an outer
     iteration x changes little, so later calls continue the steps. Memory: three volumes.
 
-    Differences of a voxel are those to its three next ones; `turn` takes the ones before along y, x or both.
+    The differences are those to the next voxels along the three axes. `turn` switches to the previous voxels along y, x
+    or both of them.
     """
 
     def __init__(
@@ -384,7 +400,10 @@ class TotalVariationProx:
         self._device, self._dual, self._scratch = device, device.dual_field(shape), device.dual_scratch(shape)
 
     def __call__(self, x: Any, threshold: float) -> None:
-        """Replace x [y, x, z], an array of the device, by the proximal point; `threshold` in its unit, 0 or more."""
+        """Replace x [y, x, z], an array of the device, by the proximal point.
+
+        `threshold`, 0 or more, is in the unit of x.
+        """
         if threshold > 0:
             given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
             for _ in range(self._steps):
@@ -394,8 +413,8 @@ class TotalVariationProx:
             x[x < 0] = 0
 
     def turn(self) -> None:
-        """Take the differences of the next of four mirror images from here on, so that no side is preferred.
+        """Use the differences of the next of four mirror images from now on, so that no side is preferred.
 
-        The differences, which the dual field holds, stay: only which three of them belong to a voxel changes.
+        The differences in the dual field do not change, only the assignment of three of them to each voxel.
         """
         self._turn = (self._turn + 1) % len(_BACK)

@@ -1,8 +1,8 @@
 """Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, with the timing of the real camera.
 
-Nothing runs in the background: the camera catches up with the trigger line and the clock whenever it is asked, and a
-frame is computed when it is taken. Triggers and frames are numbered over the camera's life for faults and noise, so
-that any frame can be made again alone. Framestamps start at 0 with every arm.
+Nothing runs in the background. On each call, the camera catches up with the trigger line and the clock. A frame is
+computed when it is read. For faults and noise, triggers and frames are numbered over the life of the camera, so that
+any frame can be computed again alone. Framestamps start at 0 with every arm.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from simulators.frame.shot import CannotExposeError, Detector
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
 
-POLL = 0.02  # s between looks at the trigger line while waiting: a stop may cancel pulses, a move may add some
-TOLERANCE = 1e-6  # s: a trigger may come so early; a float64 of seconds since 1970 resolves 2e-7 s
+# s between two checks of the trigger line while waiting, because a stop may cancel pulses and a move may add some
+POLL = 0.02
+TOLERANCE = 1e-6  # s by which a trigger may come too early; a float64 of seconds since 1970 resolves 2e-7 s
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,13 @@ class OrcaQuestBuild:
     """A simulated camera, and its faults.
 
     Attributes:
-        pixel_pitch: mm at the sample of an unbinned sensor pixel.
-        ring_frames: frames that the ring holds; a reader who falls further behind loses the oldest.
-        lost: frames (numbered over the camera's life) that are exposed and then lost: a gap in the framestamps.
-        ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
-            numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
+        pixel_pitch: size of an unbinned sensor pixel at the sample in mm.
+        ring_frames: number of frames in the ring buffer; a reader that falls further behind loses the oldest frames.
+        lost: frames (numbered over the life of the camera) that are exposed and then lost, which leaves a gap in the
+            framestamps.
+        ignored: external or software triggers to which the camera does not react, so that there is no frame and no
+            framestamp. They are also numbered over the life of the camera, counting all triggers for which it was ready
+            (also internal ones).
         unplug_at: frame at which the camera is unplugged.
         model: one of `drivers.orca_quest.LINE_TIMES`.
     """
@@ -59,14 +62,16 @@ _USUAL = OrcaQuestBuild()
 class SimulatedOrcaQuest:
     """Implements drivers.base.protocols.Camera.
 
-    External triggers come from `line`. Like the camera, it silently ignores a trigger that comes earlier than the least
-    period after the last accepted one. An internally triggered camera runs at the least period and stops after
-    the frames it was armed for.
+    External triggers come from `line`. Like the real camera, it silently ignores a trigger that comes earlier than the
+    shortest period after the last accepted trigger. With internal triggers it runs at the shortest period, and stops
+    after the number of frames for which it was armed.
 
     Args:
-        scene: what stands in the beam.
-        seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
-        beam_is_on, place_of_sample: asked when a frame is exposed: a dark, or else mm aside; None: a flat.
+        scene: the scene in front of the camera.
+        seed: seed of all random numbers, together with the name of the effect and the number of the frame over the life
+            of the camera.
+        beam_is_on, place_of_sample: called when a frame is exposed. If the beam is off, the frame is a dark. Otherwise
+            the second one returns how many mm the sample is moved sideways; None: the frame is a flat.
     """
 
     def __init__(
@@ -85,12 +90,13 @@ class SimulatedOrcaQuest:
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
         self._timing = orca_quest.timing(self._settings, model=self._model)
         self._connected = clock.now()
-        self._triggers = self._frames = self._views = 0  # over the camera's life
+        self._triggers = self._frames = self._views = 0  # number over the life of the camera
         self._ring: deque[Exposed] = deque()
-        self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
-        self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
+        self._armed_for = self._framestamp = 0  # requested number of frames (0: not armed), and the next framestamp
+        # time of the last trigger that was examined, and of the last accepted trigger
+        self._seen, self._accepted = 0.0, -np.inf
         self._gone = ""
-        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame, if there are any
+        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame; only frames with labels
         self._lock = threading.Lock()
 
     @property
@@ -99,7 +105,7 @@ class SimulatedOrcaQuest:
 
     @property
     def detector(self) -> Detector:
-        """Places of the frame's pixels, in mm from the rotation axis: the truth for alignment."""
+        """Positions of the pixels of a frame in mm from the rotation axis: the ground truth for alignment."""
         return self._camera_view().detector
 
     @property
@@ -108,21 +114,21 @@ class SimulatedOrcaQuest:
         return self._scene
 
     def show(self, scene: Scene) -> None:
-        """Replace sample and beam by those of `scene`; the effects stay. Exposed frames that were not read yet show
-        them, too.
+        """Replace sample and beam by those of `scene`; the effects are kept. Exposed frames that were not read yet also
+        show them.
         """
         with self._lock:
             self._scene = replace(self._scene, sample=scene.sample, beam=scene.beam)
 
     def labels_at(self, time: float) -> tuple[Label, ...]:
-        """The anomalies in the frame exposed at `time` (s since the Unix epoch), which must have been taken."""
+        """The anomalies in the frame exposed at `time` (s since the Unix epoch); the frame must have been read."""
         return self._labels.get(time, ())
 
     def rehearse(self) -> None:
-        """Compute a frame of the sample with the present settings and discard it; it is not counted.
+        """Compute a frame of the sample with the present settings and discard it; the frame is not counted.
 
         Raises:
-            CannotExposeError: the scene cannot be exposed with them; the message says what would help.
+            CannotExposeError: the scene cannot be exposed with these settings; the message says what would help.
         """
         now = self._clock.now()
         expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, 0.0, 0)))
@@ -135,7 +141,7 @@ class SimulatedOrcaQuest:
             self._answer()
             problem = orca_quest.refusal(settings, self._model)
             if self._armed_for:
-                problem = "is capturing and accepts no settings; disarm it first"
+                problem = "is armed and accepts no settings; disarm it first"
             if problem:
                 raise DeviceRefused(self.name, problem, request=str(settings), state="Its settings were not changed")
             self._settings = replace(settings, exposure=round(settings.exposure, 8))
@@ -143,7 +149,7 @@ class SimulatedOrcaQuest:
             return self._settings
 
     def arm(self, n_frames: int) -> None:
-        """Get ready for triggers. Framestamps start at 0; earlier triggers do not count."""
+        """Prepare for triggers. Framestamps start at 0; earlier triggers do not count."""
         with self._lock:
             self._answer()
             if n_frames < 1 or self._armed_for:
@@ -169,12 +175,12 @@ class SimulatedOrcaQuest:
             self._trigger(now, self._line.angle_at(now))
 
     def next_frame(self, timeout: float) -> CameraFrame:
-        """The oldest frame not yet taken; waits on the clock.
+        """The oldest frame that was not read yet; waits on the clock.
 
         Raises:
-            DeviceTimeout: none came within `timeout` s.
-            DeviceError: the ring was overrun (the lost framestamps are named; later frames can still be taken), or
-                the camera is gone.
+            DeviceTimeout: no frame came within `timeout` s.
+            DeviceError: the ring buffer was overrun (the message names the lost framestamps; later frames can still be
+                read), or the camera is unplugged.
         """
         deadline = self._clock.now() + timeout
         while True:
@@ -199,7 +205,7 @@ class SimulatedOrcaQuest:
             self._clock.sleep(due - now)
 
     def disarm(self) -> None:
-        """Stop the run and discard the frames not taken; legal in every state."""
+        """Stop the run, and discard frames that were not read; allowed in every state."""
         with self._lock:
             self._armed_for = 0
             self._ring.clear()
@@ -240,14 +246,14 @@ class SimulatedOrcaQuest:
         )
 
     def _answer(self, armed: bool = False) -> None:
-        """Raises DeviceError if the camera is gone (once its last frame is taken), or must be armed and is not."""
+        """Raise DeviceError if the camera is unplugged (after its last frame was read), or must be armed and is not."""
         if self._gone and not self._ring:
             raise DeviceError(self.name, self._gone, advice="Connect it again", state="Frames already taken are good")
         if armed and not self._armed_for:
             raise DeviceRefused(self.name, "is not armed", advice="Call arm(n) before reading or triggering frames")
 
     def _catch_up(self, now: float) -> None:
-        """Look at every trigger up to `now`."""
+        """Process every trigger up to `now`."""
         if self._settings.trigger is TriggerSource.EXTERNAL:
             while (pulse := self._line.next_after(self._seen)) and pulse.time <= now:
                 self._seen = pulse.time
@@ -258,7 +264,7 @@ class SimulatedOrcaQuest:
                 self._trigger(time, self._line.angle_at(time))
 
     def _free_run(self) -> float:
-        """Time of the next exposure of a free run; `_seen` is when it was armed."""
+        """Time of the next exposure in free run; `_seen` is the time at which the camera was armed."""
         return max(self._seen, self._accepted + self._timing.min_period)
 
     def _due(self) -> float:

@@ -6,11 +6,12 @@ import threading
 
 from drivers.base.clock import Clock
 
-VIRTUAL_START = 1_795_152_000.0  # s since the Unix epoch: a round moment (2026-11-20 05:20:00 UTC), so that runs repeat
+# s since the Unix epoch: a round time (2026-11-20 05:20:00 UTC), so that runs are repeatable
+VIRTUAL_START = 1_795_152_000.0
 
 
 class VirtualClock:
-    """Time that moves only when somebody sleeps: `sleep` jumps and returns at once. Safe from several threads.
+    """Time that advances only during `sleep`, which jumps and returns at once. It can be used from several threads.
 
     Args:
         start: s since the Unix epoch.
@@ -39,7 +40,7 @@ class ScaledClock:
 
     def __init__(self, base: Clock, speed: float, not_before: float = 0.0) -> None:
         if not speed > 0:
-            raise ValueError(f"a clock's speed must be positive, not {speed}; 1 is the base clock's own")
+            raise ValueError(f"the speed of a clock must be positive, got {speed}; 1 is the speed of the base clock")
         self._base, self._speed, self._base_start = base, float(speed), base.now()
         self._start = max(self._base_start, not_before)
 

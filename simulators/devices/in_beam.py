@@ -12,17 +12,18 @@ from simulators.frame.sensor import CONVERSION
 from simulators.frame.shot import AngleAt, Detector, Shot
 from simulators.scenes.scene import Scene
 
-POLL = 0.05  # s between looks at who may end the wait
+POLL = 0.05  # s between two calls of the function that may end the wait
 
 
 class SimulatedMonochromator:
     """Implements `drivers.base.protocols.Monochromator` and `Watchable`.
 
     Args:
-        energy: keV of the scene as it is; None: it states none.
-        scene_at: the scene at an energy in keV; an error of it leaves the monochromator where it stands.
-        show: takes the sample and the beam of all later frames.
-        settle: s that each move takes.
+        energy: energy of the scene in keV; None: the scene states no energy.
+        scene_at: function that returns the scene at an energy in keV; if it raises an error, the monochromator does not
+            move.
+        show: function that sets the sample and the beam of all later frames.
+        settle: duration of each move in s.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class SimulatedMonochromator:
 
 
 class SimulatedShutter:
-    """Implements `drivers.base.protocols.Shutter`; it starts closed, as a beamline does."""
+    """Implements `drivers.base.protocols.Shutter`; it is closed at the start."""
 
     by_hand = False
 
@@ -77,7 +78,7 @@ class SimulatedShutter:
 
 
 class SimulatedSampleMover:
-    """Implements `drivers.base.protocols.SampleMover`; it starts with the sample in the beam."""
+    """Implements `drivers.base.protocols.SampleMover`; at the start the sample is in the beam."""
 
     def __init__(self, name: str = "sample mover") -> None:
         self.name = name
@@ -90,7 +91,7 @@ class SimulatedSampleMover:
         self._aside = aside
 
     def place(self) -> float | None:
-        """mm by which the sample stands aside, None: out of the beam; the simulated camera asks it."""
+        """mm by which the sample is moved sideways; None: out of the beam. The simulated camera reads it."""
         return self._aside
 
 
@@ -99,14 +100,14 @@ class Exposed:
     """A frame that was exposed, but is not computed yet.
 
     Attributes:
-        framestamp: counts from 0 with every arm.
-        number: over the camera's life.
-        time: of the trigger, s since the Unix epoch.
-        angle: of the stage then, radians.
-        ready: when the frame can be taken, s since the Unix epoch.
-        beam: whether the shutter was open.
-        sample: mm by which the sample stood aside; None: out of the beam.
-        view: projections exposed before this one.
+        framestamp: number from 0 since the camera was armed.
+        number: number over the life of the camera.
+        time: time of the trigger, s since the Unix epoch.
+        angle: angle of the stage at this time, radians.
+        ready: time from which the frame can be read, s since the Unix epoch.
+        beam: True if the shutter was open.
+        sample: mm by which the sample was moved sideways; None: out of the beam.
+        view: number of projections exposed before this frame.
     """
 
     framestamp: int
@@ -124,13 +125,13 @@ class CameraView:
     """A scene in front of a camera.
 
     Attributes:
-        scene: what stands in the beam.
-        settings: the camera's.
-        pitch: mm at the sample of an unbinned sensor pixel.
-        seed: of all random numbers.
-        angle_at: of the stage, radians at s since the Unix epoch.
-        connected: s since the Unix epoch; the age of drifts counts from here.
-        model: of the camera.
+        scene: the scene.
+        settings: settings of the camera.
+        pitch: size of an unbinned sensor pixel at the sample in mm.
+        seed: seed of all random numbers.
+        angle_at: function that returns the angle of the stage in radians at a time in s since the Unix epoch.
+        connected: s since the Unix epoch; drifts begin at this time.
+        model: model of the camera.
     """
 
     scene: Scene
@@ -152,7 +153,8 @@ class CameraView:
         binning = self.settings.binning
         axis_row, axis_col = ((n - 1) / 2 for n in orca_quest.SENSOR_SHAPE)
         axis_col += self.scene.axis_offset_px
-        middle = (binning - 1) / 2  # middle of a binned pixel, in sensor pixels from the middle of its first
+        # middle of a binned pixel, in sensor pixels from the middle of its first sensor pixel
+        middle = (binning - 1) / 2
         return Detector(
             shape=orca_quest.timing(self.settings, model=self.model).shape,
             pitch=self.pitch * binning,
@@ -162,7 +164,10 @@ class CameraView:
         )
 
     def shot(self, frame: Exposed) -> Shot:
-        """The shot. Without effects of motion its angle is that of mid-exposure, as a reconstruction assumes."""
+        """The conditions of a frame.
+
+        Without effects of motion, the angle is that of mid-exposure, as a reconstruction assumes.
+        """
         middle = frame.time + self.settings.exposure / 2
         turned = 0.0 if self.scene.chain.moves else self.angle_at(middle) - self.angle_at(frame.time)
         return Shot(

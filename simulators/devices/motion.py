@@ -2,7 +2,7 @@
 position.
 
 With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²/a it never reaches v and takes
-2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move that shares the past of the first.
+2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move with the same past.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ MOVES_REMEMBERED = 4096  # A camera on a virtual clock may ask for past angles. 
 
 @dataclass(frozen=True)
 class MotionPhase:
-    """Constant acceleration for a while. Times are s after the move began; the rest is in the unit of the position."""
+    """A phase with constant acceleration.
+
+    Times are in s after the move began; other values use the unit of the position.
+    """
 
     begin: float
     duration: float
@@ -40,8 +43,8 @@ class MotionPhase:
 class TrapezoidMove:
     """A move from `start` to `target` that began at `begin` (s, on any clock). Built by `between`.
 
-    `beyond`: how far something that no controller reports as a move has turned it beyond, at a time: a hand on the
-    knob, a servo that hunts, a motor that goes on after "done". None: nothing has.
+    `beyond`: function of time; additional rotation that the controller does not report as a move: by a hand on the
+    knob, a hunting servo, or a motor that continues after "done". None: there is no such rotation.
     """
 
     begin: float
@@ -60,15 +63,15 @@ class TrapezoidMove:
         begin: float,
         deceleration: float | None = None,
     ) -> TrapezoidMove:
-        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration.
+        """The fastest move from rest to rest with |velocity| <= speed and |acceleration| <= acceleration.
 
-        While it slows down, `deceleration` is the limit; None: the same.
+        While it slows down, `deceleration` is the limit; None: the same as `acceleration`.
 
         Raises:
             ValueError: speed or acceleration is not positive.
         """
         if not (speed > 0 and acceleration > 0):
-            raise ValueError(f"speed and acceleration must be positive, not {speed} and {acceleration}")
+            raise ValueError(f"speed and acceleration must be positive, got {speed} and {acceleration}")
         distance, sign = abs(target - start), math.copysign(1.0, target - start)
         slow = deceleration or acceleration
         mean = acceleration if slow == acceleration else 2 * acceleration * slow / (acceleration + slow)
@@ -87,7 +90,7 @@ class TrapezoidMove:
 
     @property
     def end(self) -> float:
-        """Time at which the axis stands again."""
+        """Time at which the axis is at rest again."""
         return self.begin + self.duration
 
     @property
@@ -118,7 +121,7 @@ class TrapezoidMove:
         """Time at which the move passes `position`.
 
         Raises:
-            ValueError: it never passes there.
+            ValueError: the move does not pass this position.
         """
         low, high = sorted((self.start, self.target))
         if not low <= position <= high:
@@ -131,7 +134,7 @@ class TrapezoidMove:
         return self.end
 
     def braked(self, time: float, acceleration: float) -> TrapezoidMove:
-        """The same move until `time`, then slowed down to a stand with `acceleration` (> 0)."""
+        """The same move until `time`, then decelerated to rest with `acceleration` (> 0)."""
         past, velocity, here = self._until(time), self.velocity(time), self.position(time)
         seconds = abs(velocity) / acceleration
         if seconds == 0:
@@ -140,7 +143,7 @@ class TrapezoidMove:
         return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
 
     def halted(self, position: float) -> TrapezoidMove:
-        """The same move until it reaches `position`, with an immediate stand there, as by an emergency stop.
+        """The same move until it reaches `position`, and an immediate halt there, as by an emergency stop.
 
         Raises:
             ValueError: the move does not pass there.
@@ -150,7 +153,7 @@ class TrapezoidMove:
     def slowed(self, time: float, deceleration: float) -> TrapezoidMove:
         """The same move until `time`, then slowed down with `deceleration` (> 0) to a whole position.
 
-        It is the last whole position before the move would stand."""
+        It is the last whole position before the move would come to rest."""
         position, velocity = self.position(time), self.velocity(time)
         stand = position + self.direction * velocity**2 / (2 * deceleration)
         last = math.floor(stand) if self.direction > 0 else math.ceil(stand)
@@ -175,11 +178,11 @@ class TrapezoidMove:
 
 
 class MovedAxis:
-    """An axis that turns the sample by moves in closed form, and remembers the last ones.
+    """An axis that rotates the sample with moves in closed form, and keeps the last moves.
 
     Args:
-        begin: s, on any clock; from then on it stands at `counts`.
-        counts_per_turn: for 2π of true angle.
+        begin: s, on any clock; from this time on, the axis is at rest at `counts`.
+        counts_per_turn: counts for 2π of true angle.
     """
 
     def __init__(self, begin: float, counts: float, counts_per_turn: int) -> None:
@@ -190,7 +193,7 @@ class MovedAxis:
 
     @property
     def move(self) -> TrapezoidMove:
-        """The move under way, or the last one."""
+        """The present move, or the last one."""
         return self._moves[-1][0]
 
     def angle_at(self, time: float) -> float:
@@ -199,7 +202,7 @@ class MovedAxis:
         return (move.position(time) - zero) * self._angle_of_count
 
     def disturb(self, beyond: Callable[[float], float]) -> None:
-        """Until its next move, turn the axis by `beyond` (counts at a time in s) without any sign in its status."""
+        """Until the next move, rotate the axis by `beyond` (counts at a time in s), which its status does not show."""
         self._replace(replace(self.move, beyond=beyond))
 
     def _at(self, time: float) -> tuple[TrapezoidMove, int]:
@@ -211,7 +214,7 @@ class MovedAxis:
         self._moves.append((move, self.zero))
 
     def _replace(self, move: TrapezoidMove) -> None:
-        """The move under way gets another end."""
+        """Change the end of the present move."""
         self._moves[-1] = (move, self.zero)
 
 

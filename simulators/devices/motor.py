@@ -1,7 +1,7 @@
 """Pulse motor: one axis that counts commanded pulses, with limits, stops and a position-synchronised trigger output.
 
-Nothing runs in the background: a move is a closed form of time. So its trigger pulses are put on the line, with their
-exact times, the moment it starts. A stop removes the pulses that are still to come.
+Nothing runs in the background, because a move is a closed form of time. When a move starts, its trigger pulses are put
+on the line with their exact times. A stop removes the pulses that are still in the future.
 """
 
 from __future__ import annotations
@@ -44,10 +44,11 @@ class TriggerSettings:
 
 
 class MotorOutput:
-    """The counter behind a trigger output: armed once, then each point fires once while the axis passes it forwards.
+    """The counter of a trigger output. After it is armed, each point fires once when the axis passes it forwards.
 
-    After a stop between points, going on fires the rest; going back over fired points does not fire them again. A
-    pulse that begins while the last one is still high gives no edge: with width >= interval time the output stays high.
+    After a stop between points, the remaining points fire when the move continues. Moving back over points that have
+    fired does not fire them again. A pulse that begins while the last one is still high gives no edge, so with width >=
+    interval time the output stays high.
 
     Args:
         lost: pulses, counted from 0 since power-on, that never reach the line.
@@ -64,7 +65,7 @@ class MotorOutput:
         self._coming: list[float] = []
 
     def can_arm(self, position: int) -> bool:
-        """True if the output is on, and the axis at `position` stands before its start point."""
+        """True if the output is on, and the axis, at `position`, is before its start point."""
         return self.settings.width is not None and self.settings.sign * (self.settings.start - position) > 0
 
     def arm(self) -> None:
@@ -115,16 +116,16 @@ def _arrival(move: TrapezoidMove, position: int) -> float | None:
 
 
 class PulseMotor(MovedAxis):
-    """One axis. `line()` is the cable in its trigger output, or None without a cable.
+    """One axis. `line()` returns the cable of its trigger output, or None without a cable.
 
     Args:
         counts_per_turn: pulses for 2π of true angle.
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
-        stall_at: a move that would pass this count stops there at once (EMERGENCY), as when an interlock trips.
+        stall_at: a move that would pass this count stops there at once (EMERGENCY), as by an interlock.
         switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
-        fires_at_start: a train's start point itself gives a pulse.
+        fires_at_start: True: the start point of a train itself gives a pulse.
 
-    Places may be changed while it stands, as if a person clears the way.
+    `stall_at` and `switch_at` may be changed while the axis is at rest, as if a person removes an obstacle.
     """
 
     def __init__(
@@ -153,7 +154,7 @@ class PulseMotor(MovedAxis):
         return self.move.counts(self._clock.now())
 
     def preset(self, count: int) -> None:
-        """Set the count of the present place to `count`; nothing turns."""
+        """Set the count of the present position to `count`; nothing moves."""
         now, here = self._clock.now(), self.position()
         self.zero += count - here
         self._remember(TrapezoidMove(now, count, count, ()))
@@ -174,7 +175,7 @@ class PulseMotor(MovedAxis):
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
-        """Decelerate with `acceleration` (counts/s²) and stand at a whole pulse."""
+        """Decelerate with `acceleration` (counts/s²) and stop at a whole pulse."""
         now, move = self._clock.now(), self.move
         self.ended = Ended.SLOW_STOP
         if not self.moving():
@@ -183,7 +184,7 @@ class PulseMotor(MovedAxis):
         self._put_on_line(now)
 
     def halt(self) -> None:
-        """Stand at once, at the last pulse put out."""
+        """Stop at once, at the last pulse sent."""
         now = self._clock.now()
         if self.moving():
             self._replace(self.move.halted(self.position()))

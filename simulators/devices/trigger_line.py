@@ -1,8 +1,9 @@
 """Trigger line: the cable from the stage's trigger output to the camera. The stage schedules pulses, the camera
 receives them.
 
-Pulses are put on the line with the time at which they will rise, often ahead of that time. The stage knows its motion
-when it starts. A consumer takes a pulse only once the clock has passed its time, because a stop cancels later ones.
+Pulses are put on the line with the time of their rising edge, often before that time, because the stage knows its
+motion when it starts. A consumer uses a pulse only after the clock has passed its time, because a stop cancels later
+pulses.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Pulse:
 
 
 class TriggerLine:
-    """Pulses in the order of time, and the sample's true angle. Safe from several threads."""
+    """Pulses in the order of time, and the sample's true angle. It can be used from several threads."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
@@ -38,7 +39,7 @@ class TriggerLine:
         """Put pulses on the line, in any order.
 
         Raises:
-            ValueError: a time is not finite; the line stays as it was.
+            ValueError: a time is not finite; the line is not changed.
         """
         new = list(pulses)
         if bad := [pulse for pulse in new if not math.isfinite(pulse.time)]:

@@ -1,4 +1,4 @@
-"""Effects: departures from Beer-Lambert, by physical kind; a scene computes only those that it names."""
+"""Effects: deviations from Beer-Lambert, by physical kind; a scene computes only the effects that it names."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class EffectRow:
         summary: what happens, in half a sentence.
         follows: effects of the same domain that must come before it, because another order changes the frame.
         reason: why they come before it.
-        module: with its class, which has its name in capitals: PhotonNoise for photon_noise.
+        module: the module of its class; the class PhotonNoise belongs to the effect photon_noise.
     """
 
     domain: Domain

@@ -49,9 +49,9 @@ _OURS: Mapping[str, EffectRow] = MappingProxyType(
 
 
 def _fitting(name: str, effect: type[Any]) -> type[Any]:
-    """The class of another package's effect, which states its own domain, summary and place."""
+    """The class of an effect of another package, which states its own domain, summary and place."""
     if effect.name != name:
-        raise ValueError(f"its class calls itself {effect.name!r}; expected the entry point's name")
+        raise ValueError(f"the `name` of its class is {effect.name!r}; expected the name of the entry point")
     _entry_of(effect)
     return effect
 
@@ -66,7 +66,7 @@ _ALL = {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()
 
 
 def _place(name: str) -> tuple[Domain, bool, int]:
-    """Where an effect stands: in the order of domains, and in one after all that it must follow."""
+    """Position of an effect: in the order of domains, and within its domain after all effects that it must follow."""
 
     def depth(of: str) -> int:
         return max((1 + depth(before) for before in _ALL[of].follows if before in _ALL), default=0)
@@ -78,7 +78,7 @@ CATALOGUE: Mapping[str, EffectRow] = MappingProxyType({name: _ALL[name] for name
 
 
 def order_error(earlier: str, later: str) -> str:
-    """Why two effects of one domain cannot come in this order; "" if they can."""
+    """Why two effects of one domain cannot have this order; "" if they can."""
     entry = CATALOGUE.get(earlier)
     if entry is None or later not in entry.follows:
         return ""

@@ -35,7 +35,7 @@ class Effect(Protocol):
 @runtime_checkable
 class SamplingEffect(Effect, Protocol):
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        """More moments at which each row is exposed: a frame is the weighted mean over them."""
+        """Additional times at which each row is exposed; a frame is the weighted mean over them."""
 
 
 @runtime_checkable
@@ -60,7 +60,7 @@ class ImageEffect(Effect, Protocol):
 @runtime_checkable
 class Anomaly(Effect, Protocol):
     def labels(self, shot: Shot) -> Sequence[Label]:
-        """Where the anomaly changes this frame, regardless of other effects; empty without a change."""
+        """Regions in which the anomaly changes this frame, regardless of other effects; empty if it does not change."""
 
 
 AnyEffect: TypeAlias = SamplingEffect | PoseEffect | AreaEffect | ImageEffect
@@ -74,12 +74,12 @@ class Chain:
 
     @classmethod
     def of(cls, effects: Sequence[AnyEffect]) -> Chain:
-        """Check the order: motion, optical depth, photons (noise last), electrons (the readout's noise last), counts.
+        """Check the order: motion, optical depth, photons (noise last), electrons (read noise last), counts.
 
-        Within a domain the catalogue's order holds. Each effect may occur once.
+        Within a domain, the order is that of the catalogue. Each effect may occur once.
 
         Raises:
-            ValueError: a wrong order; the message names the two effects.
+            ValueError: the order is wrong; the message names the two effects.
         """
         for i, effect in enumerate(effects):
             for earlier in effects[:i]:
@@ -102,11 +102,11 @@ class Chain:
 
     @property
     def moves(self) -> bool:
-        """Whether frames depend on other moments than the trigger."""
+        """Whether frames depend on other times than that of the trigger."""
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
-        """Moments of an exposure. Without blur there is one, its middle, as a reconstruction assumes."""
+        """Times of an exposure. Without motion blur there is only its middle, as a reconstruction assumes."""
         moments = Moments.once(shot.detector.shape[0], shot.exposure / 2)
         for effect in self.effects:
             if isinstance(effect, SamplingEffect):
@@ -144,7 +144,7 @@ class Chain:
         return tuple(labels.values())
 
 
-VISIBLE = 1e-3  # Least change of the light that is labelled, as a share
+VISIBLE = 1e-3  # smallest change of the light that is labelled, as a share
 NARROWEST = 1e-9  # mm: an edge with a smaller penumbra is a step
 
 
@@ -155,7 +155,7 @@ def _in_order(views: tuple[int, int]) -> tuple[int, int]:
 
 
 Views = Annotated[tuple[int, int], AfterValidator(_in_order)]
-"""First view and the one after the last. A flat belongs to the view that is exposed next."""
+"""First view and the one after the last. A flat belongs to the projection that is exposed next."""
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from simulators.effects.chain import AreaEffect, ImageEffect, SamplingEffect
 from simulators.frame.mapping import BelowOne, Positive
 from simulators.frame.shot import Image, Moments, Shot
 
-LOOKS = 5  # Times of the exposure at which the stage's angle is read, so that a reversal within it counts as motion
+LOOKS = 5  # number of times within the exposure at which the stage's angle is read, so that a reversal counts as motion
 
 
 @dataclass(frozen=True)
 class MotionBlur(SamplingEffect):
-    """Mean of the transmission over the moments of the exposure. The blur sets their number; a standing stage has one.
+    """Mean of the transmission over times within the exposure; their number depends on the blur (at rest: 1).
 
     The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are not better, since the
     transmission jumps at edges. A battery with 1 px of blur and 1, 2, 4, 8 moments has errors of 1.1, 0.38, 0.13,
@@ -55,11 +55,11 @@ class MotionBlur(SamplingEffect):
 class PixelArea(AreaEffect):
     """Mean of the transmission over rays x rays points of a pixel, evenly spread (midpoint rule).
 
-    Without it edges are as sharp as a single ray, and jump from pixel to pixel. No volume of voxels explains such
-    views, and iterative methods bend theirs (docs/studies.md).
+    Without this effect, edges are as sharp as a single ray and jump from pixel to pixel. No volume of voxels can
+    explain such projections, and iterative methods change their volumes to fit them (docs/studies.md).
 
     Attributes:
-        rays: a side of the pixel, 2 ... 8; each of the rays² costs the line integrals of a frame.
+        rays: number along each side of the pixel, 2 ... 8; each of the rays² needs the line integrals of a frame.
     """
 
     rays: int = setting(2, ge=2, le=8)
@@ -109,7 +109,7 @@ class BeamProfile(ImageEffect):
         return image
 
     def middle(self, elapsed: float) -> tuple[float, float]:
-        """Where the middle of the beam is (horizontal, vertical), mm, `elapsed` s after the camera was connected."""
+        """Position (horizontal, vertical) of the beam's middle in mm, `elapsed` s after the camera was connected."""
         swing = np.sin(2 * np.pi * elapsed / self.wander_period)
         horizontal, vertical = (
             centre + speed * elapsed + amplitude * swing

@@ -19,7 +19,7 @@ from simulators.pixels.pattern import binned, normals
 
 @dataclass(frozen=True)
 class QuantumEfficiency(ImageEffect):
-    """Scales the expectation before the photon noise, which is exact: thinned Poisson is Poisson (Kingman 1993, ch. 5).
+    """Scales the expectation before the photon noise. Thinned Poisson is Poisson (Kingman 1993, ch. 5), so it is exact.
 
     A scene's beam.photons_per_s are then photons of the scintillator's light that arrive at the sensor; without this
     effect they are detected photons. LuAG:Ce emits at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
@@ -27,8 +27,8 @@ class QuantumEfficiency(ImageEffect):
     Attributes:
         value: 0 ... 1, or
         wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly, or
-        path: the way from X-ray photons, of which photons_per_s then are; their noise is not that of light, see
-        `PhotonNoise`.
+        path: the path from X-ray photons to electrons; photons_per_s then counts X-ray photons. Their noise is not
+            simulated, only that of light, see `PhotonNoise`.
     """
 
     value: Share | None = None
@@ -68,7 +68,7 @@ class PhotonNoise(ImageEffect):
         return poisson(image, frame_rng(self.name, shot))
 
 
-FEW = 1.0  # Electrons a pixel: below this, placing single electrons is faster than drawing a number for every pixel
+FEW = 1.0  # electrons per pixel; below this, placing single electrons is faster than drawing a number for every pixel
 
 
 @dataclass(frozen=True)
@@ -124,9 +124,9 @@ class ReadNoise(ImageEffect):
     """Gaussian noise of the readout. Binned pixels are read one by one, so that their variances add up.
 
     Attributes:
-        rms: electrons of a sensor pixel, in place of the readout's.
-        spread: between pixels: standard deviation of ln(rms of a pixel); the median is rms.
-        seed: of the pixels' noise.
+        rms: electrons of a sensor pixel; replaces the value of the readout.
+        spread: differences between pixels: standard deviation of ln(rms of a pixel); the median is rms.
+        seed: seed of the pixels' noise.
     """
 
     rms: NotNegative | None = None
@@ -139,7 +139,7 @@ class ReadNoise(ImageEffect):
         return image
 
     def _spreads(self, shot: Shot) -> Image | float:
-        """Noise of each frame pixel over that of a typical sensor pixel."""
+        """Noise of each frame pixel, divided by that of a typical sensor pixel."""
         if self.spread == 0:
             return shot.binning
         pixels = normals(self.name, self.seed, shot)

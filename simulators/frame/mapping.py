@@ -27,7 +27,7 @@ BelowOne = Annotated[float, Setting(ge=0, lt=1)]
 Whole = Annotated[int, Setting(ge=0)]
 
 
-_UNKNOWN = "unexpected_keyword_argument"  # comes first: what is missing may be a key with a wrong name
+_UNKNOWN = "unexpected_keyword_argument"  # reported first, because a missing key may be one with a wrong name
 
 
 class SceneError(ValueError):

@@ -1,6 +1,6 @@
-"""Sensor: figures of the ORCA-Quest, and the conversion of electrons to counts.
+"""Sensor: values of the ORCA-Quest, and the conversion of electrons to counts.
 
-A beam counts detected photons, so that a photon is an electron, unless a scene names the quantum efficiency.
+A beam states detected photons, so that each photon gives one electron, unless a scene names the quantum efficiency.
 The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000
 electrons.
 Binning is digital: charge and noise of the summed pixels add up.
@@ -30,10 +30,13 @@ LARGEST_PHOTON_NUMBER = 200  # Values of an unbinned pixel
 READ_NOISES = MappingProxyType(
     {MODEL: READ_NOISE, "C15550-22UP": READ_NOISE | {"ultra_quiet": 0.3, "photon_number": 0.3}}
 )
-"""By model; that of C15550-22UP in photon number resolving is taken as in ultra quiet."""
+"""For each model; the value of C15550-22UP in photon number resolving is assumed to be that of ultra quiet."""
 DARK_CURRENT = 0.0036
-"""Electrons a second and pixel, as measured on two C15550-20UP; the catalogue's most of C15550-22UP is 0.016 (air)."""
-FULL_WELL = 7000.0  # Electrons that a pixel holds
+"""Electrons per second and pixel, measured on two C15550-20UP.
+
+The largest value in the catalogue of C15550-22UP is 0.016 (air).
+"""
+FULL_WELL = 7000.0  # full well: largest number of electrons in a pixel
 
 
 def largest_count(readout: str, binning: int) -> int:

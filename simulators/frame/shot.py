@@ -121,7 +121,7 @@ def _added(present: Reals | None, more: ArrayLike, shape: tuple[int, int]) -> Re
 
 
 class CannotExposeError(ValueError):
-    """The scene cannot be exposed, though each of its values is legal; the message says what would help."""
+    """The scene cannot be exposed, although each of its values is allowed; the message says what would help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class Shot:
         frame: number since the camera was connected, of any kind.
         view: projections exposed before this frame.
         model: of the camera.
-        aside: mm by which the sample stands beside its place, towards higher columns.
+        aside: mm by which the sample is moved sideways, towards higher columns.
     """
 
     detector: Detector
@@ -197,12 +197,12 @@ class Moments:
 
 
 def frame_rng(effect: str, shot: Shot) -> np.random.Generator:
-    """The generator of (seed, effect, frame): any frame can be computed alone, whatever the other effects."""
+    """The generator of (seed, effect, frame), so that any frame can be computed alone, independent of other effects."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
 def fixed_rng(effect: str, seed: int) -> np.random.Generator:
-    """The generator of (effect, its own seed), for all that is the same in every frame.
+    """The generator of (effect, its own seed), for everything that is the same in all frames.
 
     It has a spawn key: numpy ignores zeros at the end, so (seed, effect) would equal (seed, effect, frame 0)."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

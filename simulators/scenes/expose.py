@@ -1,5 +1,7 @@
-"""Exposures of a scene: a frame, from the turning sample to counts, with only the effects that the scene names; and the
-frames of a scan by the scene's own settings: darks, flats, then views.
+"""Exposures of a scene: a single frame, and all frames of a scan with the scene's own settings.
+
+A frame is computed from the rotating sample to counts, with only the effects that the scene names. A scan has darks,
+then flats, then projections.
 
 Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert.
 """
@@ -24,7 +26,7 @@ from simulators.scenes.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class PlannedFrame:
-    """A frame of a scan, computed alone and in any order by `expose(scene, shot)`."""
+    """A frame of a scan. `expose(scene, shot)` computes frames alone and in any order."""
 
     kind: FrameKind
     shot: Shot
@@ -48,7 +50,7 @@ class Scan:
 
     @classmethod
     def of(cls, scene: Scene, seed: int = 0, views: int | None = None, start: float = 0.0) -> Scan:
-        """`views` in place of the scene's number. Raises ValueError if it is less than one."""
+        """`views` replaces the number in the scene. Raises ValueError if it is below one."""
         if views is not None and views < 1:
             raise ValueError(f"a scan needs at least one view, got {views}")
         return cls(scene, seed, start, scene.scan.views if views is None else views)

@@ -1,4 +1,4 @@
-"""Scene: the sample, the beam and the simulated departures from Beer-Lambert, read from a YAML mapping.
+"""Scene: the sample, the beam and the simulated deviations from Beer-Lambert, read from a YAML mapping.
 
 Only the parts that a scene names are imported. Keys are the field names of the dataclasses; units are mm, s, 1/mm,
 electrons:

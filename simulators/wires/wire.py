@@ -20,7 +20,7 @@ from simulators.devices.trigger_line import TriggerLine
 
 
 class Wire(Protocol):
-    """A simulated device; safe from several threads."""
+    """A simulated device; it can be used from several threads."""
 
     @property
     def clock(self) -> Clock: ...
@@ -29,7 +29,7 @@ class Wire(Protocol):
         """Bytes from the host, in pieces of any size."""
 
     def transmit(self) -> bytes:
-        """Bytes sent by now and not taken yet."""
+        """Bytes that were sent so far and not read yet."""
 
 
 class Controller(Wire, Protocol):
@@ -70,7 +70,7 @@ class BytesWire:
         """Act on bytes from the host."""
 
     def _take_lines(self, data: bytes, end: bytes, act: Callable[[bytes], None]) -> None:
-        """Act on each line that is complete with these bytes; the rest waits for its end."""
+        """Process each line that is complete with these bytes; an incomplete rest is kept."""
         *lines, rest = bytes(self._in + data).split(end)
         self._in = bytearray(rest)
         for line in lines:
@@ -81,7 +81,7 @@ class BytesWire:
             self._out.append((self.clock.now() + self.latency, data))
 
     def _turns(self, line: TriggerLine, angle_at: Callable[[float], float]) -> None:
-        """The trigger line learns the sample's true angle, asked under the device's lock."""
+        """Give the trigger line a function for the sample's true angle; the function uses the device's lock."""
 
         def locked(time: float) -> float:
             with self._lock:
@@ -119,7 +119,7 @@ _LOCK = threading.Lock()
 
 
 def register(name: str, wire: Wire) -> str:
-    """Plug a simulated device in; returns the URL that opens it. It replaces a device of the same name."""
+    """Register a simulated device; returns the URL that opens it. The device replaces one with the same name."""
     with _LOCK:
         _WIRES[name] = wire
         _OPEN.pop(name, None)

@@ -28,7 +28,7 @@ def test_a_class_without_its_fixtures_fails_with_a_sentence_and_no_test_is_skipp
     outcomes = result.parseoutcomes()
     assert set(outcomes) <= {"error", "errors", "failed"}
     for fixture in ("path", "bench", "kind"):
-        result.stdout.fnmatch_lines([f"*A subclass gives the fixture `{fixture}`: *"])
+        result.stdout.fnmatch_lines([f"*the fixture `{fixture}`*: *"])
     result.stdout.fnmatch_lines(["*Define the fixture `method` in your subclass: *"])
 
 

@@ -76,8 +76,8 @@ def test_looks_for_which_there_is_no_time_are_named() -> None:
     hurried = TimeLeft(lambda: float(next(clock)), lambda seconds: seconds < 0.1)
     found = judge(ball, views, aspects=Aspect.RESIDUAL | Aspect.STRAY | Aspect.FIT, time=hurried)
     assert found.skipped == (
-        "the look for mass where views show nothing",
-        "the look for views that do not fit the volume",
+        "the check for mass where projections show no material",
+        "the check for projections that do not fit the volume",
     )
     assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16 / 3)
     assert judge(ball, views, aspects=Aspect.STRAY).skipped == ()

@@ -158,7 +158,7 @@ class NXtomoWriter:
             with suppress(*FAILURES):
                 self.flush()  # the rows before may still fit
             self._broken = True
-            raise self._disk_error("store the frame", error) from error
+            raise self._disk_error("store the frame in", error) from error
 
     @property
     def rows(self) -> int:
@@ -211,7 +211,7 @@ class NXtomoWriter:
             self.flush()
         except FAILURES as error:
             self._broken = True
-            raise self._disk_error(f"store {what}", error) from error
+            raise self._disk_error(f"store {what} in", error) from error
 
     def close(
         self,
@@ -247,7 +247,7 @@ class NXtomoWriter:
                 self._broken = True
                 with suppress(*FAILURES):
                     self._let_go(reason or f"The file could not be finished ({hdf5.reason(error)}).")
-            raise self._disk_error("be finished", error) from error
+            raise self._disk_error("finish", error) from error
         finally:
             self._lock.release()
 
@@ -334,7 +334,7 @@ class NXtomoWriter:
         with suppress(OSError):  # the folder may have moved
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"
         return DataError(
-            f"{self.path} could not {what} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
+            f"Could not {what} {self.path} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
             "safe in this file: run `beamline recover` to make an ordinary scan file of them."
         )
 

@@ -1,8 +1,9 @@
 """EPICS motor record as a stage, over PVAccess or Channel Access (Mooney and Sluiter, motor record reference, R7).
 
-The record has no trigger output: a configuration with it takes step scans. A move is over when DMOV is 1; RBV then says
-whether it arrived. A record should set DMOV to 0 before the write of VAL is answered. Some do so later, and some say 1
-while the motor still turns: off its target, a motor stands when its place has not changed for `STILL`.
+The record has no trigger output, so only step scans are possible. A move has ended when DMOV is 1; RBV then shows
+whether the motor arrived. A record should set DMOV to 0 before the write of VAL is answered. Some records do so later,
+and some set 1 while the motor still turns. So a motor that is not at its target counts as stopped only if its position
+has not changed for `STILL`.
 """
 
 from __future__ import annotations
@@ -40,19 +41,21 @@ class Search(StrEnum):
 class EpicsSettings(StageFigures):
     """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
 
-    `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key
-    says deg.
+    `unit` is the record's EGU. If it is not deg, as for a linear sample mover, all keys with deg in their names use
+    this unit.
     """
 
     pulse_output: ClassVar[None] = None
-    """A motor record sets no output."""
+    """A motor record has no output that can be set."""
     pulse_width: ClassVar[None] = None
     active_high: ClassVar[bool] = True
-    """No cable: only checks of trigger pulses ask for it."""
+    """There is no cable; only checks of trigger pulses need one."""
     unit: str = setting(
         "deg", "Unit of the record (EGU). A linear axis has mm; every key with deg in its name then means mm."
     )
-    search: Search = setting(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
+    search: Search = setting(
+        Search.NONE, "How `beamline home` searches the reference: none, forward (HOMF) or reverse (HOMR)."
+    )
     tolerance: int = setting(
         10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
     )
@@ -72,8 +75,8 @@ class EpicsSettings(StageFigures):
 
 
 HOMED = 0x4000 | 0x0080
-"""MSTA: the reference was found, or it stands there."""
-FAULTS = {  # bit of MSTA: what it says, what to do
+"""Bits of MSTA: the reference was found, or the motor is at the reference."""
+FAULTS = {  # bit of MSTA: its meaning, and advice
     0x0200: (
         "the IOC lost its controller, or the controller reports a fault",
         "Check the controller, and read the messages in the IOC's shell",
@@ -83,15 +86,15 @@ FAULTS = {  # bit of MSTA: what it says, what to do
     0x0004: ("it is at its upper limit switch", "Move it away from the switch by hand or in the record's own screen"),
     0x2000: ("it is at its lower limit switch", "Move it away from the switch by hand or in the record's own screen"),
 }
-STILL = 1.0  # s without a change of RBV, after which a motor that says it is done, but is not at its target, stands
-CREEP = 10.0  # s that such a motor may still take to stand, at least
+STILL = 1.0  # s without a change of RBV after which a motor with DMOV 1 that is not at its target counts as stopped
+CREEP = 10.0  # s; least time that such a motor gets to stop
 GO, USE = "Go", "Use"
 """Labels of SPMG and SET with which a value written to VAL moves the motor."""
 
 
 @dataclass(frozen=True)
 class MotorStatus:
-    """State of the record: position in its unit, whether the move is done, and MSTA."""
+    """State of the record: position in its unit, whether the move has ended, and MSTA."""
 
     place: float
     done: bool
@@ -105,8 +108,10 @@ class MotorStatus:
 
 
 class EpicsStage(LineStage):
-    """Opening checks unit, step size, limits and speed of the record. VELO and ACCL are set for each move; closing
-    restores them, and lets a move under way end by itself.
+    """EPICS motor record as a stage; see the module.
+
+    Opening checks unit, step size, limits and speed of the record. VELO and ACCL are set for each move. Closing
+    restores them and does not stop a move.
 
     Args:
         url: pva://NAME or ca://NAME of the record.
@@ -118,7 +123,8 @@ class EpicsStage(LineStage):
         super().__init__(url, settings, clock, name)
         self._settings, self._last = settings, ""
         self._channel = open_channel(url, name, settings.timeout)
-        self._begun = self._looked = self._same_since = -math.inf  # s: the last move, the last look, the same place
+        # s; times of the last move, of the last read, and of the last change of position
+        self._begun = self._looked = self._same_since = -math.inf
         self._place = math.nan
         self._found = FoundSettings()
         with self._closed_on_failure():
@@ -146,7 +152,7 @@ class EpicsStage(LineStage):
             if refused.value:
                 raise DeviceRefused(
                     self.name,
-                    f"the record rejected {self._travel.degrees(target)}: beyond its own limits (LVIO)",
+                    f"the record rejected {self._travel.degrees(target)}, which is beyond its own limits (LVIO)",
                     request=self._last,
                     advice="Compare HLM and LLM of the record with low_deg and high_deg",
                     state="Nothing has moved",
@@ -158,7 +164,7 @@ class EpicsStage(LineStage):
         if self._settings.search is Search.NONE:
             raise DeviceRefused(
                 self.name,
-                "it has no reference to search for (search: none)",
+                "the configuration names no search for its reference (search: none)",
                 advice="Set devices.stage.search to forward or reverse, or home it in the record's own screen",
                 state="Nothing has moved",
             )
@@ -186,7 +192,7 @@ class EpicsStage(LineStage):
         status, target = self._status(), self._target  # read again: RBV may have been read before DMOV became 1
         arrived = target is None or self._is_at_target(status)
         if status.done and not (arrived or self._stops.came_since):
-            # It says that it is done, and is not there: look whether it stands.
+            # The record reports the end of the move, but the motor is not at the target. Check whether it has stopped.
             longest = max(timeout, CREEP)
             until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, longest)
             status = self._status()
@@ -205,7 +211,7 @@ class EpicsStage(LineStage):
         return self.to_angle(counts)
 
     def abort(self) -> None:
-        """Stop as `stop` does: the record has nothing faster, and the controller decelerates as for every stop."""
+        """Same as `stop`, because the record has no faster stop; the controller decelerates."""
         self.stop()
 
     def arm(self, train: TriggerTrain) -> None:
@@ -217,7 +223,7 @@ class EpicsStage(LineStage):
         )
 
     def disarm(self) -> None:
-        """Does nothing: the record is never armed."""
+        """Does nothing, because the record is never armed."""
 
     def digital_output(self, number: int) -> DigitalOutput:
         raise DeviceRefused(
@@ -239,28 +245,34 @@ class EpicsStage(LineStage):
 
     @property
     def _seen_to_stand(self) -> bool:
-        """Whether its place was the same in every reading of the last `STILL` s."""
+        """Whether the position was the same in every reading of the last `STILL` s."""
         return self._looked - self._same_since >= STILL
 
     def _is_at_target(self, status: MotorStatus) -> bool:
         return self._target is not None and abs(self._counts_of(status) - self._target) <= self._settings.tolerance
 
     def _hindrance(self) -> str:
-        """Why a move did not arrive, by the record; "" if it says nothing, or has no such fields."""
+        """Why a move did not arrive, according to the record.
+
+        "" if the record gives no reason or has no such fields.
+        """
         words = []
         with contextlib.suppress(DeviceError):
             (mode,) = self._read(".SPMG")
             if mode.label != GO:
-                words.append(f"SPMG is {mode}: somebody paused or stopped it in the record")
+                words.append(f"SPMG is {mode}: somebody paused or stopped the motor in the record")
         with contextlib.suppress(DeviceError):
             (disabled,) = self._read(".DISP")
             if disabled.value:
-                words.append("DISP is 1: the record accepts no values")
+                words.append("DISP is 1, so the record accepts no values")
         with contextlib.suppress(DeviceError):
             (wanted,) = self._read(".VAL")
             counts = round(float(wanted.value) * self.limits.counts_per_turn / 360)
             if self._target is not None and abs(counts - self._target) > self._settings.tolerance:
-                words.append(f"VAL is {wanted}: another client sent it somewhere else, or it did not accept the value")
+                words.append(
+                    f"VAL is {wanted}: another client sent the motor somewhere else, or the record did not accept the "
+                    "value"
+                )
         return ", ".join(words)
 
     def _counts(self) -> int:
@@ -278,7 +290,7 @@ class EpicsStage(LineStage):
         return MotorStatus(float(place.value), bool(done.value), int(bits.value))
 
     def _read(self, *suffixes: str) -> list[PvValue]:
-        """Values that the IOC vouches for."""
+        """Read values; only values that the IOC guarantees are accepted."""
         values = self._channel.read(*suffixes)
         for suffix, value in zip(suffixes, values, strict=True):
             refuse_invalid(self.name, self._channel.name + suffix, value, "It is not known whether it is moving")
@@ -290,7 +302,7 @@ class EpicsStage(LineStage):
             raise while_it_moves(self.name, purpose, self._counts_of(status))
 
     def _refuse_unless_it_would_go(self) -> None:
-        """Refuses a record that takes a place without a move: stopped by SPMG, or to be redefined by SET."""
+        """Raise DeviceRefused if the record would accept a position without a move, because of SPMG or SET."""
         for suffix, wanted in ((".SPMG", GO), (".SET", USE)):
             (field_value,) = self._read(suffix)
             if field_value.label != wanted:
@@ -314,7 +326,10 @@ class EpicsStage(LineStage):
         )
 
     def _checked(self) -> str:
-        """What the record moves; refuses a record that does not fit the settings. Remembers what moves change."""
+        """Description of the record; raises DeviceRefused if it does not match the settings.
+
+        Stores what moves change.
+        """
         fields = (".EGU", ".MRES", ".HLM", ".LLM", ".VMAX", ".VBAS", ".VELO", ".ACCL", ".DESC")
         unit, step, high, low, fastest, slowest, velocity, seconds, about = self._read(*fields)
         settings, per_unit = self._settings, self.limits.counts_per_turn / 360
@@ -331,7 +346,7 @@ class EpicsStage(LineStage):
         if wrong:
             problem = f"the record {self._channel.name} does not fit: {wrong}"
             raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved")
-        if float(high.value) > float(low.value):  # both 0: the record has no soft limits
+        if float(high.value) > float(low.value):  # if both are 0, the record has no soft limits
             low_counts = math.ceil(float(low.value) * per_unit - 1e-6)
             high_counts = math.floor(float(high.value) * per_unit + 1e-6)
             self._travel.refuse_narrower(low_counts, high_counts, "widen LLM and HLM of the record")

@@ -1,8 +1,7 @@
-"""One axis of a PI GCS 2.0 controller and its trigger line: commands and queries, converted between counts (here)
-and degrees (controller).
+"""One axis of a PI GCS 2.0 controller and its trigger line: commands and queries, in counts here and degrees there.
 
-Set commands are followed by ERR?, and important values are read back. Protocol: the C-863's manual (MS249E),
-cross-checked with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.
+ERR? follows every set command, and important values are read back. Protocol: manual of the C-863 (MS249E),
+cross-checked with the software of EPICS and of the vendor. Each line has one axis and one parameter; no daisy chain.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from drivers.stages.shared import FoundSettings, while_it_moves
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
 ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"
 RATE_AGREES = Fraction(1, 100)
-"""Controllers round velocities and accelerations to steps of their own; a larger difference is an error."""
+"""Controllers round velocities and accelerations to their own steps. A larger relative difference is an error."""
 
 
 @dataclass(frozen=True)
 class PiAxisStatus:
-    """State of the axis. raw: the replies, for errors."""
+    """State of the axis. `raw`: the replies, for error messages."""
 
     counts: int
     homed: bool
@@ -43,33 +42,36 @@ class PiAxisStatus:
 
 
 class PiGcsAxis:
-    """Raises (in all methods) the errors of `GcsLine`, and DeviceRefused if the axis must stand and does not."""
+    """One axis. All methods raise the errors of `GcsLine`, and DeviceRefused if the axis moves but must be at rest."""
 
     def __init__(self, line: GcsLine, settings: PiGcsSettings, name: str) -> None:
         self._line, self._name, self._axis, self._output = line, name, settings.axis, settings.trigger_line
         self._counts_per_turn = settings.counts_per_turn
         self._bit = 0
         self.last_move = ""
-        """The command of the last move or search, for errors."""
+        """The command of the last move or search, for error messages."""
         self._identity = ""
         self.error_at_opening = 0
-        """The code that the error register had, which opening cleared."""
+        """The code in the error register before opening cleared it."""
         self.found = FoundSettings()
-        """VEL, and the accelerations by the commands that set them, in degrees."""
+        """VEL and the accelerations in degrees, by the commands that set them."""
 
     def degrees(self, counts: Fraction | int) -> str:
-        """Degrees as text for a position, distance or rate; rounded far below a count over any train."""
+        """A position, distance or rate in degrees as text; rounding errors over any train are far below a count."""
         return plain(Fraction(counts) * 360 / self._counts_per_turn)
 
     def to_counts(self, degrees: str) -> int:
         return round(Fraction(degrees) * self._counts_per_turn / 360)
 
     def open(self, acceleration: Fraction) -> str:
-        """Identify the controller, take the axis: trigger off, servo on, acceleration (counts/s²); returns its name."""
+        """Identify the controller and prepare the axis: trigger off, servo on, acceleration (counts/s²).
+
+        Returns its name.
+        """
         self._line.wake()
         self._identity = self._line.ask("*IDN?", r".*Physik Instrumente.*", "the identity of a PI controller")[0]
         if self._line.ask("CSV?", r"(\d+)(?:\.\d+)?", "the version of the command language")[1] != "2":
-            raise self._refused(f"{self._identity} does not talk GCS 2.0", "Use a controller with command syntax 2.0")
+            raise self._refused(f"{self._identity} does not use GCS 2.0", "Use a controller with command syntax 2.0")
         self.error_at_opening = self._line.read_error()
         axes = [line.strip() for line in self._line.ask("SAI?", r"[\w\s-]+", "the names of its axes")[0].split("\n")]
         if self._axis not in axes:
@@ -88,7 +90,7 @@ class PiGcsAxis:
         return self._identity
 
     def own_limits(self) -> tuple[int, int]:
-        """The controller's own travel range in counts, a thousand million turns at most."""
+        """The controller's own travel range in counts, limited to 10⁹ turns."""
         most = 10**9 * self._counts_per_turn
         low, high = (self.to_counts(self._line.number(query, ANY_NUMBER)) for query in ("TMN?", "TMX?"))
         return max(low, -most), min(high, most)
@@ -108,7 +110,7 @@ class PiGcsAxis:
         return self._line.flag("ONT?")
 
     def status(self) -> PiAxisStatus:
-        """Read the position and state of the axis; the content of the error register becomes `fault`."""
+        """Read position and state of the axis; `fault` becomes the content of the error register."""
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
@@ -116,20 +118,20 @@ class PiGcsAxis:
         return PiAxisStatus(counts, homed, servo, in_words)
 
     def limit_switch(self) -> str:
-        """The limit switch that is on, in words; "" without one, or for a model with an unknown register."""
+        """Text about the active limit switch; "" if none is active, or if the model has an unknown register."""
         if "C-863" not in self._identity:
             return ""
         bits = int(self._line.ask(REGISTER, r"0[xX]([0-9A-Fa-f]{1,8})", "the status register")[1], 16)
         return {1: "negative limit switch", 4: "positive limit switch", 5: "both limit switches"}.get(bits & 5, "")
 
     def standing(self, purpose: str) -> None:
-        """Refuses `purpose` while the axis moves; the error register becomes `fault`."""
+        """Raise DeviceRefused for `purpose` while the axis moves; `fault` becomes the content of the error register."""
         if self.moving():
             raise while_it_moves(self._name, purpose, self.counts())
         self._line.read_error()
 
     def start(self, target: int, speed: Fraction) -> None:
-        """Begin a move of the standing axis to `target` counts at `speed` counts/s."""
+        """Begin a move to `target` counts at `speed` counts/s; the axis must be at rest."""
         self._take_rate("VEL", speed)
         self._begin(command := f"MOV {self._axis} {self.degrees(target)}")
         taken = self._line.number("MOV?")
@@ -137,7 +139,7 @@ class PiGcsAxis:
             raise self._line.not_followed(command, taken, self.degrees(target))
 
     def search_reference(self, command: str) -> None:
-        """Begin FRF, FNL or FPL of the standing axis."""
+        """Begin FRF, FNL or FPL; the axis must be at rest."""
         code, has = (31, "TRS?") if command == "FRF" else (32, "LIM?")
         if not self._line.flag(has):
             raise self._refused(f"{command} is not possible: {REFUSALS[code][0]}", advice(code), f"{has} {self._axis}")
@@ -155,7 +157,7 @@ class PiGcsAxis:
         return f"#{STOP_ALL[0]}"
 
     def arm(self, window: TriggerWindow, active_high: bool) -> None:
-        """Set the trigger line of the standing axis up and switch it on."""
+        """Set up the trigger line and switch it on; the axis must be at rest."""
         self.disarm()
         self._configure(2, self._axis)
         self._configure(3, "0")
@@ -179,10 +181,12 @@ class PiGcsAxis:
         self._line.judge(command, code)
 
     def _may_not_move(self, command: str) -> DeviceRefused:
-        """Which of the two reasons of error 5 it is."""
+        """The error for code 5, with the one of its two reasons that is true."""
         verb = command.split()[0]
         if not self._line.flag("SVO?"):
-            why = "Find what switched the servo off, then close the driver and open it again: that switches it on"
+            why = (
+                "Find what switched the servo off, then close the driver and open it again, which switches the servo on"
+            )
             return self._refused(f"{verb} is not possible: the servo is off", why, command)
         if not self._line.flag("FRF?"):
             why = "Start a reference search (start_home) when nothing is in the way of the stage"
@@ -190,7 +194,7 @@ class PiGcsAxis:
         return self._refused(f"{verb} ended with {meaning(5)}", advice(5), command)
 
     def _configure(self, parameter: int, value: str, tolerance: Fraction = Fraction(1, 2)) -> None:
-        """Send one CTO and read it back; the reply may have fewer decimals. `tolerance` in counts."""
+        """Send one CTO command and read the value back; the reply may have fewer decimals. `tolerance` is in counts."""
         command = f"CTO {self._output} {parameter} {value}"
         self._line.set(command)
         form = r"(\w+)" if parameter == 2 else NUMBER
@@ -212,7 +216,7 @@ class PiGcsAxis:
             raise self._line.not_followed(command, reply, f"{on:d}")
 
     def _compare_counts(self) -> None:
-        """Our counts must be multiples of the controller's, if it tells (parameters 0xE and 0xF)."""
+        """Check that our counts are multiples of the controller's, if it reports them (parameters 0xE and 0xF)."""
         numerator, denominator = (self._line.parameter(number) for number in (NUMERATOR, DENOMINATOR))
         if numerator is None or denominator is None or not Fraction(denominator):
             return
@@ -225,7 +229,7 @@ class PiGcsAxis:
             )
 
     def _take_accelerations(self, rate: Fraction) -> None:
-        """Set accelerations by ACC and DEC; a controller without these commands has parameters for both."""
+        """Set accelerations with ACC and DEC; a controller without these commands has parameters for both."""
         for command, parameter in (("ACC", ACCELERATION), ("DEC", DECELERATION)):
             before = self._line.parameter(parameter)
             if before is not None:
@@ -242,7 +246,7 @@ class PiGcsAxis:
                     raise self._line.not_followed(instead, reply or "", text) from None
 
     def _take_rate(self, command: str, rate: Fraction) -> None:
-        """VEL, ACC or DEC in counts."""
+        """The value of VEL, ACC or DEC in counts."""
         text = self.degrees(rate)
         self._line.set(f"{command} {self._axis} {text}")
         reply = self._line.number(f"{command}?")
@@ -250,9 +254,9 @@ class PiGcsAxis:
             raise self._line.not_followed(f"{command} {self._axis} {text}", reply, text)
 
     def restore(self) -> None:
-        """Restore the settings that moves and opening have changed; not during a move, which would follow them."""
+        """Restore the settings that moves and opening have changed; not during a move, because they would affect it."""
         if self.found.values and not self.moving():
-            self._line.read_error()  # of a move or a stop before: it says nothing of the settings
+            self._line.read_error()  # the code belongs to an earlier move or stop and not to the settings
             self.found.restore(lambda setting, value: self._line.set(_setting(setting, self._axis, value)))
 
     def _refused(self, problem: str, advice: str, request: str = "") -> DeviceRefused:

@@ -1,5 +1,4 @@
-"""The dialogue of PI GCS 2.0: set commands and the error register (ERR?) after each, queries, control bytes, numbers as
-text."""
+"""The protocol of PI GCS 2.0: set commands, each followed by ERR?, queries, control bytes, numbers as text."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ CHECK_SPEED = "Compare max_speed and acceleration in the configuration with what
 HOME = "Search the reference first, and check that the servo is on"
 LET_GO = "Release the controller from joystick, macro or another program"
 WAIT = "Wait until it has stopped, or stop it"
-OBSTACLE = "Find what held the stage (collision, load, cable, limit switch), then close and open the driver again"
+OBSTACLE = "Find what blocked the stage (collision, load, cable, limit switch), then close and open the driver again"
 LINE = "Check the cable and the baud rate"
 SERVICE = "Switch the controller off and on; if the error persists, ask the vendor"
 
@@ -71,10 +70,10 @@ REFUSALS = {
     203: ("the axis is not configured", "Check the stage's name in the controller (CST?)"),
     214: ("the position is unknown", HOME),
 }
-"""Code -> meaning and advice, for a refused command without other effects."""
+"""For each code, meaning and advice; for commands that were rejected and had no effect."""
 
 MOTION = frozenset({45, 49, 333, 504, 505, 1024, 1025})
-"""Events after which the axis may not be where it was sent: errors of the move in which they come."""
+"""Events after which the axis may not be at its target; they are errors of the move in which they occur."""
 EVENTS = {
     STOPPED: ("stopped by command", "Find who stopped it before you move it again"),
     45: (
@@ -93,7 +92,7 @@ EVENTS = {
     1024: ("motion error: the position error grew too large and the servo switched itself off", OBSTACLE),
     1025: ("the motor output limit was reached", OBSTACLE),
 }
-"""Code -> meaning and advice, for an event without a command."""
+"""For each code, meaning and advice; for events that do not belong to a command."""
 
 
 def meaning(code: int) -> str:
@@ -113,7 +112,7 @@ FRAMING = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
 PROBE = Probe("CSV?", r"\d+\.\d+")
 NUMBER = r"([+-]?\d{1,12}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,2})?)"
 ANY_NUMBER = r"([+-]?\d{1,320}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,3})?)"
-"""Endless stages give limits as large as a number can be."""
+"""Stages without end stops report limits as large as a number can be."""
 DECIMALS = 12
 
 
@@ -132,36 +131,37 @@ def is_rounding_of(reply: str, sent: str) -> bool:
 
 
 class GcsLine:
-    """A controller and the used one of its axes. `fault` keeps the register's last code until it is set to 0. Safe from
-    several threads.
+    """A controller and one of its axes. It can be used from several threads.
+
+    `fault` keeps the last code of the error register until it is set to 0.
 
     Raises (here and in all methods):
-        DeviceRefused: the controller refuses a command. DeviceError: another code, or a reply of another form.
-        DeviceTimeout: no reply.
+        DeviceRefused: the controller rejects a command. DeviceError: another error code, or a reply of another form.
+        DeviceTimeout: there is no reply.
     """
 
     def __init__(self, url: str, axis: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.fault = 0
         self.commanded = False
-        """Whether a move has started; error messages depend on it."""
+        """True if a move was started; error messages depend on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
         self._serial = line_to(wiring, url, name, clock, PROBE, framing=FRAMING)
 
     def set(self, command: str) -> None:
-        """Send a set command; raises if the register then has a code."""
+        """Send a set command; raises an error if the register then contains a code."""
         self.judge(command, self.tell(command))
 
     def tell(self, command: str) -> int:
-        """Send a set command; returns the register's code."""
+        """Send a set command; returns the code in the error register."""
         with self._register:
             self._serial.send(command)
             return self.read_error()
 
     def stop(self, command: str | bytes) -> None:
-        """Send a stop, as a command or control byte, even while another thread asks; then check that it was understood.
+        """Send a stop (a command or control byte), even while another thread waits for a reply; then check its code.
 
-        A stop sets its own code; codes of earlier errors are accepted, too.
+        A stop sets its own code. Codes of earlier errors are also accepted.
         """
         self._serial.send(command)
         with self._register:
@@ -191,7 +191,7 @@ class GcsLine:
             )
 
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
-        """Send a query, a text or a control byte. Returns the match of its whole reply with `form`."""
+        """Send a query (text or control byte). Returns the match of its whole reply with `form`."""
         return self._serial.query(request, form, meant, self._state())
 
     def flag(self, query: str) -> bool:
@@ -203,8 +203,10 @@ class GcsLine:
         return self.ask(f"{query} {self._axis}", self._key + form, f"{self._axis}=number")[1]
 
     def parameter(self, number: str) -> str | None:
-        """Read a parameter (SPA?); None if it is unknown: the controller then sets the error register and does not
-        answer."""
+        """Read a parameter (SPA?).
+
+        None if the controller does not know it, sets the error register and does not answer.
+        """
         request = f"SPA? {self._axis} {number}"
         try:
             return self.ask(request, rf"{re.escape(self._axis)} \w+ ?= ?{NUMBER}", f"{self._axis} {number}=number")[1]

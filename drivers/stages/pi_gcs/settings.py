@@ -1,9 +1,9 @@
 """Settings of a PI GCS 2.0 stage, in degrees as the controller uses them, and its trigger pulse trains.
 
-Trains are those of mode 0 (PositionDistance). The controller gives a pulse at each step between the thresholds, if the
-stage entered through the start threshold. The stop threshold lies half an interval behind the last pulse, so that it
-does not matter whether the threshold itself fires. No manual says where the first pulse comes. We take it to come at
-the start threshold, from memory, see `PiFirstPulse`.
+Trains use trigger mode 0 (PositionDistance). The controller gives a pulse at each step between the thresholds if the
+stage entered through the start threshold. The stop threshold is half an interval after the last pulse, so that it does
+not matter whether there is a pulse at the threshold itself. No manual states the position of the first pulse. We
+assume, from memory, that it is at the start threshold; see `PiFirstPulse`.
 """
 
 from __future__ import annotations
@@ -18,28 +18,32 @@ from drivers.stages.settings import StageFigures, Wiring
 from recon.base.setting import setting
 
 PULLED_APART = Fraction(1, 10)
-"""Largest error of the last pulse, in intervals, by a step that a controller rounds in its reply. Whether it also uses
-the rounded step cannot be seen; a smaller error spoils no image.
+"""Largest error of the last pulse, in intervals, if the controller rounds the step in its reply. It is not known
+whether the controller also uses the rounded step; a smaller error does not affect an image.
 """
 
 
 class PiFirstPulse(StrEnum):
-    """Place of a train's first pulse, which the firmware decides. To find out: arm 3 pulses, pass them, and count."""
+    """Position of the first pulse of a train, which depends on the firmware.
+
+    To find it, arm 3 pulses, pass them, and count.
+    """
 
     AT_THRESHOLD = "at_threshold"
-    """At the start threshold: it is put on the first pulse."""
+    """The first pulse is at the start threshold, which is set to the position of the first pulse."""
     STEP_AFTER = "step_after"
-    """One step behind the start threshold: it is put one interval before the first pulse."""
+    """The first pulse is one step after the start threshold, which is set one interval before the first pulse."""
     GRID = "grid"
-    """At whole steps from position 0 inside the window: it begins half an interval before the first pulse, and trains
-    must lie on whole intervals.
+    """Pulses are at whole steps from position 0 inside the window. The window begins half an interval before the first
+    pulse, and trains must begin at a whole number of intervals.
     """
 
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """Trigger window in counts: distance of pulses, begin and end, and the allowed error of a step, which adds up
-    over the train. The stage must stand before the window.
+    """Trigger window in counts: distance of pulses, begin and end, and the allowed error of a step.
+
+    The error adds up over the train. The stage must be at rest before the window.
     """
 
     step: Fraction
@@ -52,10 +56,10 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     """The window for a train of at least one pulse and an interval that is not 0.
 
     Raises:
-        ValueError: this firmware cannot put pulses there.
+        ValueError: this firmware cannot send pulses at these positions.
     """
     sign = 1 if train.interval > 0 else -1
-    # Thresholds that a controller rounds to the same count would switch the window of a single pulse off.
+    # If a controller rounds both thresholds to the same count, the window of a single pulse is empty.
     alone = train.n == 1 and first_pulse is not PiFirstPulse.GRID
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
@@ -71,7 +75,8 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
     """True if the train must be disarmed for a move from `here` to `target` (counts).
 
-    Either it was emitted, and passing it would emit it again. Or it has begun, and the way back would give pulses.
+    Either the train was emitted, and passing it would emit it again. Or it has begun, and moving back would give
+    pulses.
     """
     sign = 1 if train.interval > 0 else -1
     started, passed = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
@@ -79,7 +84,7 @@ def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
 
 
 SLOWEST = 1e-6
-"""Least degrees/s that can be written."""
+"""Smallest degrees/s that can be written."""
 AXIS_NAME = r"^\w{1,16}$"
 
 
@@ -97,13 +102,13 @@ class Reference(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class PiGcsSettings(Wiring, StageFigures):
-    """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
+    """Physik Instrumente controller with the command language GCS 2.0 and triggers by CTO and TRO, such as a C-863.
 
-    The axis is named as SAI? lists it. `firmware_pulse` is from memory; trains need equal pauses between pulses. A
-    servo holds to a few counts, hence the tolerance.
+    The axis has the name that SAI? lists. `firmware_pulse` is from memory; trains need pauses between pulses that are
+    as long. A servo holds a position to a few counts, which is the reason for the tolerance.
 
     Raises:
-        ValueError: a speed or acceleration that cannot be written, or a pulse width, which the firmware fixes.
+        ValueError: a speed or acceleration cannot be written, or a pulse width is given, which the firmware fixes.
     """
 
     axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
@@ -137,8 +142,10 @@ class PiGcsSettings(Wiring, StageFigures):
         return self.trigger_line
 
     def limits(self) -> StageLimits:
-        """See `StageSettings`. If the first pulse comes a step after the threshold, the stage must stand more than a
-        step before it. The pause between pulses is as long as a pulse.
+        """See `StageSettings`.
+
+        If the first pulse is one step after the threshold, the stage must be more than a step before the first pulse.
+        The pause between pulses is as long as a pulse.
         """
         if min(math.degrees(self.max_speed), math.degrees(self.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")

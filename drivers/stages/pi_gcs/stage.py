@@ -1,7 +1,7 @@
 """PI controller with GCS 2.0 (C-863 class) as rotation stage, with position-synchronised trigger pulses.
 
-Positions come from an encoder and hold only after a reference move (`start_home`): before it, moves are refused. Pulses
-come from a digital output in trigger mode 0; the controller does not count them.
+Positions come from an encoder and are valid only after a reference move (`start_home`). Before it, the stage does not
+accept moves. Pulses come from a digital output in trigger mode 0; the controller does not count them.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from drivers.stages.shared import POLL, LineStage, StageOutput, found_at_opening
 
 
 class PiGcsStage(LineStage):
-    """Opening switches the servo on and the trigger line off. Closing leaves both as they are. It restores velocity and
-    accelerations, unless a move is under way, which it leaves.
+    """PI controller with GCS 2.0 as a rotation stage; see the module.
 
-    `abort` stops all axes of the controller. A move that would emit a train a second time, or turn back inside it, ends
-    the train.
+    Opening switches the servo on and the trigger line off. Closing does not change them. It restores velocity and
+    accelerations, except during a move, which it does not stop. `abort` stops all axes of the controller. A move that
+    would emit a train a second time, or turn back inside it, disarms the train.
 
     Args:
-        url: what pyserial opens.
+        url: pyserial URL.
     """
 
     Settings = PiGcsSettings
@@ -37,7 +37,7 @@ class PiGcsStage(LineStage):
         self._settings = settings
         self._per_radian = Fraction(settings.counts_per_turn) / Fraction(2 * math.pi)
         self._train: TriggerTrain | None = None
-        self._told = 0  # the code of the error register that an error has told
+        self._told = 0  # the code of the error register that an error has already reported
         self._line = GcsLine(url, settings.axis, settings, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
         self._found = self._axis.found
@@ -64,14 +64,14 @@ class PiGcsStage(LineStage):
             self._refuse_untold()
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
                 self.disarm()
-            # Clear the earlier move: it is not the reason if this one fails.
+            # Clear the earlier move, because it is not the reason if this one fails.
             self._target, self._searching = None, False
             self._axis.start(target, Fraction(speed) * self._per_radian)
             self._told = 0
             self._target = target
 
     def start_home(self) -> None:
-        """Soft limits do not hold on the way. It ends an armed train."""
+        """Begin the reference move; soft limits do not apply on the way. It disarms a train."""
         with self._stops.none_while("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._searching = None, None, False
@@ -147,7 +147,7 @@ class PiGcsStage(LineStage):
             self._axis.restore()
 
     def _refuse_untold(self) -> None:
-        """Raise DeviceError, once, for what disturbed the standing axis since its last move."""
+        """Raise DeviceError, once, if something disturbed the axis since its last move."""
         code = self._line.fault
         if code not in MOTION or code == self._told:
             return
@@ -158,7 +158,8 @@ class PiGcsStage(LineStage):
             reply=str(code),
             expected="an axis at rest",
             advice=f"{advice(code)}. Frames since then may have been taken at another angle",
-            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(self._axis.counts())}",
+            state="Nothing has moved because of this request; the stage is at "
+            f"{self._travel.degrees(self._axis.counts())}",
         )
 
     def _send_stop(self, hard: bool) -> str:
@@ -174,7 +175,7 @@ class PiGcsStage(LineStage):
         return self._target is not None and abs(counts - self._target) > self._settings.tolerance
 
     def _fault(self, status: PiAxisStatus) -> str:
-        """Why the last move ended early, or what stands, in words; "" for nothing."""
+        """Text on why the last move ended early, or on a present fault; "" if there is none."""
         code, words = self._line.fault, []
         early = self._away(status.counts) or (self._searching and not status.homed)
         if code and code != STOPPED:
@@ -200,5 +201,5 @@ class PiGcsStage(LineStage):
             if code in EVENTS
             else "Find what stopped it (limit switch, person) before you move it again",
             state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts"
-            + ("" if status.homed else ", which do not count from the reference"),
+            + ("" if status.homed else ", which are not counted from the reference"),
         )

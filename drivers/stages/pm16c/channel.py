@@ -1,8 +1,9 @@
 """One motor channel of a Tsuji PM16C-04XD(L) in the controller's own units: pulses, pulses/s, codes, and its replies.
 
 Protocol: the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Set commands have no reply,
-so each important one is read back. A controller that writes its memory takes its time: KEK's driver waits 40 ms after
-settings. So a wrong read-back is repeated for a while, and the setting then sent once more; only then it is refused.
+so each important one is read back. A controller that writes its memory needs time: KEK's driver waits 40 ms after
+settings. So if a read-back is wrong, it is repeated for a while, and then the setting is sent once more. Only after
+that is it an error.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from drivers.stages.shared import FoundSettings, while_it_moves
 
 PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"
-MEMORY = 0.12  # Longest time, s, until a setting takes effect
-LOOK = 0.02  # s between two checks of this
+MEMORY = 0.12  # longest time in s until a setting takes effect
+LOOK = 0.02  # s between two checks of a setting
 T = TypeVar("T")
 
 
@@ -33,7 +34,7 @@ class PM16CLine:
 
     def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.commanded = False
-        """Whether a move has started; the text of an error depends on it."""
+        """True if a move was started; error messages depend on it."""
         self._name, self._clock = name, clock
         self._serial = line_to(wiring, url, name, clock, PROBE, unsolicited=STOPPED_NOTE)
 
@@ -54,7 +55,7 @@ class PM16CLine:
         self.make_sure(command, query, "YES|NO", wanted, str)
 
     def make_sure(self, command: str, query: str, form: str, wanted: T, read: Callable[[str], T]) -> None:
-        """Send a setting and check that the reply to `query`, of the form `form`, reads `wanted`."""
+        """Send a setting, and check that the reply to `query`, of the form `form`, is `wanted`."""
         for _ in range(2):
             self.send(command)
             value = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
@@ -70,7 +71,7 @@ class PM16CLine:
         return seen
 
     def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
-        """The error for a read-back that is not what was set."""
+        """The error for a read-back that differs from the set value."""
         return DeviceError(
             self._name,
             f"it did not accept a setting ({self.complaint()})",
@@ -82,7 +83,7 @@ class PM16CLine:
         )
 
     def complaint(self) -> str:
-        """Read and clear the controller's own error text."""
+        """Read and clear the controller's error text."""
         text = self.ask("ERR?", r".*", "an error text")[0]
         self.send("ERRC")
         return f"the controller says {text}"
@@ -95,13 +96,16 @@ COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 ERRORS = {0x2: "a move was rejected because its pulse chip was busy", 0x4: "a move to a wrong position was rejected"}
-"""Error flags that tell of the motor; that of an unknown command is set by the empty line of every opening, too."""
+"""Error flags about the motor.
+
+The flag for an unknown command is left out, because the empty line at every opening sets it.
+"""
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
 
 @dataclass(frozen=True)
 class ChannelStatus:
-    """Reply to STSx?. ending: why the last move ended early, in words; "" if it did not."""
+    """Reply to STSx?. `ending`: text on why the last move ended early; "" if it did not."""
 
     remote: bool
     moving: bool
@@ -116,11 +120,11 @@ class ChannelStatus:
 
 
 class PM16CChannel:
-    """Controls one channel of the controller, on position controller A, which has the trigger output TP0.
+    """Controls one channel of the controller, on position controller A, because that one has the trigger output TP0.
 
     Raises (here and in all methods):
         DeviceError: a wrong reply or read-back. DeviceTimeout: no reply.
-        DeviceRefused: the controller is in LOCAL, or its motors move.
+        DeviceRefused: the controller is in LOCAL mode, or its motors move.
     """
 
     def __init__(self, url: str, channel: int, wiring: Wiring, clock: Clock, name: str) -> None:
@@ -128,14 +132,18 @@ class PM16CChannel:
         self.last_move = ""
         """The command of the last move or search, for errors."""
         self.error_at_opening = ""
-        """What the controller's error flags said, which opening cleared."""
+        """The controller's error flags before opening cleared them."""
         self.found = FoundSettings()
-        """What opening and moves change: position controllers, acceleration code, high speed, selected speed."""
+        """What opening and moves change: position controllers, acceleration code, high speed, selected speed.
+        """
         self._restore_local = False
         self._line = PM16CLine(url, wiring, clock, name)
 
     def open(self, rate_code: int) -> str:
-        """Go to REMOTE, take position controller A without a train, set the acceleration; returns the firmware."""
+        """Switch to REMOTE, select position controller A without a train, set the acceleration.
+
+        Returns the firmware.
+        """
         c = self._digit
         self._line.send("")  # an empty line ends an incomplete command of another program
         version = self._line.ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
@@ -159,8 +167,9 @@ class PM16CChannel:
         return version
 
     def own_limits(self) -> tuple[int, int] | None:
-        """The controller's own soft limits (backward, forward) in counts; None if the first of the switch bits has them
-        switched off [from memory].
+        """The controller's own soft limits (backward, forward) in counts.
+
+        None if the first of the switch bits says that they are switched off [from memory].
         """
         c = self._digit
         if self._line.ask(f"SETLS?{c}", r"[01]{8}", "eight limit-switch bits")[0][0] == "0":
@@ -179,7 +188,7 @@ class PM16CChannel:
         return ChannelStatus(match[1] == "R", match[2] != "S" or bool(bits & 1), ending, int(match[4]), match[0])
 
     def standing(self, purpose: str) -> ChannelStatus:
-        """The status; refuses `purpose` while the motor moves or the panel is in LOCAL."""
+        """The status. Raises DeviceRefused for `purpose` while the motor moves or the panel is in LOCAL."""
         status = self.status()
         if status.moving:
             raise while_it_moves(self._name, purpose, status.counts, status.raw)
@@ -200,7 +209,7 @@ class PM16CChannel:
         self._begin(f"ABS{self._digit}{target:+d}", target)
 
     def find_home(self, speed: int) -> None:
-        """Begin the search for the home switch at `speed` pulses/s; it leaves the trigger output cleared."""
+        """Begin the search for the home switch at `speed` pulses/s. The trigger output is cleared."""
         self.standing("a home search")
         self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
         self._take_speed(speed)
@@ -211,12 +220,12 @@ class PM16CChannel:
         self._begin(f"GTHP{self._digit}", home)
 
     def home(self) -> int | None:
-        """Position of the home switch in counts; None if no search has found it."""
+        """Position of the home switch in counts; None if no search has found the switch."""
         reply = self._line.ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
         return None if reply[1] is None else int(reply[1])
 
     def preset(self, counts: int) -> None:
-        """Set the count of the present place to `counts`."""
+        """Set the count of the present position to `counts`."""
         self.standing("a preset")
         self._line.set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
 
@@ -240,7 +249,7 @@ class PM16CChannel:
         return command
 
     def close(self) -> None:
-        """Give the panel back if it was in LOCAL, and free the port even if the line is dead."""
+        """Switch back to LOCAL if it was in LOCAL before, and free the port even if the line is dead."""
         try:
             self._restore()
             if self._restore_local:
@@ -257,14 +266,17 @@ class PM16CChannel:
         self.found.values = values
 
     def _restore(self) -> None:
-        """Set back what opening and moves have changed; not while a motor moves, which then refuses it."""
+        """Restore the settings that opening and moves have changed.
+
+        Not while a motor moves, because it is then rejected.
+        """
         c, write = self._digit, self._line.send
         if self.found.values and not (status := self.status()).moving and status.remote:
             forms = {"RTE": f"RTE{c}{{}}", "SPDH": f"SPDH{c}{{}}", "SPD": f"SPD{{}}{c}", "SETCH": "SETCH{}"}
             self.found.restore(lambda name, value: write(forms[name].format(value)))
 
     def _channels(self) -> str:
-        """On position controllers A to D."""
+        """The channels on position controllers A to D."""
         return self._line.ask("SETCH?", r"[0-9A-F]{4}", "four channels")[0]
 
     def _refuse_old(self, version: str) -> None:
@@ -286,7 +298,7 @@ class PM16CChannel:
         self._line.make_sure(f"SPDH{c}", f"SPD?{c}", "[HML]SPD", "HSPD", str)
 
     def _begin(self, command: str, target: int | None) -> None:
-        """Send a move command, and check that the motor moves or is already at its target (None: no target)."""
+        """Send a move command, and check that the motor moves or is already at its target, if there is one."""
         self._line.commanded, self.last_move = True, command
         self._line.send(command)
 

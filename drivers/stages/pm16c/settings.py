@@ -12,12 +12,12 @@ from drivers.stages.settings import StageFigures, Wiring
 from drivers.stages.travel import counts_in
 from recon.base.setting import setting
 
-MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}  # Pulse width in s, the widest first -> TMGM mode
+MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}  # pulse width in s, the widest first, and its TMGM mode
 
 
 @dataclass(frozen=True)
 class PulseWidths:
-    """The widths that a train may take, the widest first: the `chosen` one, or all.
+    """The pulse widths that a train may have, the widest first: the `chosen` one, or all.
 
     Raises:
         ValueError: the output has no such width.
@@ -37,22 +37,28 @@ class PulseWidths:
 
     @property
     def spacing(self) -> float:
-        """Least time between pulses in s. Closer ones would merge, and the controller then leaves the output high."""
+        """Smallest time between pulses in s.
+
+        Closer pulses would merge, and the controller would leave the output high.
+        """
         return 2 * self.allowed[-1]
 
     def widest_for(self, train: TriggerTrain, limits: StageLimits) -> float:
-        """The widest pulse that leaves the output low as long as high at full speed, for a train with this spacing."""
+        """The widest pulse for which, at full speed, the output is low for as long as it is high."""
         fits = (w for w in self.allowed if train.n == 1 or abs(train.interval) >= counts_in(2 * w, limits))
         return next(fits, self.allowed[-1])
 
 
 class Pm16cFirstPulse(StrEnum):
-    """Place of a train's first pulse, which the firmware decides. To find out: arm 3 pulses, pass them, and count."""
+    """Position of the first pulse of a train, which depends on the firmware.
+
+    To find it, arm 3 pulses, pass them, and count.
+    """
 
     AT_START = "at_start"
-    """The start point itself fires."""
+    """The first pulse is at the start point."""
     INTERVAL_AFTER = "interval_after"
-    """The first pulse comes one interval behind the start point: the stage must stand before that."""
+    """The first pulse is one interval after the start point; the stage must be at rest before the start point."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,8 @@ class TriggerPoints:
 def points_of(train: TriggerTrain, first_pulse: Pm16cFirstPulse) -> TriggerPoints:
     """The points for a train of at least one pulse and an interval that is not 0.
 
-    The end point lies half an interval behind the last pulse, so that a pulse at the end point itself makes no
-    difference. At an interval of one count the end point is the last pulse.
+    The end point is half an interval after the last pulse, so that it does not matter whether there is a pulse at the
+    end point itself. With an interval of one count, the end point is the last pulse.
     """
     sign = 1 if train.interval > 0 else -1
     interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
@@ -77,18 +83,18 @@ def points_of(train: TriggerTrain, first_pulse: Pm16cFirstPulse) -> TriggerPoint
 
 
 MAX_SPEED = 5_000_000  # pulses/s
-MAX_COUNT = 2_147_483_647  # Largest position, trigger point and limit, either way
+MAX_COUNT = 2_147_483_647  # largest position, trigger point and limit in both directions
 E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 _TRIED = (m / 10 * 10.0**e for m in E24 for e in range(-2, 4))
 RATES = sorted((ms for ms in _TRIED if 0.0155 < ms < 1005), reverse=True)
-"""RTE code -> ms per 1000 pulses/s: the preferred numbers of IEC 60063 from 1000 down to 0.016, codes 0 to 115."""
+"""For each RTE code 0 to 115, ms per 1000 pulses/s: the preferred numbers of IEC 60063 from 1000 down to 0.016."""
 
 
 def steepest_code(acceleration: float) -> int:
-    """The code of the steepest acceleration up to `acceleration` (pulses/s²).
+    """The code of the highest acceleration up to `acceleration` (pulses/s²).
 
     Raises:
-        ValueError: even the gentlest is above it.
+        ValueError: even the lowest acceleration of the controller is above `acceleration`.
     """
     codes = [code for code, ms in enumerate(RATES) if 1e6 / ms <= acceleration * (1 + 1e-9)]
     if not codes:
@@ -101,8 +107,8 @@ class PM16CSettings(Wiring, StageFigures):
     """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
 
     Raises:
-        ValueError: a speed, a place, a width, a polarity or a channel that the controller does not have, or an
-            acceleration below its gentlest.
+        ValueError: the controller does not have this speed, position, pulse width, polarity or channel, or the
+            acceleration is below its lowest one.
     """
 
     pulse_output: ClassVar[None] = None
@@ -115,10 +121,10 @@ class PM16CSettings(Wiring, StageFigures):
         "from the manual), or an interval after it.",
     )
     home: float | None = setting(
-        None, "Angle of its home switch; null: it has none, and no search is made.", unit="deg"
+        None, "Angle of the home switch; null: there is no home switch, and no search is made.", unit="deg"
     )
     home_speed: float | None = setting(
-        None, "Speed of the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0
+        None, "Speed of the search for the home switch; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0
     )
 
     def __post_init__(self) -> None:
@@ -154,9 +160,11 @@ class PM16CSettings(Wiring, StageFigures):
         return steepest_code(self.acceleration / (2 * math.pi / self.counts_per_turn))
 
     def limits(self) -> StageLimits:
-        """See `StageSettings`. The acceleration is the controller's steepest one up to the configured one. If the first
-        pulse comes an interval after the start point, the stage must stand more than that before it. The pause between
-        pulses is as long as a pulse.
+        """See `StageSettings`.
+
+        The acceleration is the controller's highest one up to the configured one. If the first pulse is an interval
+        after the start point, the stage must be more than an interval before the first pulse. The pause between pulses
+        is as long as a pulse.
         """
         radians = 2 * math.pi / self.counts_per_turn
         if max(abs(self.low), abs(self.high)) > MAX_COUNT * radians:

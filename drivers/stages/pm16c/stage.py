@@ -1,7 +1,7 @@
 """Tsuji PM16C-04XD(L) as rotation stage: a serial pulse motor controller with position-synchronised trigger pulses.
 
-Positions are commanded pulses, not an encoder's. Pulses come from TP0. The controller's own soft limits are respected
-and never changed.
+Positions are commanded pulses; there is no encoder. Trigger pulses come from TP0. The controller's own soft limits are
+respected and never changed.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from drivers.stages.shared import LineStage, found_at_opening, until_standing
 
 
 class HomeSearch:
-    """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
+    """One search for the home switch: find it (FDHP), go back to it (GTHP), set its count (PS).
 
-    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
-    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
-    speed is the selected one. A search that has found the switch may end some counts beyond it.
+    Call `begin`, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
+    checked at an instrument: the direction of the search and the kind of the switch are set on the controller's panel;
+    the speed is the selected one; a search that has found the switch may end some counts beyond it.
 
     Args:
-        home: the count that the reference gets.
+        home: the count of the reference.
     """
 
     def __init__(self, channel: PM16CChannel, name: str, home: int) -> None:
@@ -38,14 +38,14 @@ class HomeSearch:
         self._channel.find_home(speed)
 
     def cancel(self) -> None:
-        """End the search: no further step. Call it before the stop is sent, from any thread."""
+        """End the search, so that no further step follows. Call this before the stop is sent, from any thread."""
         self._cancelled = True
 
     def go_on(self, status: ChannelStatus) -> bool:
-        """Take the next step after the motor has come to rest; False if there is none.
+        """Make the next step after the motor has come to rest; False if there is no further step.
 
         Raises:
-            DeviceError: the search ended without the switch, or was stopped.
+            DeviceError: the search ended without finding the switch, or was stopped.
         """
         home = self._channel.home() if self._found is None else self._found
         if home is None or self._cancelled or status.stopped:
@@ -55,7 +55,7 @@ class HomeSearch:
             try:
                 self._channel.go_home(home)
             finally:
-                if self._cancelled:  # the stop may have gone out just before the move
+                if self._cancelled:  # the stop may have been sent just before the move
                     self._channel.stop(hard=False)
             return True
         if status.counts != home:
@@ -71,16 +71,18 @@ class HomeSearch:
             reply=status.raw,
             expected="to be on the home switch",
             advice="Check the switch and its settings on the controller's panel, then search again",
-            state=f"It is at {status.counts} counts, which do not count from the reference",
+            state=f"It is at {status.counts} counts, which are not counted from the reference",
         )
 
 
 class PM16CStage(LineStage):
-    """Closing it restores speed, acceleration and position controllers as they were found; a move under way ends by
-    itself, and they stay then. Arming and disarming need a standing stage.
+    """Tsuji PM16C-04XD(L) as a rotation stage; see the module.
+
+    Closing restores speed, acceleration and position controllers as they were found. During a move it restores nothing,
+    and the move ends by itself. For arming and disarming, the stage must be at rest.
 
     Args:
-        url: what pyserial opens; the controller's LAN port is "socket://host:7777".
+        url: pyserial URL; the controller's LAN port is "socket://host:7777".
     """
 
     Settings = PM16CSettings
@@ -113,12 +115,12 @@ class PM16CStage(LineStage):
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """Begin the search for home; `wait` does its later steps. An armed train is disarmed."""
+        """Begin the search for the home switch; `wait` makes its later steps. An armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
                 "it has no home switch",
-                advice="If there is one, give its angle as `home_deg` in the configuration",
+                advice="If there is a home switch, set its angle as `home_deg` in the configuration",
                 state="Nothing has moved",
             )
         search = HomeSearch(self._channel, self.name, self._home)
@@ -191,5 +193,5 @@ class PM16CStage(LineStage):
         )
 
     def _until_standing(self, timeout: float) -> ChannelStatus:
-        """The status once the stage stands, or when the time is over."""
+        """The status when the stage has stopped, or when the time is over."""
         return until_standing(self._clock, self._channel.status, lambda status: status.moving, timeout)

@@ -1,9 +1,9 @@
 """One axis of a Zaber device in the device's own units (microsteps, native speeds), with its settings, flags and
 replies.
 
-Every command except a stop has its own message id and waits for its reply, which accepts or rejects it. Commands and
-replies are Zaber's ASCII protocol version 2, as the vendor's library zaber-motion sends and accepts it. Meanings of
-flags and reasons are in our words, after zaber-motion and ArduinoZaberMaster.
+Every command except a stop has its own message id and waits for its reply, which accepts or rejects the command.
+Commands and replies follow Zaber's ASCII protocol version 2, as the vendor's library zaber-motion uses it. The texts
+for flags and reasons are our own, after zaber-motion and ArduinoZaberMaster.
 """
 
 from __future__ import annotations
@@ -51,10 +51,11 @@ FAULTS = {
     "FE": Meaning("limit error", "Find why the stage ran into a limit, then search the reference"),
     "FT": Meaning("twisted too far", "Turn it back until the cables are straight"),
 }
-"""Flags of a fault; the driver may be off."""
+"""Flags of faults; the motor driver may be off."""
 ENDINGS = {
     "WL": Meaning(
-        "a limit switch came where none was expected", "Check travel limits and cables, then search the reference"
+        "reached a limit switch at an unexpected position",
+        "Check travel limits and cables, then search the reference",
     ),
     "WV": Meaning("supply voltage out of range", "Check the power supply"),
     "WT": Meaning("controller hot", "Let it cool down"),
@@ -63,14 +64,17 @@ ENDINGS = {
     "NC": Meaning("moved by its knob", "Do not touch the knob during a scan"),
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
-"""Flags that can explain why a move ended early, beside those of faults."""
+"""Flags that can explain why a move ended early, in addition to those of faults."""
 INTERRUPTED = "NI"
-"""The flag that every stop before the end of a move leaves, also a stop of our own: the stage is where it counts."""
+"""The flag that every stop before the end of a move sets, also our own stop. The position is still right."""
 SLIPPED = frozenset({"WL", "WS", "WM", "NC"})
-"""Flags after which the stage may not be where its counts say: beside faults, errors of the move in which they come."""
+"""Flags after which the position may be wrong.
+
+In addition to faults, they are errors of the move in which they occur.
+"""
 LOST = frozenset({"FS", "FQ", "FI", "FA", "FE"})
-"""Flags of faults after which the same holds."""
-UNREFERENCED = frozenset({"WR", "WH"})  # Flags of an axis that does not know its reference
+"""Flags of faults after which the position may be wrong."""
+UNREFERENCED = frozenset({"WR", "WH"})  # flags of an axis that has no reference
 REASONS = {
     "AGAIN": "it repeatedly asks to repeat the request",
     "AXISONLY": "only an axis can answer this",
@@ -93,7 +97,10 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply to one command. `flag` is the gravest warning, "" without one; `data` is "0" if there are no data."""
+    """A reply to one command.
+
+    `flag`: the most serious warning, "" if there is none; `data` is "0" if there are no data.
+    """
 
     accepted: bool
     busy: bool
@@ -113,7 +120,7 @@ def lrc(body: str) -> str:
 
 
 def encode(device: int, axis: int, identity: int, words: str) -> str:
-    """A command packet without its line end."""
+    """A command packet, without its line end."""
     body = f"{device} {axis} {identity:02d} {words}".rstrip()
     return f"/{body}:{lrc(body)}"
 
@@ -121,7 +128,7 @@ def encode(device: int, axis: int, identity: int, words: str) -> str:
 def damage(line: str, *, must_have_checksum: bool) -> str:
     """Fault of a received line by its checksum; "" if it is good.
 
-    Only replies, alerts and information carry a checksum; other lines pass.
+    Only replies, alerts and information have a checksum; other lines count as good.
     """
     if line[:1] not in ("@", "!", "#"):
         return ""
@@ -130,7 +137,9 @@ def damage(line: str, *, must_have_checksum: bool) -> str:
         return "it has no checksum" if must_have_checksum and line[0] == "@" else ""
     if not body.isascii() or checksum != lrc(body):
         return (
-            f"its checksum is {checksum!r} and not {lrc(body)!r}" if body.isascii() else "it has bytes that are no text"
+            f"its checksum is {checksum!r}; expected {lrc(body)!r}"
+            if body.isascii()
+            else "it contains bytes that are not text"
         )
     return ""
 
@@ -142,14 +151,12 @@ def reply_form(device: int, axis: int, identity: int, data: str) -> str:
 
 
 def passed_over_form(identity: int) -> str:
-    """Regular expression of lines to skip: alerts, information, echoes, empty lines, and replies to commands with this
-    id.
-    """
+    """Regular expression of lines to skip: alerts, information, echoes, empty lines, and replies to this id."""
     return rf"|[!#/].*|@\d\d \d {identity:02d} .*"
 
 
 def meaning_of(flags: tuple[str, ...]) -> Meaning | None:
-    """The gravest of the flags that is a fault or ends moves; None without one."""
+    """The most serious of these flags that is a fault or ends moves; None if there is none."""
     known = FAULTS | ENDINGS
     serious = [flag for flag in flags if flag in known or flag.startswith("F")]
     if not serious:
@@ -162,23 +169,23 @@ def meaning_of(flags: tuple[str, ...]) -> Meaning | None:
     return Meaning(text, meanings[0].advice)
 
 
-PROBE_ID, STOP_ID, IDS = 98, 99, 98  # Ordinary commands count their ids from 0 to 97
-REPEATS = 3  # How often a command is sent again if the device answers AGAIN
-PAUSE = 0.05  # s before that
+PROBE_ID, STOP_ID, IDS = 98, 99, 98  # ordinary commands use the ids 0 to 97
+REPEATS = 3  # how often a command is repeated if the device answers AGAIN
+PAUSE = 0.05  # s before a repetition
 TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
-"""Most digits of a position; a longer number is impossible for an axis and for a float."""
+"""Largest number of digits of a position; a longer number is impossible for an axis and for a float."""
 CHECKSUM = "comm.checksum"
 BINARY = (
     ". A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: "
     "switch it with Zaber Launcher, or with the Binary command 124 (Convert To ASCII)"
 )
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
-"""Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
+"""Settings of the axis that survive switching off. The driver restores them, and the device's checksums, at the end."""
 
 
 @dataclass(frozen=True)
 class ZaberAxisStatus:
-    """Position in microsteps, motion, and every warning flag, the gravest first."""
+    """Position in microsteps, motion, and all warning flags, the most serious first."""
 
     counts: int
     moving: bool
@@ -191,7 +198,7 @@ class ZaberAxisStatus:
 
     @property
     def grave(self) -> frozenset[str]:
-        """Flags of faults, and of a stage that slipped or was moved, whatever the last move did."""
+        """Flags of faults, and of a stage that slipped or was displaced, independent of the last move."""
         return frozenset(flag for flag in self.flags if flag.startswith("F")) | (SLIPPED & set(self.flags))
 
 
@@ -208,10 +215,10 @@ class ZaberAxis:
         self._ids = itertools.cycle(range(IDS))
         self._must_have_checksum = self._commanded = False
         self.last_move = ""
-        """The command of the last move or search, for errors."""
+        """The command of the last move or search, for error messages."""
         self.found = FoundSettings()
         self.flags_at_opening: tuple[str, ...] = ()
-        """Without that of a stop, which says nothing of where the stage is."""
+        """Flags found at opening, without the flag of a stop, because the position is still right after a stop."""
         self._line = line_to(
             settings,
             url,
@@ -225,7 +232,7 @@ class ZaberAxis:
         )
 
     def open(self) -> dict[str, str]:
-        """Switch checksums on, identify the device, remember the settings that will change."""
+        """Switch checksums on, identify the device, and store the settings that will change."""
         self._line.send("")  # an empty line ends an incomplete command in the device
         if (checksums := self.get_if_known(CHECKSUM, 0)) is not None:
             self.ask(f"set {CHECKSUM} 1")
@@ -244,7 +251,7 @@ class ZaberAxis:
         return ZaberAxisStatus(int(reply.data), reply.busy, tuple(flags), reply.raw)
 
     def standing(self, purpose: str) -> ZaberAxisStatus:
-        """The status; refuses `purpose` while the axis moves."""
+        """The status. Raises DeviceRefused for `purpose` while the axis moves."""
         status = self.status()
         if status.moving:
             raise while_it_moves(self._name, purpose, status.counts, status.raw)
@@ -256,25 +263,25 @@ class ZaberAxis:
         self.ask_axis(words)
 
     def stop(self, words: str) -> str:
-        """Send `stop` or `estop` without waiting, and return it; its reply is skipped when it comes."""
+        """Send `stop` or `estop` without waiting, and return the command; its reply is skipped when it arrives."""
         self._line.send(packet := encode(self._device, self._axis, STOP_ID, words))
         return packet
 
     def ask(self, words: str, form: str = TEXT) -> str:
-        """Data of the reply of the device itself."""
+        """Data of the reply of the device (not of an axis)."""
         return self._ask(0, words, form).data
 
     def ask_axis(self, words: str, form: str = TEXT) -> str:
         return self._ask(self._axis, words, form).data
 
     def get_if_known(self, setting: str, axis: int) -> str | None:
-        """A setting of an axis, or of the device itself (0); None if it has no such setting."""
+        """A setting of an axis, or of the device (0); None if there is no such setting."""
         with contextlib.suppress(DeviceRefused):
             return self._ask(axis, f"get {setting}", NUMBER).data
         return None
 
     def close(self) -> None:
-        """Restore the settings, and free the port even if the line is dead."""
+        """Restore the settings, and free the port even if the connection is lost."""
         try:
             self.found.restore(self._restore)
         finally:
@@ -299,7 +306,7 @@ class ZaberAxis:
                 request=words,
                 reply=reply.raw,
                 advice="Check the configuration against the device, and that no other program controls it",
-                state="The current move continues" if reply.busy else "Nothing has moved by it",
+                state="The current move continues" if reply.busy else "Nothing has moved because of this request",
             )
         return reply
 

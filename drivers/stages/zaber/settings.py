@@ -1,10 +1,10 @@
 """Settings of a Zaber stage, their values in the controller, and a pulse train programmed as triggers.
 
-One trigger fires once, at the right place, and enables a second that counts distance. The starter fires one step before
-the first pulse, the repeater then each step. So the stage may stand anywhere before the train. The time that firmware
-needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. If the stage already stands within that step, the
-starter gives the first pulse itself. If an action cannot enable a trigger (`chained` false), the repeater alone gives
-the train; then the stage must stand one step before the first pulse.
+One trigger, the starter, fires once at a position, and enables a second one, the repeater, which counts distance. The
+starter fires one step before the first pulse, and the repeater then fires at each step. So the stage may be anywhere
+before the train. The time that the firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses by the same
+time. If the stage is already within this step, the starter gives the first pulse itself. If an action cannot enable a
+trigger (`chained` false), the repeater alone gives the train, and the stage must be one step before the first pulse.
 """
 
 from __future__ import annotations
@@ -17,24 +17,26 @@ from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.settings import StageFigures, Wiring
 from recon.base.setting import setting
 
-SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
-SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²
+SHORTEST = 1e-3  # smallest time in s between two fires of a trigger [from memory: interval of the firmware's checks]
+# native speed of one microstep/s; for an acceleration of one microstep/s² it is a ten-thousandth of this
+SPEED_UNIT = 1.6384
 
 
 @dataclass(frozen=True, kw_only=True)
 class ZaberSettings(Wiring, StageFigures):
-    """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output.
+    """Zaber stage with the ASCII protocol, firmware 7.06 or later, and triggers on a digital output.
 
-    counts_per_turn must be the device's own limit.cycle.dist. The pulse width is whole milliseconds; None is 1 ms, or
-    half an interval with `toggle`: fires toggle the output, every second one is a pulse, so that intervals must be
-    even. Defaults of the triggers are the firmware's behaviour from memory; so is the encoder's unit, microsteps.
+    counts_per_turn must be the device's own limit.cycle.dist. The pulse width is a whole number of milliseconds; None:
+    1 ms. With `toggle`, each fire toggles the output, so that every second fire begins a pulse of half an interval, and
+    intervals must be even. The defaults of the triggers are the firmware's behaviour from memory, and so is the unit of
+    the encoder (microsteps).
 
     Raises:
-        ValueError: a speed or an acceleration below one native unit, an address that no device has, pulses that no
-            output can give, or triggers that cannot work together.
+        ValueError: a speed or an acceleration is below one native unit, no device has the address, no output can give
+            the pulses, or the triggers cannot work together.
     """
 
-    stand_in: ClassVar[str] = "pi_gcs"  # its own controller is simulated in the tests
+    stand_in: ClassVar[str] = "pi_gcs"  # the controller is simulated only in the tests
     device: int = setting(1, ge=1, le=99)
     axis: int = setting(1, ge=1, le=9)
     serial: str | None = setting(
@@ -45,8 +47,8 @@ class ZaberSettings(Wiring, StageFigures):
     output: int = setting(1, "Digital output of the trigger pulses.", gt=0)
     toggle: bool = setting(
         False,
-        "true: each fire toggles the output (for firmware without `schedule`). Every second one is a "
-        "pulse, and intervals must be even.",
+        "true: each fire of a trigger toggles the output (for firmware without `schedule`). Every second fire begins "
+        "a pulse, and intervals must be even.",
     )
     speed_unit: float = setting(
         SPEED_UNIT,
@@ -56,23 +58,30 @@ class ZaberSettings(Wiring, StageFigures):
     measured: bool = setting(False, "true: pulses follow the encoder, not the commanded position.")
     chained: bool = setting(
         True,
-        "true: an action may enable another trigger. false: arming turns the stage to one step before the first pulse.",
+        "true: the action of a trigger may enable another trigger. false: arming turns the stage to one step before "
+        "the first pulse.",
     )
-    fires_when_enabled: bool = setting(False, "true: a distance trigger also fires where it is enabled.")
+    fires_when_enabled: bool = setting(
+        False, "true: a distance trigger also fires at the position where it is enabled."
+    )
     starter: int = setting(1, gt=0)
-    repeater: int = setting(2, "The numbers of the two triggers used.", gt=0)
-    shortest: float = setting(SHORTEST, "Shortest time between two fires at full speed.", unit="s", gt=0)
+    repeater: int = setting(2, "Number of one of the two triggers used.", gt=0)
+    shortest: float = setting(SHORTEST, "Shortest time between two fires of a trigger at full speed.", unit="s", gt=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fires_when_enabled and not self.chained:
-            raise ValueError("a trigger that fires when it is enabled needs another one that enables it: chained")
+            raise ValueError(
+                "a trigger that fires when it is enabled needs another trigger that enables it: set chained to true"
+            )
         if self.starter == self.repeater:
             raise ValueError(f"starter and repeater must be two different triggers, got {self.starter} for both")
         if self.toggle and self.pulse_width is not None:
             raise ValueError("a toggled output has no pulse width; choose a width or toggle, not both")
         if not self.toggle and abs(self.width * 1000 - self.milliseconds) > 1e-6:
-            raise ValueError(f"a pulse width of {self.width:g} s is not possible; it is whole milliseconds, 1 or more")
+            raise ValueError(
+                f"a pulse width of {self.width:g} s is not possible; expected a whole number of milliseconds, 1 or more"
+            )
         self.limits()
 
     @property
@@ -81,7 +90,7 @@ class ZaberSettings(Wiring, StageFigures):
 
     @property
     def width(self) -> float:
-        """Of a pulse that is not toggled, s."""
+        """Width in s of a pulse without `toggle`."""
         return 1e-3 if self.pulse_width is None else self.pulse_width
 
     @property
@@ -90,29 +99,29 @@ class ZaberSettings(Wiring, StageFigures):
 
     @property
     def fires(self) -> int:
-        """Of the triggers for one pulse."""
+        """Number of fires for one pulse."""
         return 2 if self.toggle else 1
 
     @property
     def quiet(self) -> tuple[str, ...]:
-        """Commands that disable both triggers, the starter first, because it enables the repeater, and put the output
-        at rest.
+        """Commands that disable both triggers (the starter first, because it enables the repeater) and reset the
+        output.
         """
         off = f"io set do {self.output} {int(not self.active_high)}"
         return f"trigger {self.starter} disable", f"trigger {self.repeater} disable", off
 
     @property
     def pulse(self) -> str:
-        """The action of one fire."""
+        """The action of a trigger for one fire."""
         on, off = int(self.active_high), int(not self.active_high)
         return f"io set do {self.output} " + ("t" if self.toggle else f"{on} schedule {self.milliseconds} {off}")
 
     @property
     def native_limits(self) -> tuple[int, int]:
-        """Native speed nearest to the full speed, and the steepest native acceleration up to the configured one.
+        """The native speed nearest to the full speed, and the highest native acceleration up to the configured one.
 
         Raises:
-            ValueError: less than one native unit.
+            ValueError: a value is less than one native unit.
         """
         per_radian = self.per_radian * self.speed_unit
         speed = round(self.max_speed * per_radian)
@@ -120,14 +129,16 @@ class ZaberSettings(Wiring, StageFigures):
         if speed < 1 or steepest < 1:
             raise ValueError(
                 f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² "
-                f"are native values of {speed} and {steepest}; the controller's smallest are 1, "
-                f"{math.degrees(1e4 / per_radian):g} deg/s² for the latter"
+                f"are the native values {speed} and {steepest}, but both must be 1 or more. The smallest acceleration "
+                f"is {math.degrees(1e4 / per_radian):g} deg/s²"
             )
         return speed, steepest
 
     def limits(self) -> StageLimits:
-        """See `StageSettings`, with firmware that has triggers. The acceleration is the controller's steepest one up to
-        the configured one. At full speed an output rests as long as it is set.
+        """See `StageSettings`; for firmware with triggers.
+
+        The acceleration is the controller's highest one up to the configured one. At full speed, the pause between
+        pulses is as long as a pulse.
         """
         acceleration = self.native_limits[1] * 1e4 / self.speed_unit / self.per_radian
         spacing = 2 * self.shortest if self.toggle else max(self.shortest, 2 * self.width)
@@ -135,12 +146,13 @@ class ZaberSettings(Wiring, StageFigures):
 
 
 def set_up(settings: ZaberSettings, train: TriggerTrain, counts: int) -> tuple[tuple[str, ...], int]:
-    """The triggers for a train that can be emitted, with the stage standing at `counts`, before the first pulse.
+    """The triggers for a train that can be emitted; the stage is at rest at `counts`, before the first pulse.
 
-    Returns the commands, of which the last one arms the train, and the count at which the stage must stand for it.
+    Returns the commands, of which the last one arms the train, and the count at which the stage must be when it is
+    armed.
     """
     sign, fires = (1 if train.interval > 0 else -1), settings.fires * train.n
-    step = max(abs(train.interval) // settings.fires, 1)  # the interval of a single pulse may be any
+    step = max(abs(train.interval) // settings.fires, 1)  # the interval of a single pulse may have any value
     starter, repeater = f"trigger {settings.starter}", f"trigger {settings.repeater}"
     distance, position = ("encoder dist", "encoder.pos") if settings.measured else ("dist", "pos")
     before = train.start - sign * step

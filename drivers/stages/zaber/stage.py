@@ -1,8 +1,8 @@
 """Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output at equal
 distances.
 
-Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
-those of `ZaberSettings`.
+Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings, see
+`ZaberSettings`.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from drivers.stages.zaber.axis import INTERRUPTED, LOST, SLIPPED, WHOLE, ZaberAx
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (
-    "Firmware without `schedule` needs toggle. Firmware whose actions cannot enable triggers needs "
-    "chained: false, and room for one step before the first pulse"
+    "For firmware without `schedule`, set toggle: true. For firmware whose actions cannot enable triggers, set "
+    "chained: false and leave room for one step before the first pulse"
 )
 
 
-STANDING_IN_PLACE = 10.0  # s beyond twice the time of a short move after which it has failed
+STANDING_IN_PLACE = 10.0  # s; a short move has failed after twice its expected time plus this
 
 
 class ZaberStage(LineStage):
-    """Closing it lets a move under way end by itself, disarms a train, and restores speed, acceleration and checksums.
+    """Zaber rotary stage; see the module.
 
-    A move against a train under way ends the train: the controller counts distance both ways. If triggers are not
-    `chained`, `arm` itself turns the stage to one step before the first pulse and waits. It then speeds up over the
-    first pulses.
+    Closing does not stop a move. It disarms a train, and restores speed, acceleration and checksums. A move against the
+    direction of a train that has begun disarms the train, because the controller counts distance in both directions. If
+    triggers are not `chained`, `arm` turns the stage to one step before the first pulse and waits. Then the stage still
+    accelerates during the first pulses.
 
     Args:
-        url: what pyserial opens; a controller's LAN port is "socket://host:55550".
+        url: pyserial URL; a controller's LAN port is "socket://host:55550".
     """
 
     Settings = ZaberSettings
@@ -44,9 +45,9 @@ class ZaberStage(LineStage):
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
         super().__init__(url, settings, clock, name)
         self._settings, (self._fastest, steepest) = settings, settings.native_limits
-        self._told = frozenset[str]()  # flags that an error, or the description, has told
+        self._told = frozenset[str]()  # flags that an error or the description has already reported
         self._train: TriggerTrain | None = None
-        self._touched = True  # the triggers, since they were disabled
+        self._touched = True  # the armed triggers; None after they were disabled
         self._axis = ZaberAxis(url, settings, clock, name)
         self._found = self._axis.found
         with self._closed_on_failure():
@@ -71,7 +72,7 @@ class ZaberStage(LineStage):
         self._start_move(angle, speed, self._stops.count)
 
     def _start_move(self, angle: float, speed: float, stops: int) -> None:
-        """`stops`: number of stops before; a later one wins."""
+        """`stops`: number of stops before the move; a later stop cancels the move."""
         target = self._travel.target(angle)
         per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._settings.speed_unit
         native = self._travel.native(speed, per_radian, self._fastest, "native units")
@@ -80,7 +81,7 @@ class ZaberStage(LineStage):
             if not status.referenced:
                 raise DeviceRefused(
                     self.name,
-                    "a move is not possible: its position is not referenced",
+                    "a move is not possible, because the position has no reference",
                     reply=status.raw,
                     advice="Search the reference (home) first",
                     state="Nothing has moved",
@@ -93,7 +94,7 @@ class ZaberStage(LineStage):
         self._target, self._searching = target, False
 
     def start_home(self) -> None:
-        """Begin the search, at the controller's own speed and acceleration for it."""
+        """Begin the search for the reference, at the controller's own speed and acceleration for searches."""
         with self._stops.none_while("the search for the reference"):
             status = self._axis.standing("a search for the reference")
             self.disarm()
@@ -144,7 +145,7 @@ class ZaberStage(LineStage):
         self._set_up(train, counts, stops)
 
     def disarm(self) -> None:
-        """Legal in every state. The output is put at rest."""
+        """Disarm the trigger output; allowed in every state. The output is reset."""
         if self._touched and self.limits.trigger_output:
             for command in self._settings.quiet:
                 self._axis.ask(command)
@@ -184,7 +185,7 @@ class ZaberStage(LineStage):
         self._axis.close()
 
     def _refuse_untold(self, status: ZaberAxisStatus) -> None:
-        """DeviceError, once, for what happened to the standing stage since its last move."""
+        """Raise DeviceError, once, if something disturbed the stage since its last move."""
         if not (status.grave & (SLIPPED | LOST)) - self._told:
             return
         self._told = frozenset(status.flags)
@@ -196,7 +197,7 @@ class ZaberStage(LineStage):
             reply=status.raw,
             expected="a stage at rest",
             advice=f"{fault.advice}. Frames since then may have been taken at another angle",
-            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(status.counts)}",
+            state=f"Nothing has moved because of this request; the stage is at {self._travel.degrees(status.counts)}",
         )
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
@@ -208,10 +209,10 @@ class ZaberStage(LineStage):
         return self._axis.stop("estop" if hard else "stop")
 
     def _set_up(self, train: TriggerTrain, counts: int, stops: int) -> None:
-        """Set the triggers up with the stage at `counts`, and enable the first one.
+        """Set up the triggers with the stage at `counts`, and enable the first one.
 
         Args:
-            stops: number of stops before; a later one wins.
+            stops: number of stops before; a later stop cancels this.
         """
         (*commands, enable), stand = set_up(self._settings, train, counts)
         self._train, self._touched = None, True
@@ -233,14 +234,17 @@ class ZaberStage(LineStage):
         self._train = train
 
     def _before_move(self, counts: int, target: int) -> None:
-        """Keep a train correct before a move from `counts` against it, because distance counts both ways.
+        """Keep a train correct before a move from `counts` against its direction, because distance counts in both
+        directions.
 
-        A train under way ends. A train before its first pulse is set up again, or ends if the stage had to move for it.
+        A train that has begun is disarmed. A train before its first pulse is set up again, or disarmed if the stage
+        would have to move for this.
         """
         train, settings = self._train, self._settings
         if train is None or train.interval * (target - counts) >= 0:
             return
-        needed = max(settings.starter, settings.repeater)  # `d` (disabled), `e` or the fires left, of each trigger
+        # for each trigger `d` (disabled), `e` or the number of remaining fires
+        needed = max(settings.starter, settings.repeater)
         states = self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").split()
         if settings.chained and states[settings.starter - 1] != "d":
             return
@@ -254,7 +258,9 @@ class ZaberStage(LineStage):
         if own is None or float(own) != self.limits.counts_per_turn:
             raise DeviceRefused(
                 self.name,
-                "it has no limit.cycle.dist, so it does not rotate" if own is None else f"a turn has {own} microsteps",
+                "it has no limit.cycle.dist, so it is not a rotary stage"
+                if own is None
+                else f"a turn has {own} microsteps",
                 expected=f"{self.limits.counts_per_turn} a turn, as configured",
                 advice="Correct counts_per_turn, or check device and axis",
                 state="Nothing has moved",

@@ -1,4 +1,4 @@
-"""StageConformance: conformance tests for every stage, real or simulated; the tests of a stage subclass them."""
+"""StageConformance: conformance tests for every stage, real or simulated; the tests of a stage derive from them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ class _Suite:
 
     @pytest.fixture
     def kind(self) -> StageKind:
-        pytest.fail("A subclass gives the fixture `kind`: a StageKind, what the suite has to know of the stage.")
+        pytest.fail(
+            "Define the fixture `kind` in the subclass: a StageKind with the facts about the stage that the tests need."
+        )
 
     @pytest.fixture
     def build(self, kind: StageKind) -> Build:
         pytest.fail(
-            "A subclass gives the fixture `build`: a function of settings of the driver "
-            "that opens the stage on a fresh wire."
+            "Define the fixture `build` in the subclass: a function that opens the stage with settings of the driver "
+            "on a new wire."
         )
 
     @pytest.fixture
@@ -35,8 +37,8 @@ class _Suite:
 
 
 class StageConformance(_Suite, Moves, Trains):
-    """A subclass gives the fixtures `kind` and `build`; the stage of `build` stands at angle 0."""
+    """The tests of a stage. A subclass defines the fixtures `kind` and `build`; the stage of `build` is at angle 0."""
 
 
 class StepStageConformance(_Suite, Moves, NoTrains):
-    """The same for a stage without a trigger output (`StageKind.triggers` is False)."""
+    """The tests of a stage without a trigger output (`StageKind.triggers` is False)."""

@@ -1,4 +1,4 @@
-"""A stage and its trigger cable on a bench, for tests without a protocol: moves, trains, pulses in degrees."""
+"""A stage and its trigger cable for tests that do not depend on a protocol: moves, trains and pulses in degrees."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LONG = 60.0
 
 
 class EmittedPulse(Protocol):
-    """A pulse on the cable: when it rose, s, and where the stage was in fact, rad."""
+    """A pulse on the cable: the time of its rising edge in s, and the true position of the stage in rad."""
 
     @property
     def time(self) -> float: ...
@@ -28,7 +28,7 @@ class Cable(Protocol):
     """The trigger cable, with a measurement of the true angle: a simulated line, or a counter card."""
 
     def next_after(self, time: float) -> EmittedPulse | None:
-        """The first pulse strictly later than `time`, even where that is still to come; None if there is none."""
+        """The first pulse strictly later than `time`, also if it is still in the future; None if there is none."""
 
     def angle_at(self, time: float) -> float:
         """The true angle in rad."""
@@ -39,11 +39,11 @@ class StageKind:
     """Facts about a stage that the suite needs.
 
     Attributes:
-        width: a pulse width (s) that the output has, at most 1 ms; None without a choice.
-        no_width: a width that it lacks, or that excludes other settings.
+        width: a pulse width (s) of the output, at most 1 ms; None if the width is fixed.
+        no_width: a width that the output does not have, or that excludes other settings.
         inverts: its pulses may be active low.
-        homes: it has a reference, within its limits.
-        turning_back_ends: a train ends if the stage turns back inside it; otherwise its rest comes later.
+        homes: it has a reference within its limits.
+        turning_back_ends: a train ends if the stage turns back inside it; otherwise its remaining pulses come later.
         disarms_moving: a train can be ended while the stage moves.
         triggers: it has a trigger output; without one its suite is `StepStageConformance`.
     """
@@ -59,22 +59,22 @@ class StageKind:
 
 @dataclass
 class StageBench:
-    """A stage at angle 0 that can go from -5 to 100 degrees at 10 degrees/s or faster, and its trigger cable."""
+    """A stage at angle 0 that can move from -5 to 100 degrees at 10 degrees/s or faster, and its trigger cable."""
 
     stage: RotationStage
     clock: Clock
     line: Cable
 
     def pulses(self) -> list[EmittedPulse]:
-        """The number of pulses emitted by now."""
+        """The number of pulses emitted so far."""
         return emitted(self.line, self.clock)
 
     def pulse_counts(self) -> list[int]:
-        """The places of the pulses, in counts."""
+        """The positions of the pulses in counts."""
         return [self.stage.to_counts(pulse.angle) for pulse in self.pulses()]
 
     def go(self, degrees: float) -> float:
-        """Move and wait; returns its place in degrees."""
+        """Move and wait; returns the position in degrees."""
         self.stage.start_move(math.radians(degrees), SPEED)
         return math.degrees(self.stage.wait(LONG))
 
@@ -92,11 +92,11 @@ class StageBench:
 
 
 Build = Callable[..., StageBench]
-"""Opens the stage anew, with settings of its driver that differ from the usual ones."""
+"""Function that opens the stage again, with settings of its driver that differ from the usual ones."""
 
 
 def emitted(line: Cable, clock: Clock) -> list[EmittedPulse]:
-    """The pulses that have come out of a cable by now, in their order."""
+    """The pulses on a cable so far, in their order."""
     pulses: list[EmittedPulse] = []
     after = -math.inf
     while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():

@@ -212,7 +212,7 @@ class Moves:
 
 
 def _refused(bench: StageBench, degrees: float) -> None:
-    """A stage without a reference refuses a search where it stands, and stays there."""
+    """A stage without a reference rejects a search, and does not move."""
     bench.go(degrees)
     before = bench.stage.position()
     with pytest.raises(DeviceRefused, match="Nothing has moved"):

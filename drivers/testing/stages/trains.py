@@ -1,4 +1,4 @@
-"""Conformance tests of trigger trains: a train gives exactly its pulses at its angles, once, until it is disarmed,
+"""Conformance tests of trigger trains: a train gives each of its pulses once, at its angle, until it is disarmed,
 replaced or complete.
 """
 
@@ -16,7 +16,7 @@ from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED, Build, StageBench, StageKind
 
 Step = float | tuple[float, float, int] | None
-"""A move to an angle, a train to arm (first, step, n), or None: disarm; in degrees."""
+"""A step of a test: a move to an angle, a train to arm (first, step, n), or None: disarm; in degrees."""
 SCRIPTS: Mapping[str, tuple[Sequence[Step], Sequence[int]]] = {
     "a train ends with its last pulse": ([(1.0, 1.0, 3), 30.0], [3]),
     "it fires once": ([(1.0, 1.0, 3), 5.0, 0.0, 5.0], [3]),
@@ -33,7 +33,7 @@ SCRIPTS: Mapping[str, tuple[Sequence[Step], Sequence[int]]] = {
     "turned back within a step before it begins": ([(2.0, 1.0, 5), 1.5, -4.0, 20.0], [5]),
     "turned back just before it begins": ([(2.0, 1.0, 5), 1.9, -4.0, 20.0], [5]),
 }
-"""Name -> steps, and how many pulses each train gives."""
+"""For each name, the steps of a test and the number of pulses of each train."""
 
 
 class Trains:
@@ -136,7 +136,7 @@ class Trains:
     def test_at_a_speed_that_is_low_enough_pulses_come_at_each_of_the_smallest_intervals(
         self, build: Build, sign: int
     ) -> None:
-        """A count where pulses have a width, two where fires toggle the output."""
+        """The smallest interval is one count if pulses have a width, and two counts if fires toggle the output."""
         bench = build(max_speed=math.radians(0.2))
         interval = 1
         try:
@@ -181,7 +181,7 @@ class Trains:
     ) -> None:
         with pytest.raises((DeviceRefused, ValueError)):
             build(pulse_width=kind.no_width)
-        if kind.width is None:  # it has no choice, as the refusal shows
+        if kind.width is None:  # the width is fixed, as the error shows
             return
         bench = build(pulse_width=kind.width)
         described = bench.stage.describe()["pulse_width_s"]
@@ -210,7 +210,7 @@ class Trains:
 
 
 class NoTrains:
-    """The law of a stage without a trigger output."""
+    """The test for a stage without a trigger output."""
 
     def test_a_train_is_refused_and_the_stage_moves_all_the_same(self, bench: StageBench) -> None:
         with pytest.raises(DeviceRefused, match="Nothing has moved"):

@@ -55,7 +55,8 @@ class ArrayFrame:
         time: s since the Unix epoch, when the driver received the frame, after readout.
         received: s since the Unix epoch, on this computer's clock.
         attributes: NDAttributes by name.
-        is_current: the server had this frame already when we connected: an old frame, unless its number is new.
+        is_current: True if the server already had this frame when we connected; it is an old frame, unless its number
+            is new.
         codec: "" for raw pixels.
     """
 
@@ -130,14 +131,14 @@ def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     if mode != _MONO or len(sizes) != 2:
         what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (if the array is 3D, a plugin before makes "
-            "it so)"
+            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
+            "makes it 3D)"
         )
 
 
 def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
     if codec and not element:
-        raise FrameRefusedError(f"its codec {codec} does not say the type of its pixels")
+        raise FrameRefusedError(f"its codec {codec} does not state the type of the pixels")
     if dtype not in COUNTS:
         raise FrameRefusedError(
             f"its pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
@@ -149,8 +150,8 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     n_bytes = dtype.itemsize * math.prod(shape)
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
-            f"it has {pixels.nbytes} bytes, which does not fit its dimensions, {shape[0]} x {shape[1]} {dtype}, or is "
-            f"more than {MOST_BYTES >> 20} MB"
+            f"it has {pixels.nbytes} bytes, which does not match its dimensions, {shape[0]} x {shape[1]} {dtype}, or "
+            f"is more than {MOST_BYTES >> 20} MB"
         )
 
 
@@ -166,14 +167,14 @@ def _window(dimension: Any) -> Window:
 
 
 ELEMENTS = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8"}
-"""`codec.parameters` of NTNDArray, pvData's number for the type of the pixels -> type of numpy."""
+"""The numpy type for each `codec.parameters` of NTNDArray, which is pvData's number for the type of the pixels."""
 _BLOCK = 8192  # bytes of a block of bitshuffle
 MOST_BYTES = 2**29  # largest frame: more than the largest sensors have
-_MOST_RATIO = 256  # LZ4 expands one byte to 255 at most
+_MOST_RATIO = 256  # LZ4 expands one byte to at most 255
 
 
 def _bslz4(payload: bytes, n_bytes: int, item: int) -> bytes:
-    block = max(_BLOCK // item // 8 * 8, 128) * item  # bitshuffle's default: whole eights of elements
+    block = max(_BLOCK // item // 8 * 8, 128) * item  # default of bitshuffle: a multiple of eight elements
     return struct.pack(">QI", n_bytes, block) + payload
 
 
@@ -194,7 +195,7 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
         codec: one of NAMES.
 
     Raises:
-        ValueError: they cannot be decoded. A wrong size is found before memory is allocated.
+        ValueError: the pixels cannot be decoded. A wrong size is found before memory is allocated.
     """
     make_filter, with_header = _CODECS[codec]
     n_bytes = dtype.itemsize * shape[0] * shape[1]

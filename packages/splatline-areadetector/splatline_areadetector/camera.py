@@ -1,6 +1,7 @@
-"""AreaDetectorCamera: a camera behind an EPICS areaDetector. Its records set it, and frames come over PVAccess.
+"""AreaDetectorCamera: a camera of an EPICS areaDetector. Records control the camera, and frames come over PVAccess.
 
-The time of a frame is when the driver received it, minus exposure and readout: it misses the pulse by milliseconds.
+The time of a frame is the time at which the driver received it, minus exposure and readout. It differs from that of the
+pulse by milliseconds.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ class AreaDetectorSettings:
 
     prefix: str = setting(..., "Prefix of the IOC's records, with ca:// or pva://, such as ca://2bmSP2:.")
     driver: Literal["spinnaker", "simdetector", "pco", "andor3", "hamamatsu", "eiger"] = setting(
-        ..., "Driver of areaDetector: it determines the labels of the trigger records."
+        ..., "Driver of areaDetector, which determines the labels of the trigger records."
     )
     sensor: tuple[int, int] = setting(..., "Rows and columns of the sensor.")
     readout: float = setting(..., "Read-out time of a full frame.", unit="s", gt=0, le=100)
-    electrons_per_count: float = setting(..., "Electrons for each count, from the data sheet.", gt=0, le=1e6)
+    electrons_per_count: float = setting(..., "Electrons per count, from the data sheet.", gt=0, le=1e6)
     image: str | None = setting(None, "Where the frames come from, pva://NAME; null: PREFIXPva1:Image.")
     line: str = setting("Line0", "The camera's input for trigger pulses (spinnaker).")
     min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
@@ -57,9 +58,9 @@ class AreaDetectorSettings:
 class AreaDetectorCamera:
     """Implements drivers.base.protocols.Camera. See `AreaDetectorSettings`.
 
-    Framestamps are the frame numbers of the driver, from 0 at arm: a lost frame leaves a gap. If the camera counts them
-    (spinnaker, hamamatsu), a loss of the very first frame shows at the end, because a frame is missing there. One
-    thread takes frames; another may call `disarm` or `close`, which end the wait for a frame.
+    Framestamps are the frame numbers of the driver, from 0 at arm, so that a lost frame leaves a gap. If the camera
+    counts them (spinnaker, hamamatsu), a loss of the very first frame shows at the end, because a frame is missing
+    there. One thread takes frames; another may call `disarm` or `close`, which end the wait for a frame.
 
     Raises:
         DeviceTimeout, DeviceError: the IOC does not answer, or its image cannot be stored.
@@ -102,7 +103,7 @@ class AreaDetectorCamera:
             raise ValueError(f"readout {wanted.readout!r} is unknown; legal: standard")
         row0, col0, height, width = wanted.roi or (0, 0, rows, cols)
         if row0 + height > rows or col0 + width > cols:
-            raise ValueError(f"roi {list(wanted.roi or ())} is larger than the sensor of {rows} x {cols} pixels")
+            raise ValueError(f"roi {list(wanted.roi or ())} extends beyond the sensor of {rows} x {cols} pixels")
         if height % wanted.binning or width % wanted.binning:
             raise ValueError(f"{height} x {width} pixels cannot be divided by binning {wanted.binning}")
         shape = height // wanted.binning, width // wanted.binning
@@ -126,7 +127,7 @@ class AreaDetectorCamera:
         try:
             self.timing_of(self._own, settings)
         except ValueError as error:
-            raise DeviceRefused(self.name, str(error), state="Its settings are as they were") from error
+            raise DeviceRefused(self.name, str(error), state="Its settings were not changed") from error
         try:
             self._settings = self._applied(settings)
         except DeviceError:
@@ -179,7 +180,7 @@ class AreaDetectorCamera:
         if self._labels.fire:
             self._records.write(f"cam1:{self._labels.fire}", 1)
         else:
-            self._records.await_value("cam1:Acquire", 0)  # the acquisition of the frame before
+            self._records.await_value("cam1:Acquire", 0)  # the acquisition of the previous frame
             self._records.write("cam1:Acquire", 1)
 
     def next_frame(self, timeout: float) -> CameraFrame:
@@ -189,7 +190,7 @@ class AreaDetectorCamera:
             DeviceTimeout: no frame came within `timeout` s.
             DeviceRefused: not armed, or disarmed while waiting.
             DeviceError: the ring buffer overflowed (later frames can still be taken), frames have another size or type
-                than was set, or the IOC has gone.
+                than was set, or the connection to the IOC was lost.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._ring or self._lost or self._problem or not self._armed, timeout)
@@ -199,7 +200,8 @@ class AreaDetectorCamera:
             if lost:
                 raise DeviceError(
                     self.name, f"the ring of {self._ring_size} frames was overrun and {lost} frames are lost",
-                    advice="Take frames faster, trigger slower, or raise ring_mb", state="Later frames can be taken",
+                    advice="Take frames faster, trigger more slowly, or raise ring_mb",
+                    state="Later frames can be taken",
                 )  # fmt: skip
             if self._ring:
                 return self._ring.popleft()
@@ -262,7 +264,7 @@ class AreaDetectorCamera:
         if (rows, cols) != tuple(self._own.sensor):
             raise DeviceRefused(
                 self.name,
-                f"its sensor has {rows} x {cols} pixels, but devices.camera.sensor is {list(self._own.sensor)}",
+                f"its sensor has {rows} x {cols} pixels, but devices.camera.sensor states {list(self._own.sensor)}",
                 advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
             )  # fmt: skip
 
@@ -273,7 +275,7 @@ class AreaDetectorCamera:
         row0, col0, height, width = wanted.roi or (0, 0, *self._own.sensor)
         n = wanted.binning
         across = n if labels.binned_region else 1
-        for record in ("MinX", "MinY"):  # first to the corner, or a larger region would not fit
+        for record in ("MinX", "MinY"):  # first to the corner, because otherwise a larger region would not fit
             records.write(f"cam1:{record}", 0)
         binnings = {"A3Binning": labels.binning.format(n)} if labels.binning else {"BinX": n, "BinY": n}
         region = {"SizeX": width // across, "SizeY": height // across, "MinX": col0 // across, "MinY": row0 // across}
@@ -317,12 +319,12 @@ class AreaDetectorCamera:
                 self._fail(f"its frames cannot be stored: {why}")
             case Died(code):
                 self._fail(
-                    f"the process that receives its frames has ended (exit code {code}); another one is being started",
+                    f"the process that receives its frames has ended (exit code {code}); a new one is being started",
                     state="Frames taken before are good",
                 )
             case Disconnected():
                 advice = "Check whether it runs; the camera continues when the IOC is back"
-                self._fail("its IOC has gone", advice, "Frames taken before are good")
+                self._fail("the connection to its IOC was lost", advice, "Frames taken before are good")
             case ArrayFrame(is_current=False):
                 self._take_frame(item)
 

@@ -33,9 +33,10 @@ class DriverLabels:
         triggers: records to write for each trigger source; {line}: as configured.
         fire: the record that triggers a frame by software; "": each frame is an acquisition of one frame.
         modes: ImageMode for each trigger source; None: the driver has no such record.
-        counted: ArrayCounter numbers frames from 1, after it was set to 0; else the camera numbers them from its first.
-        train: the record for the number of external triggers, each of one image; "": not needed.
-        binning: label of A3Binning, in place of BinX and BinY.
+        counted: True: ArrayCounter numbers frames from 1 after it was set to 0. False: the camera numbers them from its
+            first frame.
+        train: the record for the number of external triggers, with one image for each trigger; "": not needed.
+        binning: label of A3Binning, which replaces BinX and BinY.
         binned_region: SizeX and SizeY are in binned pixels.
     """
 

@@ -38,14 +38,14 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
               help="Print a configuration to edit, then exit.")  # fmt: skip
 @set_option
 @click.option("--check", "only_check", is_flag=True,
-              help="Record nothing; show what the IOC says, and whether 2 s of frames arrive complete.")  # fmt: skip
+              help="Record nothing; show the settings of the IOC, and whether 2 s of frames are complete.")  # fmt: skip
 @click.option(
     "--darks", metavar="FILE", help="Darks for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
 )
 @click.option(
     "--flats", metavar="FILE", help="Flats for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
 )
-@click.option("--page", is_flag=True, help="Show the runs in the browser, all at one address.")
+@click.option("--page", is_flag=True, help="Show the runs in the browser; all runs have the same address.")
 @click.option("--no-live", is_flag=True, help="Do not reconstruct during the scan.")
 @click.option(
     "--repeat",
@@ -158,7 +158,7 @@ def _ride(
 def _raise_worst(
     ended: BeamlineError | str, n_whole: int, lacking: Sequence[LedgerError], say: Callable[[str], None]
 ) -> None:
-    """Print how many scans were recorded one after the other, and raise the worst error.
+    """Print how many scans were recorded, and raise the worst error.
 
     Args:
         ended: why the last scan ended; "": no scan was running.

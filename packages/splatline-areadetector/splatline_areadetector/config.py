@@ -53,7 +53,7 @@ class PlanAngles(_from("plan")):  # type: ignore[misc]
 
 
 class AttributeAngles(_from("attribute")):  # type: ignore[misc]
-    """A step scan: each frame has an attribute with its angle, the position of the standing stage."""
+    """A step scan: each frame has an attribute with its angle, which is the position of the stage at rest."""
 
     views: Views
     name: str = setting("SampleRotary", "Name of the NDAttribute, in degrees.", min_length=1)
@@ -81,8 +81,8 @@ class RideSection(Section):
     angles: Angles
     kinds: str | None = setting(
         None,
-        f"NDAttribute that says whether a frame is a dark, a flat or a projection ({KINDS}); null: tomoscan's status "
-        "says it, without tomoscan the order of darks, projections and flats.",
+        f"NDAttribute that says whether a frame is a dark, a flat or a projection ({KINDS}); null: the status of "
+        "tomoscan says it, or, without tomoscan, the order of darks, projections and flats.",
         min_length=1,
     )
     darks: Fields = setting(
@@ -94,14 +94,16 @@ class RideSection(Section):
         None, "Prefix of the camera's variables, such as ca://2bmSP2:cam1:; null: not used."
     )
     source: str | None = setting(
-        None, "Port of areaDetector whose frames are stored as they are, such as ROI1; null: the camera's own frames.",
+        None, "Port of areaDetector whose frames are stored unchanged, such as ROI1; null: the camera's own frames.",
         min_length=1,
     )  # fmt: skip
     first_id: int | None = setting(
         None, "uniqueId of the first projection; null: that of the first projection that arrives.", ge=0
     )
     exposure_s: Seconds | None = setting(
-        None, "null: the attribute AcquireTime of each frame; without it the value of tomoscan or of the camera."
+        None,
+        "Exposure time; null: the attribute AcquireTime of each frame, or, if there is none, the value of "
+        "tomoscan or of the camera.",
     )
     period_s: Seconds | None = setting(
         None, "Approximate time between frames, for the size of the queue; null: 100 frames a second."
@@ -110,11 +112,13 @@ class RideSection(Section):
         None, "Bits of a pixel, for the saturation value; null: those of the pixel type.", ge=1, le=16
     )
     queue_s: float = setting(1.0, "Frames that the server buffers for this program, in seconds.", gt=0, le=60)
-    queue_mb: float = setting(512.0, "Most memory of the IOC for this buffer, in MB.", gt=0, le=65_536)
+    queue_mb: float = setting(512.0, "Largest memory of the IOC for this buffer, in MB.", gt=0, le=65_536)
     ring_mb: float = setting(
-        2048.0, "Most memory of this program for frames that wait for the disk, in MB.", gt=0, le=1e6
+        2048.0, "Largest memory of this program for frames that wait for the disk, in MB.", gt=0, le=1e6
     )
-    silence_s: Seconds = setting(60.0, "After this time without a frame a message says why, as far as the IOC tells.")
+    silence_s: Seconds = setting(
+        60.0, "After this time without a frame a message gives the reason, as far as the IOC shows it."
+    )
 
     @property
     def queues(self) -> Queues:
@@ -179,7 +183,7 @@ class RideConfig(Section):
 
 EXAMPLE = """\
 # Recording the scan of another program (docs/areadetector.md). beamline ride writes no process variable.
-# beamline ride FILE --check   shows what the IOC says, and whether two seconds of frames arrive complete.
+# beamline ride FILE --check   shows the settings of the IOC, and whether the frames of 2 s are complete.
 # Units are in the names: s, deg, mm, um, keV. null means "not known" or "the default".
 
 sample: {name: tooth, description: "", diameter_mm: null}

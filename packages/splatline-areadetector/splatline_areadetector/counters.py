@@ -1,5 +1,6 @@
-"""Counters of the IOC's plugin and camera. They tell who lost a frame, why no frame comes, and why frames cannot be
-stored. Each message says what to change."""
+"""Counters of the IOC's plugin and camera, which show where frames were lost and why no frame comes.
+
+They also show why frames cannot be stored. Each message says what to change."""
 
 from __future__ import annotations
 
@@ -22,10 +23,11 @@ CAMERA = ("PortName_RBV", "Acquire_RBV", "DetectorState_RBV", "ArrayCallbacks_RB
 _LONG = 0.3  # s; if this process gets no processor time for longer, the server's queue may fill up
 OURS = "this program"
 _SETTLES = 0.2  # s until the camera's counter has arrived here
-_REST, _LEAST, _SLOW = 5, 0.5, 10.0  # a pause of the counter: periods, and s at least; s, period of a slow camera
+# a pause of the counter: number of periods, and least time in s; period of a slow camera in s
+_REST, _LEAST, _SLOW = 5, 0.5, 10.0
 _SKIPPED = "Nothing was recorded."
 _PLUGINS = ("OVER", "ROI", "PROC", "TRANS", "CC", "STATS", "FFT", "CB", "CODEC", "SCATTER", "GATHER", "ATTR")
-"""How the port names of plugins usually begin: their output may differ from the camera's frame."""
+"""Usual beginnings of the port names of plugins; the output of a plugin may differ from the camera's frame."""
 _SAFE = ("CB", "CODEC", "STATS", "ATTR")  # these plugins do not change pixels
 
 
@@ -78,7 +80,7 @@ class Counters:
         return rises[0] > 0 or rises[1] > n
 
     def blame(self, gap: Gap) -> str:
-        """Who lost the frames, as the end of a sentence."""
+        """What lost the frames, as the end of a sentence."""
         margin = (gap.after - gap.before) / (len(gap.ids) + 1) / 2
         begin, end = gap.before + margin, gap.after + margin
         dropped = self.plugin.histories["DroppedArrays_RBV"].rise(begin, end)
@@ -86,9 +88,12 @@ class Counters:
         if dropped:
             return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
         if counted is None:
-            return "before they arrived here (no counter of the IOC says where)"
+            return "before they arrived here (no counter of the IOC shows where)"
         if counted > len(gap.ids):
-            return "after the plugin had sent them: in the network, or in the server's queue for us (ride.queue_s)"
+            return (
+                "after the plugin had sent them: in the network, or in the server's queue for this program "
+                "(ride.queue_s)"
+            )
         return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
 
 
@@ -117,7 +122,7 @@ def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Coun
 
 
 class Silence:
-    """Says why no frame comes, each time that none has come for `seconds`.
+    """Reports why no frame comes, each time that no frame has come for `seconds`.
 
     Args:
         say: prints the sentence.
@@ -152,12 +157,12 @@ class Silence:
 
 
 def silence_told(counters: Counters) -> str:
-    """The likely reason for no frames, as far as the IOC tells, as the end of a sentence."""
+    """The likely reason why no frames come, as far as the IOC shows it; the end of a sentence."""
     plugin, camera = counters.plugin, counters.camera
     if plugin.text("EnableCallbacks_RBV") == "Disable":
         return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
     if camera is None:
-        return "the camera waits for triggers, or does not acquire (set ride.camera to find out)"
+        return "the camera waits for triggers, or does not acquire (set ride.camera, and the next message says which)"
     if camera.text("ArrayCallbacks_RBV") == "Disable":
         return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
     state = camera.text("DetectorState_RBV")

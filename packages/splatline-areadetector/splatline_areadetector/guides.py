@@ -31,7 +31,10 @@ from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Phase
 from splatline_areadetector.variables import History, Variables
 
 LOCATIONS = {"data_dark": FrameKind.DARK, "data_white": FrameKind.FLAT, "data": FrameKind.PROJECTION}
-"""Last part of a path of Data Exchange -> kind; tomoscan's attribute HDF5FrameLocation has such paths."""
+"""For the last part of a path of Data Exchange, the kind of frame.
+
+Tomoscan's attribute HDF5FrameLocation has such paths.
+"""
 _WORDS = {
     **LOCATIONS, "darkfield": FrameKind.DARK, "flatfield": FrameKind.FLAT, "projection": FrameKind.PROJECTION,
     "dark": FrameKind.DARK, "flat": FrameKind.FLAT, "white": FrameKind.FLAT,
@@ -40,7 +43,7 @@ EXPOSURE = "AcquireTime"
 """Attribute with the exposure time of a frame, s."""
 _VIEWS = FrameKind.PROJECTION
 _BEFORE, _AFTER = (Place.START, Place.BOTH), (Place.END, Place.BOTH)
-_POLL = 0.1  # s between two looks at a file that grows
+_POLL = 0.1  # s between two reads of a growing file
 MOST, MOST_DEGREES = 1_000_000, 1e6  # largest number of frames of a kind, and of degrees, as in a configuration
 _FEW, _NEAR = 3, 0.02  # fewest rows for a step; relative tolerance for steps that add up to 180° or 360° in radians
 SKEW = 0.5  # s: if the clocks of two IOCs differ by less, they count as equal
@@ -62,11 +65,11 @@ class Guide(Protocol):
         """Angle of a projection in radians; NaN: not known."""
 
     def ended(self, seconds: float) -> bool:
-        """Whether the scan had ended by this time of its IOC."""
+        """Whether the scan had ended at this time of its IOC."""
 
     @property
     def status(self) -> str:
-        """What the scan is doing, in words; "" if that is not known."""
+        """Text on what the scan is doing; "" if this is not known."""
 
     def close(self) -> None: ...
 
@@ -193,7 +196,7 @@ class PandaGuide(_ByNumbers):
     def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 2.0) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._settings, self._wait, self._path = angles, wait, Path(angles.file)
-        self._rows, self._waited_at = np.empty(0), -1  # number of rows after which no other row came in time
+        self._rows, self._waited_at = np.empty(0), -1  # number of rows when a further row did not come in time
         if (problem := self._look()) and self._path.exists():
             raise ConfigError(f"{problem}. Nothing was started.")
 
@@ -211,7 +214,8 @@ class PandaGuide(_ByNumbers):
         self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait
         while (problem := self._look()) and time.monotonic() < deadline:
             time.sleep(_POLL)
-        begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None  # else it may come after darks and flats
+        # otherwise the file may come after darks and flats
+        begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None
         if problem and (begins or self._path.exists()):
             raise ConfigError(f"{problem}. Nothing was recorded.")
         return super().plan()
@@ -341,7 +345,7 @@ class TomoscanGuide:
         numbers = numbers and all(0 <= n <= MOST for n in (darks, flats, views))
         if not numbers or views < 1 or (views > 1 and step == 0.0):
             raise ConfigError(
-                f"tomoscan's numbers give no angles: {self._prefix}NumAngles is {views:g}, RotationStep {step:g}, "
+                f"tomoscan's settings give no angles: {self._prefix}NumAngles is {views:g}, RotationStep {step:g}, "
                 f"RotationStart {start:g}, NumDarkFields {darks:g}, NumFlatFields {flats:g}. Set them in tomoscan "
                 "before the scan begins. Nothing was recorded."
             )

@@ -1,4 +1,4 @@
-"""`beamline ride --check`: what the IOC says, and whether two seconds of frames arrive complete."""
+"""`beamline ride --check`: shows the settings of the IOC, and whether the frames of two seconds arrive without gaps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def check(config: RideConfig) -> list[str]:
         rows = {
             "image": stream.name,
             "frames": _size(frames[-1] if frames else stream.first),
-            "port": counters.plugin.text("NDArrayPort_RBV") or "not known: no variables of the plugin answer",
+            "port": counters.plugin.text("NDArrayPort_RBV")
+            or "not known, because the variables of the plugin do not answer",
             "queue": f"{stream.queue} frames in the server",
             "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_told(counters)}",
             "refused": refused,

@@ -45,7 +45,7 @@ class RidePlan:
         angles: float64 [view] radians; NaN if only the frames tell them.
         exposures: s by kind; a kind that is not listed has that of projections.
         period: s between frames; None: not known.
-        told_by: where the plan comes from, for the record.
+        told_by: where the plan comes from, for the metadata.
     """
 
     blocks: tuple[PlannedBlock, ...]
@@ -65,7 +65,7 @@ class RidePlan:
 
 
 def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: int) -> Timeline:
-    """The plan as the timeline of a scan of ours. Nothing moves, so it breaks no limit."""
+    """The plan as the timeline of our own scans. Nothing moves, so no limit applies."""
     period = plan.period or _USUAL_PERIOD
     blocks = tuple(
         Block(
@@ -81,9 +81,9 @@ def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: 
     n_frames = sum(block.n for block in blocks)
     frame_bytes = 2 * math.prod(shape)
     total = n_frames * (frame_bytes + 4 * math.prod(preview_shape(shape, preview_bin)))
-    remarks = ["another program runs the scan: beamline ride pauses and repeats nothing, and moves no device"]
+    remarks = ["another program runs the scan; beamline ride does not pause or repeat anything, and moves no device"]
     if total > free:
-        remarks.append(f"make room on the disk while the scan runs: it needs {size(total)}, and {size(free)} are free")
+        remarks.append(f"free space on the disk during the scan: it needs {size(total)}, and {size(free)} are free")
     return Timeline(blocks, n_frames * period, frame_bytes, total, 0, 0.0, 0.0, 0.0, (), tuple(remarks), _plan_of(plan))
 
 

@@ -1,4 +1,4 @@
-"""`beamline publish`: the running scan as an areaDetector publishes its frames."""
+"""`beamline publish`: publishes the running scan in the form in which an areaDetector publishes its frames."""
 
 from __future__ import annotations
 

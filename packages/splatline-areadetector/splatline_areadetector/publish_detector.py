@@ -148,8 +148,8 @@ class PublishedDetector:
 
     Args:
         put: shows a value in the record of this name, without calling the handler of a setpoint.
-        files: folder below which clients may have files written; None: nowhere.
-        say: prints a sentence for whoever runs the server.
+        files: folder below which clients may request files; None: no files.
+        say: prints a sentence for the person who runs the server.
     """
 
     def __init__(self, put: Callable[[str, Value], None], files: Path | None, say: Callable[[str], None]) -> None:
@@ -160,7 +160,7 @@ class PublishedDetector:
         self._lock = threading.RLock()
         self._acquiring, self._counted, self._counter = False, 0, 0
         self._target: Path | None = None  # while it captures
-        self._file: FrameFile | None = None  # once a frame has come
+        self._file: FrameFile | None = None  # after the first frame
         self._shape, self._exposure, self._said = (0, 0), 0.0, set[str]()
 
     def asked(self, name: str, value: Value) -> None:
@@ -183,7 +183,7 @@ class PublishedDetector:
                 self._put(f"{name}_RBV", value)
 
     def began(self, shape: tuple[int, int], dtype: np.dtype) -> None:
-        """Another run has begun, with frames of this shape and type."""
+        """A new run has begun, with frames of this shape and type."""
         with self._lock:
             (rows, cols), self._shape = shape, shape
             kind = [name.lower() for name in _TYPES].index(dtype.name)
@@ -302,8 +302,8 @@ class PublishedDetector:
         template = str(self._set["HDF1:FileTemplate"])
         if self._files is None:
             raise DataError(
-                f"Start `beamline publish` with --files FOLDER, so that it may write {folder}{name}: it writes no "
-                "files now."
+                f"Start `beamline publish` with --files FOLDER, so that it may write {folder}{name}; without --files "
+                "it writes no files."
             )
         if not self._allowed(Path(folder)):
             raise DataError(f"{folder} is not below the folder of --files, {self._files}.")

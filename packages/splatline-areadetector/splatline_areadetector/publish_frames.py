@@ -1,4 +1,4 @@
-"""RunFrames: the frames of the newest run of a folder, each once and in order, as they come into its scan file.
+"""RunFrames: the frames of the newest run of a folder, each once and in order, as they are written to its scan file.
 
 They are read from the scan file, so the scan never waits for a client.
 """
@@ -23,7 +23,7 @@ from beamline.scan.runs import newest
 from beamline.storage.hdf5 import look_again, open_hdf5, readable
 from drivers.base.frame import FrameKind
 
-LOOK_EVERY = 0.5  # s between two looks for a new run
+LOOK_EVERY = 0.5  # s between two checks for a new run
 _SPREAD = 0.7  # frames that came together are sent this fraction of the mean time between frames apart
 _WINDOW = 2.0  # s over which the mean is computed
 _LONGEST, _AT_FIRST = 0.25, 0.02  # s: longest time between two frames sent, and this time while the mean is not known

@@ -49,8 +49,7 @@ class ImageServer:
             from p4p.server.thread import SharedPV
         except ImportError as error:
             raise ConfigError(
-                f'Install p4p: pip install "splatline[epics]". Publishing needs it, and it cannot be loaded ({error}). '
-                "Nothing was started."
+                f'Install p4p: pip install "splatline[epics]". It cannot be loaded ({error}). Nothing was started.'
             ) from error
         self.name, self._type = name, NTNDArray()
         self._image = SharedPV(initial=self._type.type())

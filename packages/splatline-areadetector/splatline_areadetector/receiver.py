@@ -1,4 +1,4 @@
-"""The receiver: a process of its own that takes each frame over PVAccess at once, even while `beamline ride` is busy.
+"""The receiver: a separate process that takes each frame over PVAccess at once, even while `beamline ride` is busy.
 
 HDF5 keeps Python's lock while it writes, so a thread of `beamline ride` would be too late for frames. Frames that
 `beamline ride` has not taken yet wait here. Each item is a line of JSON on stdout, followed by the pixels of a frame.
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
 
-_TICK, _STILL = 0.1, 0.4  # s between two looks at the clock; if it takes so many s more, the process has stalled
+# s between two reads of the clock; if they are farther apart by the second value, the process has stalled
+_TICK, _STILL = 0.1, 0.4
 
 
 class Subscribed:
@@ -34,7 +35,7 @@ class Subscribed:
 
     Args:
         takers: functions by the name of the variable. Each gets the updates (p4p's values, not unwrapped) and the
-            exceptions (the server has gone). A function that raises misses that update.
+            exceptions (the connection to the server was lost). A function that raises misses that update.
         request: pvRequest; None: that of p4p.
 
     Raises:
@@ -86,8 +87,10 @@ class Receiver:
         self._fresh, self._ready = True, False  # fresh: the next frame is the one that the server had before
 
     def take(self, value: Any) -> None:
-        """Take an update, or p4p's exception that the server has gone. It never raises, because the next update may be
-        good."""
+        """Take an update, or p4p's exception for a lost connection.
+
+        It never raises, because the next update may be good.
+        """
         received = self._now()
         if isinstance(value, Exception):
             if not self._fresh:  # every subscription begins disconnected

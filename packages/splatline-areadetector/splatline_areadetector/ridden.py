@@ -141,9 +141,14 @@ class RiddenFrames:
                     self._silence.look()
                 case Disconnected():
                     self._gone = True
-                    self._warn(f"{self._stream.name}: its server has gone. Waiting until it is back.")
+                    self._warn(
+                        f"The connection to the server of {self._stream.name} was lost. Waiting until the server is "
+                        "back."
+                    )
                 case Died(code):
-                    self._warn(f"The process that receives frames has ended (exit code {code}); starting another one.")
+                    self._warn(
+                        f"The process that receives frames has ended (exit code {code}); a new one is being started."
+                    )
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     yield from self._stored(self._sorter.decided(1))
@@ -383,7 +388,7 @@ def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:
     """What is known of a frame.
 
     Args:
-        gone: the server was gone since the frame before.
+        gone: the connection to the server was lost since the previous frame.
     """
     return Seen(
         frame.unique_id, guide.phase(frame), frame.time, frame.kind, frame.payload, gone or frame.is_current, frame

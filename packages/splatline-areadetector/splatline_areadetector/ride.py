@@ -47,9 +47,9 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
         live: loads its code while waiting for a scan, then makes the live volume; None: no live volume.
 
     Raises:
-        ConfigError: the frames cannot be stored, or no angles follow for them; nothing was recorded.
+        ConfigError: the frames cannot be stored, or their angles are not known; nothing was recorded.
         LedgerError: frames are missing in one of the files; the last such error, after all of them are closed.
-        BeamlineError, DeviceError: as `record_scan`.
+        BeamlineError, DeviceError: as for `record_scan`.
     """
     config, lost = ride.config.as_scan, None
     first_id = ride.config.ride.first_id
@@ -190,7 +190,7 @@ def load_given(darks: str | None, flats: str | None) -> Images:
             images = load_images(name, kind)
         except BeamlineError as error:
             raise ConfigError(f"--{kind.name.lower()}s: {error}") from error
-        counts = np.rint(images)  # averaged frames of other programs are real numbers
+        counts = np.rint(images)  # averaged frames of other programs are floating-point numbers
         if not (images.size and counts.min() >= 0 and counts.max() <= np.iinfo(np.uint16).max):
             raise ConfigError(
                 f"--{kind.name.lower()}s {name} must hold counts, numbers from 0 to 65535. Nothing was recorded."

@@ -31,8 +31,8 @@ from drivers.base.frame import FrameKind
 from splatline_areadetector.plan import PlannedBlock
 
 VIEW = FrameKind.PROJECTION
-WINDOW = 4  # at most so many frames may come before a frame with a lower number
-_NEAR = 100  # a counter may restart so many numbers before or after the end of its range
+WINDOW = 4  # largest number of frames that may come before a frame with a lower number
+_NEAR = 100  # largest distance from the end of its range at which a counter may restart
 _RANGES = ((0, 2**16 - 1), (0, 2**31 - 1), (-(2**31), 2**31 - 1))
 _RUNNING = 3  # longest time between two frames of the same acquisition, in periods
 
@@ -64,7 +64,8 @@ class Seen:
         time: s, on the clock of the IOC.
         size: a value that is the same for all frames of a file.
         pixels: compared with those of a frame with the same number.
-        reconnected: the server was gone since the frame before, or had this frame already when we connected.
+        reconnected: the connection was lost since the previous frame, or the server already had this frame when we
+            connected.
         frame: the frame itself, which the sorter passes on.
         count_restarts: how often the numbers have restarted; the sorter sets it.
     """
@@ -99,7 +100,7 @@ class Basis(Enum):
 
 
 class Witness(Protocol):
-    """The IOC's own counters."""
+    """The counters of the IOC, as evidence for lost frames."""
 
     def counted(self, first: float, second: float | None) -> int | None:
         """The camera's count in this acquisition, including its frame of this time; None: not known.
@@ -200,8 +201,8 @@ class _Taken:
 def not_set(number: int) -> str:
     """The message about numbers that stay the same."""
     return (
-        f"uniqueId stays at {number} while the pixels change. Have the server set uniqueId of its NTNDArray to the "
-        "count of frames, because beamline ride identifies frames by it"
+        "Let the server set uniqueId of its NTNDArray to the count of frames, because beamline ride identifies "
+        f"frames by it: uniqueId stays at {number} while the pixels change"
     )
 
 
@@ -360,7 +361,7 @@ class Sorter:
         step = 1 if lost else step
         if self._step:
             self._note = (
-                f"Do not use the frames up to {last.number}: they may have a wrong kind or angle. From frame "
+                f"Do not use the frames up to {last.number}, because they may have a wrong kind or angle. From frame "
                 f"{seen.number} on, numbers rise by {step} instead of {block.step}, so frames were lost before."
             )
             numbers = [block.first + block.step * trigger for trigger in block.triggers]
@@ -370,9 +371,9 @@ class Sorter:
             block.triggers = {i for number in numbers if (i := (number - block.first) // step) < block.n}
         elif step > 1:
             self._note = (
-                f"Frame numbers rise by {step}: a plugin averages {step} frames, or passes on one in {step}. Each "
-                "frame that arrives counts as a frame of the plan. If the plan counts the camera's frames, take the "
-                "image before that plugin (NDArrayPort)."
+                f"Frame numbers rise by {step}, because a plugin averages {step} frames or passes on one in {step}. "
+                "Each frame that arrives counts as a frame of the plan. If the plan counts the camera's frames, take "
+                "the image before that plugin (NDArrayPort)."
             )
         self._step = block.step = step
 
@@ -409,7 +410,8 @@ class Sorter:
         block.triggers.add(trigger)
         if seen.reconnected and not self._note and len(block.triggers) > 1:
             self._note = (
-                f"The server was gone before frame {seen.number}: the frame is assigned as if the count had continued."
+                f"The connection to the server was lost before frame {seen.number}. The frame is assigned as if the "
+                "count had continued."
             )
         return Place(self._now, block.kind, trigger, skipped, block.basis)
 
@@ -493,14 +495,14 @@ class Sorter:
         if is_late:
             off = "" if block.kind is VIEW else "the kinds of frames and "
             self._note = (
-                f"Frame {seen.number} is taken for the first {noun} of the scan, but others may have come before it. "
-                f"In that case {off}all angles are wrong by the number of lost steps. To avoid this, set "
+                f"Frame {seen.number} counts as the first {noun} of the scan, but others may have come before it. In "
+                f"that case {off}all angles are wrong by the number of lost steps. To avoid this, set "
                 f"{'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id."
             )
         return 0, Basis.UNKNOWN if is_late else Basis.WAITED
 
     def _go_on(self, seen: Seen, views: _Taken, other: Seen) -> None:
-        """The projections continue after frames of another kind, which take no trigger of the projections."""
+        """The projections continue after frames of another kind, which do not use triggers of the projections."""
         lost, known = 0, self._known
         counts = {each.count_restarts for each in (seen, known, other, views) if each is not None}
         if known is not None and len(counts) == 1:

@@ -1,9 +1,9 @@
-"""FrameStream: a subscription to an areaDetector's image over PVAccess. Frames go at once into our own memory.
+"""FrameStream: a subscription to an areaDetector's image over PVAccess. Frames are copied to our own memory at once.
 
 The server keeps a queue for each client. If the queue is full, the server overwrites its newest entry without an error.
-So we ask for a queue of about a second, and a process of its own (`receiver`) takes at once what the server delivers.
-With `pipeline=true` the server would wait for us, but today's servers of NDPluginPva then repeat frames. Lost frames
-show as a gap in the frame numbers.
+So we request a queue of about a second, and a separate process (`receiver`) takes frames as soon as the server delivers
+them. With `pipeline=true` the server would wait for us, but today's servers of NDPluginPva then repeat frames. Lost
+frames show as a gap in the frame numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one
 _AT_HAND = 4  # items held in this process; all others wait in the receiver
 _PIPE = 2**20  # bytes
 ANSWERS_WITHIN = 3.0  # s
-UNREACHABLE = "Check the name, whether its IOC runs, and which hosts are asked (EPICS_PVA_ADDR_LIST)"
+UNREACHABLE = "Check the name, whether its IOC runs, and which hosts are searched (EPICS_PVA_ADDR_LIST)"
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Overflow:
 
 @dataclass(frozen=True)
 class Disconnected:
-    """The server has gone: it was stopped, or did not answer for EPICS_PVA_CONN_TMO (40 s)."""
+    """The connection was lost: the server was stopped, or did not answer for EPICS_PVA_CONN_TMO (40 s)."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,8 @@ class FrameStream:
         while not self._over:
             process = self._process
             assert process.stdin is not None and process.stdout is not None
-            with process.stdin, process.stdout as stream, suppress(EOFError, ValueError):  # it died within an item
+            # the process died within an item
+            with process.stdin, process.stdout as stream, suppress(EOFError, ValueError):
                 while line := stream.readline():
                     self._take(stream, *json.loads(line))
             code, self._died_at = process.wait(), time.time()

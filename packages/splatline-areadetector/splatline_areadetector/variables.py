@@ -1,7 +1,7 @@
 """Variables: process variables of an IOC, subscribed to over PVAccess or Channel Access, each with its history.
 
-Nothing is written. Values and frames arrive on different ways, and a computer that stalled gets all of them at once. So
-a value counts from the time that its IOC gave it.
+Nothing is written. Values and frames arrive by different ways, and a computer that has stalled gets all of them at
+once. So a value counts from the time stamp of its IOC.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from drivers.base.errors import DeviceTimeout
 from splatline_areadetector.receiver import Subscribed
 
 Value = float | str
-_ANSWER, _OTHERS = 3.0, 1.5  # s to wait for an answer: of variables that are needed, of others
-_LONGEST_DELAY = 60.0  # s: if the clock of an IOC is off by more, it was never set
+_ANSWER, _OTHERS = 3.0, 1.5  # s to wait for an answer: for variables that are needed, and for others
+_LONGEST_DELAY = 60.0  # s; if the clock of an IOC is wrong by more, it was never set
 
 
 def url_problem(url: str) -> str:
@@ -129,7 +129,7 @@ class Variables:
                 url,
                 f"no answer within {_ANSWER:g} s",
                 request=", ".join(self.prefix + name for name in silent),
-                advice="Check the prefix, whether its IOC runs, and which hosts are asked (EPICS_CA_ADDR_LIST, "
+                advice="Check the prefix, whether its IOC runs, and which hosts are searched (EPICS_CA_ADDR_LIST, "
                 "EPICS_PVA_ADDR_LIST)",
                 state="Nothing was started",
             )
@@ -184,7 +184,7 @@ def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of Channel Access, in a thread of its own, once a process."""
+    """The event loop of Channel Access in a separate thread; one for each process."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
     return loop
@@ -197,7 +197,7 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
         if not update.ok:
             return
         is_choice = update.datatype == aioca.DBR_ENUM
-        if is_choice and not labels:  # because updates with a time leave out the labels
+        if is_choice and not labels:  # because updates with a time stamp do not contain the labels
             labels.extend((await aioca.caget(update.name, format=aioca.FORMAT_CTRL)).enums)
         add(float(update.timestamp), labels[int(update)] if is_choice and int(update) < len(labels) else _plain(update))
 
@@ -212,5 +212,5 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
             each.close()
 
     subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
-    # It waits: aioca closes what is left when the program ends, in another thread, which crashes in the midst of ours.
+    # Wait for the closing. Otherwise aioca closes the rest at the end of the program in another thread, which crashes.
     return lambda: asyncio.run_coroutine_threadsafe(end(), _loop()).result()

@@ -33,7 +33,7 @@ SETTINGS = AreaDetectorSettings(
 EXTERNAL = CameraSettings(0.01, TriggerSource.EXTERNAL, (32, 64, 64, 96))
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"exposure": 0.0}, "exposure of 0 s"),
-    ({"roi": (224, 0, 64, 96)}, "larger than the sensor of 256 x 320"),
+    ({"roi": (224, 0, 64, 96)}, "beyond the sensor of 256 x 320"),
     ({"binning": 5}, "cannot be divided by binning 5"),
     ({"readout": "fast"}, "readout 'fast' is unknown; legal: standard"),
 ]
@@ -150,7 +150,7 @@ def test_a_lost_frame_leaves_a_gap(spinnaker: FakeIoc) -> None:
 
 
 def test_another_sensor_than_configured_is_refused(spinnaker: FakeIoc) -> None:
-    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, but .*sensor is \[512, 320\]"):
+    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, but .*sensor states \[512, 320\]"):
         spinnaker.camera(sensor=(512, 320))
 
 

@@ -73,7 +73,7 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
         value.codec = {"name": codec, "parameters": 6}
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in sides]
     began = time.monotonic()
-    with pytest.raises(FrameRefusedError, match=f"not fit its dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
+    with pytest.raises(FrameRefusedError, match=f"match its dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
         array_frame(value, 0.0)
     assert time.monotonic() - began < 1
 
@@ -102,7 +102,7 @@ def test_window_and_attributes() -> None:
     ("changed", "sentence"),
     [
         ({"codec": {"name": "zfp", "parameters": 6}}, "with zfp, which this program cannot decode; set Codec1:Comp"),
-        ({"codec": {"name": "blosc", "parameters": 0}}, "its codec blosc does not say the type of its pixels"),
+        ({"codec": {"name": "blosc", "parameters": 0}}, "its codec blosc does not state the type of the pixels"),
         ({"attributes": {"ColorMode": 1}}, "its pixels are Bayer, not mono"),
     ],
 )

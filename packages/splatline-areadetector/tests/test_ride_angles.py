@@ -101,11 +101,11 @@ def test_a_camera_that_ran_free_before_the_projections(tmp_path: Path, pause: fl
     (file,) = stored(tmp_path)
     said = f"{told.error}{told.warnings}"
     if lost and not pause:
-        assert file.ids.tolist() == [*range(32, 91)] and "Frame 32 is taken for the first" in said
+        assert file.ids.tolist() == [*range(32, 91)] and "Frame 32 counts as the first" in said
         assert "the missing frame may be the first" in said
     else:
         assert np.allclose(file.degrees, 3.0 * (file.ids - 31)) and file.missing == [*range(lost)]
-        assert (told.error is None) is (lost == 0) and "is taken for the first" not in said
+        assert (told.error is None) is (lost == 0) and "counts as the first" not in said
 
 
 def test_a_ride_that_subscribes_late_says_that_it_may_be_the_first_that_are_missing(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_ride_that_subscribes_late_says_that_it_may_be_the_first_that_are_miss
         told = ride_along(config_of(tmp_path, ioc.url), tmp_path, scan)
     one, other = stored(tmp_path)
     assert isinstance(told.error, ScanStopped) and _views(one) == [*range(6)] and _views(other) == [0, 1, 2]
-    assert len(re.findall(r"Frame \d+ is taken for the first projection", told.warnings)) == 2
+    assert len(re.findall(r"Frame \d+ counts as the first projection", told.warnings)) == 2
     assert "the missing 17 frames may be the first" in str(told.error)
 
 
@@ -165,8 +165,8 @@ def _renumbered(numbers: Iterable[int], words: bool = True) -> list[Any]:
         ([*range(0, 5), *range(0, 5), *range(0, 20), *range(0, 5)], True, ""),
         ([(65515 + i - 1) % 65535 + 1 for i in range(35)], False, ""),
         ([(65515 + i) % 65536 for i in range(35)], True, ""),
-        ([5 * i + 5 for i in range(35)], False, "rise by 5: a plugin averages 5 frames"),
-        ([5 * i + 5 for i in range(35)], True, "rise by 5: a plugin averages 5 frames"),
+        ([5 * i + 5 for i in range(35)], False, "rise by 5, because a plugin averages 5 frames"),
+        ([5 * i + 5 for i in range(35)], True, "rise by 5, because a plugin averages 5 frames"),
     ],
 )
 def test_numbers_of_acquisitions_of_16_bits_and_of_a_plugin_that_averages(

@@ -224,7 +224,7 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> N
             ride = stack.enter_context(RideProgram(tmp_path, IMAGE, "--no-live", **_views(n)))
             start()
             ride.wait_for(lambda: ride.frames() > 20)
-        ride.wait_for(lambda: "its server has gone" in ride.output)
+        ride.wait_for(lambda: "connection to the server of" in ride.output)
         with served(scan, 20) as start:
             start()
             assert ride.exit_code() == 5

@@ -193,7 +193,7 @@ def test_what_the_first_projection_rests_on(
     frames = [*before, *seen(came, VIEWS)]
     decided = sort(sorter, [replace(frame, time=float(i)) for i, frame in enumerate(frames)])
     assert triggers(decided) == {number: number - first for number in came if number - first < 60}
-    assert sorter.basis is basis and ("is taken for the first" in notes(decided)) is (basis is Basis.UNKNOWN)
+    assert sorter.basis is basis and ("counts as the first" in notes(decided)) is (basis is Basis.UNKNOWN)
 
 
 def test_a_ride_that_came_late_says_so() -> None:
@@ -208,9 +208,9 @@ def test_a_ride_that_came_late_says_so() -> None:
         sorter = Sorter([PlannedBlock(VIEW, 20)], before=before, began_within_scan=began_within_scan)
         decided = sort(sorter, times)
         assert triggers(decided) == {i: i - 15 for i in range(15, 35)}
-        assert ("Frame 15 is taken for the first" in notes(decided)) is late
+        assert ("Frame 15 counts as the first" in notes(decided)) is late
     decided = sort(Sorter([PlannedBlock(VIEW, 20)]), [Seen(14, BY_ORDER, reconnected=True), *times[:2]])
-    assert "Frame 14 is taken for the first" in notes(decided)  # it came while the ride subscribed
+    assert "Frame 14 counts as the first" in notes(decided)  # it came while the ride subscribed
 
 
 def test_neighbours_that_are_exchanged_have_their_places() -> None:
@@ -267,7 +267,7 @@ def test_a_plugin_that_averages_is_said_and_each_frame_is_a_projection() -> None
     sorter = Sorter(BLOCKS)
     decided = sort(sorter, [Seen(5 * (i + 1), phase) for i, phase in enumerate(phases)])
     assert triggers(decided) == {15 + 5 * i: i for i in range(5)} and sorter.complete
-    assert "rise by 5: a plugin averages 5 frames" in notes(decided)
+    assert "rise by 5, because a plugin averages 5 frames" in notes(decided)
     decided = sort(Sorter([PlannedBlock(VIEW, 9)]), seen((5, 10, 20, 25, 30, 35, 37, 40), VIEWS))
     assert triggers(decided) == {5 * i + 5: i for i in (0, 1, 3, 4, 5, 6, 7)} and isinstance(decided[6][1], Unknown)
     for numbers, lost in (((1, 3, 5, 7, 9), True), ((1, 3, 5, 6, 9), False)):  # the plugin dropped frames, or none
@@ -281,7 +281,7 @@ def test_a_step_learned_from_frames_of_which_every_second_was_lost_is_revised() 
     assert all(triggers(decided)[i] == i - 1 for i in range(12, 21))
     assert "From frame 12 on, numbers rise by 1 instead of 2" in notes(
         decided
-    ) and "up to 11: they may have a wrong" in notes(decided)
+    ) and "up to 11, because they may have a wrong" in notes(decided)
     sorter = Sorter([PlannedBlock(FLAT, 4), PlannedBlock(VIEW, 20)])
     decided = sort(sorter, seen([*range(1, 12, 2), *range(12, 25)], BY_ORDER))
     assert {i: i - 5 for i in range(12, 25)}.items() <= triggers(decided).items() and sorter.complete
@@ -317,17 +317,17 @@ def test_a_number_of_the_next_acquisition_fills_no_gap_of_the_one_before() -> No
     sorter = Sorter([PlannedBlock(DARK, 6), PlannedBlock(VIEW, 8)])
     decided = sort(sorter, [*seen((1, 3, 4, 5, 6), DARKS), *seen(range(2, 9), VIEWS)])
     assert sorter.missing(0) == [1] and list(triggers(decided)) == [*range(2, 9)]
-    assert not sorter.basis.is_sure and "Frame 2 is taken for the first projection" in notes(decided)
+    assert not sorter.basis.is_sure and "Frame 2 counts as the first projection" in notes(decided)
 
 
 def test_the_kind_of_the_first_frame_of_a_second_file_is_assumed_by_order() -> None:
     sorter = Sorter(BLOCKS, before=Seen(1, BY_ORDER), began_within_scan=True)
     told = notes(sort(sorter, [*seen(range(1, 3), BY_ORDER), *seen(range(1, 6), BY_ORDER)]))
-    assert "Frame 1 is taken for the first dark of the scan" in told and "the kinds of frames and all angles" in told
-    assert told.count("is taken for the first") == 1
+    assert "Frame 1 counts as the first dark of the scan" in told and "the kinds of frames and all angles" in told
+    assert told.count("counts as the first") == 1
     sorter = Sorter(BLOCKS, before=Seen(9, VIEWS), began_within_scan=True)  # a second file that begins with darks
     told = notes(sort(sorter, [*seen((1, 2), DARKS), *seen(range(1, 6), VIEWS)]))
-    assert "Frame 1 is taken for the first projection" in told
+    assert "Frame 1 counts as the first projection" in told
 
 
 def test_more_flats_within_the_projections_than_planned_are_stored() -> None:
@@ -364,7 +364,7 @@ def test_a_kind_that_is_not_told_for_some_frames() -> None:
     phases = [*[DARKS] * 2, NOT_TOLD, *[VIEWS] * 4]  # the first projection, or of no scan, for all that is known
     decided = sort(Sorter(BLOCKS), [Seen(i, phase) for i, phase in enumerate(phases, 1)])
     assert triggers(decided) == {i: i - 4 for i in range(4, 8)} and isinstance(decided[2][1], Unknown)
-    assert "Frame 4 is taken for the first projection" in notes(decided)
+    assert "Frame 4 counts as the first projection" in notes(decided)
 
 
 def test_frames_of_another_size() -> None:

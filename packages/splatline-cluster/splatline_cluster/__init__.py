@@ -25,7 +25,7 @@ from recon.base.method import Method
 _CONNECT_TIMEOUT = 30  # s to wait for a scheduler, and for its first worker
 _PATIENCE = 60.0  # s to wait if all workers have left
 LOOK_EVERY = 2.0  # s between two checks for a worker
-_TASK_SIZE_WARNING = "1 TB"  # size of a task from which distributed warns; a slab is sent as it is
+_TASK_SIZE_WARNING = "1 TB"  # task size above which distributed warns; a slab is sent as one task
 _SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # so that modules in the current folder are not imported
 
 
@@ -40,7 +40,7 @@ class Cluster:
     """Workers that reconstruct slabs. If a worker is lost, another one repeats its work.
 
     Attributes:
-        patience: s without any worker, after which the work is given up.
+        patience: time in s without any worker after which the reconstruction stops.
     """
 
     workers: int
@@ -56,7 +56,7 @@ class Cluster:
         control: RunControl,
         **settings: Any,
     ) -> Reconstruction:
-        """Reconstruct on a worker with as many threads as this process has, without progress and without a stop.
+        """Reconstruct on a worker with as many threads as this process has. Progress and stop are not supported.
 
         Raises:
             WorkersLostError: several workers with this slab were lost, or all workers, or the scheduler.

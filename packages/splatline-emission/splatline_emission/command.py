@@ -12,7 +12,7 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_existing
 
-_UPDATES = 200  # most updates of the volume, over all subsets, if held-out counts choose the iterations
+_UPDATES = 200  # largest number of updates of the volume, over all subsets, if held-out counts choose the iterations
 _NEW = click.Path(path_type=Path)
 
 

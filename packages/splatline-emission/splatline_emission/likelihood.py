@@ -36,9 +36,9 @@ def mlem(
 
         x <- x / (Aᵀs) * Aᵀ[s y / (s A x + b)]
 
-    With one subset, each iteration raises L = Σ y log(mean) - mean. N subsets of the projections are OSEM (Hudson &
-    Larkin 1994): about N times as fast, but L need not rise. Memory: 4 volumes with one subset, else 3 + subsets; 4
-    times the projections of a subset.
+    With one subset, each iteration raises L = Σ y log(mean) - mean. With N subsets of the projections this is OSEM
+    (Hudson & Larkin 1994), which is about N times as fast, but L may fall. Memory: 4 volumes with one subset, else 3 +
+    subsets; 4 times the projections of a subset.
 
     Args:
         on_iteration: called with the number of each iteration, from 1, L (up to a constant), and
@@ -91,7 +91,7 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
             if blind := np.count_nonzero(counts[mean <= 0]):
                 raise ValueError(
                     f"{blind} lines have counts although their mean is 0: they miss the grid, or their survival is 0. "
-                    "Give a larger grid, their background, or no counts"
+                    "Use a larger grid, state a background for these lines, or set their counts to 0"
                 )
             ratio = np.divide(counts, mean, out=np.zeros_like(mean), where=mean > 0)
             likelihood += float(np.sum(xlogy(counts, mean) - mean, dtype=np.float64))

@@ -18,9 +18,10 @@ from recon import Grid, Volume, project, voxelize
 from recon.post import clusters
 
 F32 = NDArray[np.float32]
-_SLICES = 16  # computed at a time
-_RANGE = 0.5, 99.5  # percentiles at which values are cut, so that a speck of metal does not count as the material
-_APART = 5e-4  # least distance of a voxel from the level, over the largest: keeps vertices off the corners
+_SLICES = 16  # projections computed at a time
+_RANGE = 0.5, 99.5  # percentiles to which values are limited, so that a speck of metal does not count as the material
+# smallest distance of a voxel value from the level, relative to the largest; keeps vertices off the corners
+_APART = 5e-4
 
 
 def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ...] | None) -> Grid:

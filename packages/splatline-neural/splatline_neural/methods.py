@@ -35,8 +35,8 @@ from splatline_neural.networks import F32, Field, HashGrid, Waves, drawn, rays_o
 CHUNK = 2**15  # samples in one pass through the network
 _FLOATS = 24  # floats for each sample and number of a layer: activations and their gradients
 _SOME = 256  # rays of a projection from which the mean density is estimated
-_DROP, _DROP_AT = 0.1, 0.5  # factor of the rate, and fraction of the run after which it applies
-_TOP = 0.98  # the highest density counts as reached from this fraction on
+_DROP, _DROP_AT = 0.1, 0.5  # factor on the rate, and fraction of the run after which it is used
+_TOP = 0.98  # the highest density counts as reached above this fraction of it
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class FieldMethod(Iterative):
 
     Attributes:
         steps: number of steps; each uses one projection.
-        seconds: time limit from the call to the last step; `steps` ends the run, too.
-        allow_negative: density without limits, in place of a sigmoid.
+        seconds: time limit from the call to the last step; `steps` also ends the run.
+        allow_negative: True: the density has no limits; False: a sigmoid limits it.
         rays: number of rays in a step, drawn at random from its projection.
         samples: number of samples along a ray, 2 or more; the ray is divided into as many equal parts with a random
             point in each. None: five for every four voxels of the longest edge, as published.

@@ -15,12 +15,12 @@ from scipy.special import stdtr
 Reals = NDArray[np.float64]
 
 NEARLY_BEST = 0.95
-WINDOW = 7  # energies over which the noise is smoothed
-ENOUGH = 50  # pixels inside the rim to estimate the noise; with fewer, the rim is used, too
-FEWEST = 16  # pixels for any estimate of the noise
+WINDOW = 7  # number of energies over which the noise is smoothed
+ENOUGH = 50  # fewest pixels inside the rim from which the noise is estimated; with fewer, the rim is also used
+FEWEST = 16  # fewest pixels for an estimate of the noise
 DARK = 0.01  # largest share of dark pixels in a region
 KNOWN = 0.5  # smallest share of pixels with a value in a region
-_LIT, _LIT_SHARE = 0.5, 1e-3  # least intensity: counts above the dark level, or fraction of the flat if that is less
+_LIT, _LIT_SHARE = 0.5, 1e-3  # least intensity: counts above the dark level or, if this is less, fraction of the flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
     first = max(step - max(NARROW, energies.size // 10), 0)
     steepest = first + int(np.argmax(slope[first : step + max(NARROW, energies.size // 10)]))
     if slope[steepest] <= 0:
-        return none("the absorption rises nowhere")
+        return none("the absorption does not rise at any energy")
     if steepest < 2 or steepest > energies.size - 3:
         return none("widen the range of energies: the curve is steepest at the end of the range")
     return AbsorptionEdge(

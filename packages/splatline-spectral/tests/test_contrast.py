@@ -236,7 +236,7 @@ def test_what_only_falls_has_no_edge() -> None:
     energies = np.arange(8.30, 8.40, 0.001)
     fall = -np.arctan((energies - 8.35) * 1e3 / 2) - 20 * (energies - 8.3)
     found = find_edge(energies, fall)
-    assert not found.found and found.reason == "the absorption rises nowhere"
+    assert not found.found and found.reason == "the absorption does not rise at any energy"
 
 
 def test_the_noise_is_that_of_the_curve() -> None:

@@ -104,8 +104,8 @@ class Seen:
 @click.option(
     "--quick",
     is_flag=True,
-    help="Do not reconstruct from halves of the projections: faster, but the intervals leave out the error from few "
-    "projections.",
+    help="Do not reconstruct from halves of the projections. This is faster, but the intervals leave out the error "
+    "from few projections.",
 )
 @click.option(
     "--crop",
@@ -252,15 +252,15 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     particles = values["particles"] or n_materials
     if labels.size not in (0, n_materials):
         raise ValueError(
-            f"leave out --materials {n_materials}, because the volume holds {labels.size} different values "
-            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values, and each label is "
-            "a material"
+            f"leave out --materials {n_materials}, because the volume contains {labels.size} different values "
+            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values, and each label "
+            "is a material"
         )
     if labels.size:
         materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
         answer.warn(
             Note(
-                f"{path} holds few different values, so they are read as labels and not as grey values: "
+                f"{path} contains few different values, so they are read as labels and not as grey values: "
                 f"{', '.join(materials)}."
             )
         )
@@ -282,7 +282,7 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
         found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure"))
     except ValueError as error:
         way_out = (
-            f"only slices {read.slices.start}:{read.slices.stop} fit the memory and were measured: give more "
+            f"only slices {read.slices.start}:{read.slices.stop} fit into the memory and were measured: give more "
             "--memory, or choose other --slices"
             if read.limit_sentence
             else "reconstruct from more projections"

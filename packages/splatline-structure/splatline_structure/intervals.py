@@ -22,14 +22,17 @@ may be wrong because of partial-volume voxels."""
 OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
 """By the first word of a number's name, two factors. The first, times the change from half of the projections to all,
 estimates the change from all to infinitely many. The second, times the change from voxels twice as wide, is the
-half-width from the voxels. OTHERS holds for other numbers, and its second factor for voxels that are not cubes. All
-figures here were found on simulated grains and checked once on others (docs/structure.md). Sizes and tortuosities
+half-width from the voxels. OTHERS is used for other numbers, and its second factor for voxels that are not cubes. All
+values here were found on simulated grains and checked once on other grains (docs/structure.md). Sizes and tortuosities
 changed in both directions."""
 OTHERS = 0.5, 0.3
 BIAS = 0.012  # relative: fractions of grains (or of the rest) come out low by this, whatever the number of projections
 SPLIT_OR_MERGED = 0.62
-"""Some of n whole particles are split, merged or cut in another way than in the sample. So the fraction s of their
-volume below a size is wrong by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
+"""Some of n whole particles are split, merged or cut differently than in the sample.
+
+So the fraction s of their volume below a size is wrong by this value times √(s (1 - s) / n). Found on twenty scenes
+(docs/structure.md).
+"""
 LEVELS_MOVE = 0.5  # error of thresholds, as a factor of their change with half of the projections
 UNDECIDED, SURE = 0.15, 0.8
 """Largest fraction of undecided voxels; a voxel is decided if one material has this probability or more."""
@@ -193,15 +196,19 @@ def _interval(
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):
-        nothing = "nothing connects the faces" if math.isinf(value) else "no particle is completely in the measured box"
-        return Interval(value, why_not=nothing if kind != "connected" else "there is none of this material")
+        nothing = (
+            "no part of the material connects the two faces"
+            if math.isinf(value)
+            else "no particle is completely in the measured box"
+        )
+        return Interval(value, why_not=nothing if kind != "connected" else "there are no voxels of this material")
     if of_particles == math.inf:
         return Interval(
             value, why_not="only one particle is completely in the box, so there is no distribution of sizes"
         )
     if not all(map(math.isfinite, (*halves, *sides, wide))):
         return Interval(
-            value, why_not="the threshold, half of the projections or the voxel size decide whether it exists at all"
+            value, why_not="its existence depends on the threshold, on the number of projections or on the voxel size"
         )
     still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan

@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 Spacing = tuple[float, float, float]
 
 _ROUNDS, _LOOKED_AT = 4, 160  # side in voxels of the central cube from which the levels are found
-_CORE = 2  # only voxels so many voxels from an edge are used for the level of a material
+_CORE = 2  # least distance from an edge, in voxels, of the voxels from which the level of a material is computed
 _TRIMMED = 0.02  # fraction of a core's voxels left out at each end, because of specks of other materials
 _LEAST = 200  # fewest voxels of a core; with fewer, the outer quarter of the material's values gives the level
 MOST = 6  # largest number of materials
@@ -106,7 +106,7 @@ def _core(volume: F32, mask: Mask, k: int, count: int) -> F32:
         return core
     values = volume[mask]
     if not values.size:
-        raise ValueError(f"it holds fewer than {count} materials: no voxel is of material {k + 1}")
+        raise ValueError(f"it contains fewer than {count} materials, because no voxel is of material {k + 1}")
     low, high = (0, 25) if k == 0 else (75, 100) if k == count - 1 else (37.5, 62.5)
     low, high = np.percentile(values, (low, high))
     return values[(values >= low) & (values <= high)]

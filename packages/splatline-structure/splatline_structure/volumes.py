@@ -83,17 +83,17 @@ def read_volume(
     """
     if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
         raise DataError(
-            f"Reconstruct {path} with `beamline recon` first: it is a scan ({scan}). If it does hold a volume, give "
-            "--dataset. Nothing was written."
+            f"Reconstruct {path} with `beamline recon` first: it is a scan ({scan}). If the file does contain a "
+            "volume, give --dataset. Nothing was written."
         )
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as packed:
             unpacked = sum(each.file_size for each in packed.infolist())
         if unpacked > memory:
             raise DataError(
-                f"{path}: not enough memory. Unpacked it has {size(unpacked)}, and {size(memory)} are allowed. Give "
-                "more --memory, or save the volume as .npy (numpy.save), which is read slice by slice. Nothing was "
-                "written."
+                f"{path}: not enough memory. The unpacked volume has {size(unpacked)}, and {size(memory)} are "
+                "allowed. Give more --memory, or save the volume as .npy (numpy.save), which is read slice by slice. "
+                "Nothing was written."
             )
     with opened_volume(path, dataset) as record:
         grid = record.volume.grid

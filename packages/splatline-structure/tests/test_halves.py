@@ -150,7 +150,7 @@ def test_a_volume_that_is_laid_out_as_a_scan_is_read_by_its_name(here: Path) -> 
         file["exchange/data"] = np.zeros((9, 10, 11), np.float32)
     read = read_volume(here / "volume.h5", "exchange/data", (2, 2, 2), None, 10**9, "square")
     assert read.record.grid.shape == (9, 10, 11)
-    with pytest.raises(DataError, match="If it does hold a volume, give --dataset"):
+    with pytest.raises(DataError, match="If the file does contain a volume, give --dataset"):
         read_volume(here / "volume.h5", None, (2, 2, 2), None, 10**9, "square")
 
 

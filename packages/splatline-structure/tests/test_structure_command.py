@@ -158,7 +158,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
     np.save(here / "can.npy", volume)
     common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
     result = beamline(*common)
-    words = "the rarer level; only slices 14:26 fit the memory and were measured: give more --memory, or choose other"
+    words = "the rarer level; only slices 14:26 fit into the memory and were measured: give more --memory, or"
     assert result.exit_code == 5 and words in result.stderr
     assert "views" not in result.stderr and "--materials" not in result.stderr
     assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr
@@ -255,7 +255,7 @@ REFUSED = [
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
     (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice must be squares"),
     (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "so they are labels and not grey values"),
-    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "Unpacked it has 830 kB, and 10 kB are allowed"),
+    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "The unpacked volume has 830 kB, and 10 kB are allowed"),
     (("holes.npy", *VOXEL_UM), 5, "holes.npy are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected 8 or more along each side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
@@ -300,7 +300,7 @@ def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> N
     assert result.exit_code == 0, result.output
     assert (
         "no particle is completely in the measured box" in result.stdout
-        and "nothing connects the faces" in result.stdout
+        and "no part of the material connects the two faces" in result.stdout
     )
 
 

@@ -56,7 +56,7 @@ class Discrete(VoxelMethod):
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
             voxels are pulled weakly to given levels.
-        still: as of `FistaTv`.
+        still: as in `FistaTv`.
     """
 
     name: ClassVar[str] = "discrete"
@@ -78,7 +78,7 @@ class Discrete(VoxelMethod):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """As of `FistaTv`."""
+        """As in `FistaTv`."""
         return with_quality(self, quality)
 
     def refit(self, share: float) -> VoxelMethod:
@@ -87,7 +87,7 @@ class Discrete(VoxelMethod):
 
     @property
     def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume stands still."""
+        """Usual number of iterations until the volume has converged."""
         return min(self.iterations, USUAL_SWEEPS)
 
     @property

@@ -128,8 +128,8 @@ class AsdPocs(VoxelMethod):
     Attributes:
         goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 times the residual of filtered back-projection
             (FBP or FDK). FDK cannot reconstruct a short cone scan; the goal is then 0.15 times the residual after one
-            iteration of ordered-subset SIRT. Both have about the same residual: 0.085 to 0.12, and
-            FDK 0.075 to 0.11 (a box in a box, 20 to 180 projections, 0 and 2 % noise).
+            iteration of ordered-subset SIRT. This residual is about the same: 0.085 to 0.12, and that of FDK is 0.075
+            to 0.11 (a box in a box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"

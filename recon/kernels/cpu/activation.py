@@ -2,8 +2,8 @@
 
     scale = exp(log_scale)        density = unit * softplus(raw)        R = R(quaternion / |quaternion|)
 
-The other kernels work on means, scales, rotations (row-major 3x3) and densities; `activation_backward` takes their
-gradients back to the raw parameters.
+The other kernels work on means, scales, rotations (row-major 3x3) and densities. `activation_backward` converts their
+gradients to those of the raw parameters.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _TASK = 1024  # Gaussians
 
 @njit(inline="always", fastmath=True)
 def _softplus(r):
-    """log(1 + e^r) a lane, without overflow for large r and without cancellation for small r.
+    """log(1 + e^r) for each lane, without overflow for large r and without cancellation for small r.
 
-    log(1 + t) = 2 artanh(t / (2 + t)) for t = e^-|r|; the series of artanh is cut at a relative error of 1e-8.
+    log(1 + t) = 2 artanh(t / (2 + t)) for t = e^-|r|; the series of artanh is truncated at a relative error of 1e-8.
     """
     size = r * lanes.sign(r)
     t = lanes.exp(lanes.zero() - size)
@@ -47,7 +47,7 @@ def _sigmoid(r):
 
 @njit(inline="always", fastmath=True)
 def _rescaled(quaternions, i):
-    """Quaternion i scaled to float32's range, its squared length then, and the factor (0 if it is too short)."""
+    """Quaternion i scaled to the range of float32, its squared length, and the factor (0 if it is too short)."""
     w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
     length2, factor = w * w + x * x + y * y + z * z, _f(1)
     if not length2 < _LONGEST:
@@ -61,7 +61,10 @@ def _rescaled(quaternions, i):
 def activate(
     log_scales: F32, quaternions: F32, raw: F32, unit: float, scales: F32, rotations: F32, densities: F32
 ) -> None:
-    """Fill scales [n, 3], rotations [n, 9] and densities [n], to a few float32 steps; logs are clamped to +-87."""
+    """Fill scales [n, 3], rotations [n, 9] and densities [n], accurate to a few float32 steps.
+
+    Logs are clamped to +-87.
+    """
     n, one, two = raw.shape[0], _f(1), _f(2)
     logs, widths = log_scales.reshape(1, 3 * n), scales.reshape(1, 3 * n)
     raws, dense = raw.reshape(1, n), densities.reshape(1, n)
@@ -93,7 +96,7 @@ def activate(
 def activation_backward(
     quaternions: F32, raw: F32, unit: float, d_rotations: F32, d_densities: F32, d_quaternions: F32, d_raw: F32
 ) -> None:
-    """Gradients on quaternions [n, 4] and raw densities [n] from those on rotations [n, 9] and densities [n]."""
+    """Gradients of quaternions [n, 4] and raw densities [n] from those of rotations [n, 9] and densities [n]."""
     n, two, four = raw.shape[0], _f(2), _f(4)
     raws, d_dense, out = raw.reshape(1, n), d_densities.reshape(1, n), d_raw.reshape(1, n)
     for task in prange((n + _TASK - 1) // _TASK):
@@ -112,7 +115,8 @@ def activation_backward(
             gx = two * (y * g[1] + z * g[2] + y * g[3] - w * g[5] + z * g[6] + w * g[7]) - four * x * (g[4] + g[8])
             gy = two * (x * g[1] + w * g[2] + x * g[3] + z * g[5] - w * g[6] + z * g[7]) - four * y * (g[0] + g[8])
             gz = two * (-w * g[1] + x * g[2] + w * g[3] + y * g[5] + x * g[6] + y * g[7]) - four * z * (g[0] + g[4])
-            # Only the part orthogonal to the unit quaternion rotates; the part along it would change its length.
+            # Only the part orthogonal to the unit quaternion rotates; the part along the quaternion would change its
+            # length.
             along = gw * w + gx * x + gy * y + gz * z
             d_quaternions[i, 0] = (gw - along * w) * inverse
             d_quaternions[i, 1] = (gx - along * x) * inverse

@@ -31,7 +31,10 @@ def _adam(
     eps: float,
     tasks: NDArray[np.int64],
 ) -> None:
-    """One pass over flat arrays [1, size]; tasks [k, 2] hold the number of an array and the start of a piece of it."""
+    """One pass over flat arrays [1, size].
+
+    Tasks [k, 2] contain the number of an array and the start of a piece of it.
+    """
     b1, b2 = _f(BETA1), _f(BETA2)
     s2, e, one = _f(scale2), _f(eps), _f(1)
     for task in prange(tasks.shape[0]):
@@ -73,14 +76,14 @@ def adam_all(
         bounds: (lowest, highest) value of each array, enforced after the update; None: unbounded.
 
     Raises:
-        ValueError: shapes disagree, or an array is not contiguous (then only a copy would be updated).
+        ValueError: shapes do not match, or an array is not contiguous (then only a copy would be updated).
     """
     lists = (parameters, gradients, first, second)
     for arrays in zip(*lists, strict=True):
         if any(a.shape != arrays[0].shape or not a.flags.c_contiguous for a in arrays):
             shapes = [(a.shape, "C" if a.flags.c_contiguous else "not contiguous") for a in arrays]
             raise ValueError(
-                f"a parameter, its gradient and its moments must be C-contiguous and of one shape: {shapes}"
+                f"a parameter, its gradient and its moments must be C-contiguous and have the same shape, got {shapes}"
             )
     limits = [(-_WIDEST, _WIDEST) if b is None else b for b in bounds or [None] * len(parameters)]
     scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
@@ -93,7 +96,7 @@ def adam_all(
 
 @njit(**OPTIONS)
 def add_lengths(vectors: F32, factor: float, sums: F32) -> None:
-    """sums [n] += factor * |vectors [n, 2]|: accumulates gradients on footprints' centres for density control."""
+    """sums [n] += factor * |vectors [n, 2]|: accumulates gradients of the centres of footprints for density control."""
     for i in prange(sums.shape[0]):
         x, y = vectors[i, 0], vectors[i, 1]
         sums[i] += _f(factor) * _f(math.sqrt(x * x + y * y))

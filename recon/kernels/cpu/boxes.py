@@ -1,4 +1,4 @@
-"""Boxes: which pixels a footprint covers, the shape of arrays that rows of lanes fill, and where sums stay accurate."""
+"""Boxes: the pixels that a footprint covers, the shape of arrays for rows of lanes, and where sums are accurate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V
 
 _f = np.float32
-GROUP = 4  # rows are processed four at a time: branches on the exact count cost more than the extra rows
+GROUP = 4  # rows are processed four at a time, because branches on the exact count cost more than the extra rows
 DEEPEST = 60.0  # largest -E of an upright enough footprint, E = -1/2 δᵀ K δ
 
 
@@ -18,14 +18,15 @@ DEEPEST = 60.0  # largest -E of an upright enough footprint, E = -1/2 δᵀ K δ
 def box_of(table, i, rows, cols, height):
     """Pixel box of footprint i, clipped to the image: (row0, row1, col0, col1), ends excluded; empty if outside.
 
-    The number of rows is a multiple of `GROUP`; they stay within `height`, which is such a multiple and >= `rows`.
+    The number of rows is a multiple of `GROUP`. The rows are within `height`, which is also a multiple and >= `rows`.
     """
     hu, hv = table[i, HU], table[i, HV]
     u, v = table[i, U], table[i, V]
     last_row, last_col = _f(rows - 1), _f(cols - 1)
     if not (hu >= 0 and u + hu >= 0 and u - hu <= last_col and v + hv >= 0 and v - hv <= last_row):
         return 0, 0, 0, 0
-    # Clip as floats and round by conversion: math.ceil and floor are calls here, as slow as everything else together.
+    # Clip as floats and round by conversion, because math.ceil and floor are calls here, as slow as all the rest
+    # together.
     top, left = max(v - hv, _f(0)), max(u - hu, _f(0))
     row0, col0 = int(top), int(left)
     row0, col0 = row0 + (_f(row0) < top), col0 + (_f(col0) < left)

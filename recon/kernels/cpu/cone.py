@@ -4,9 +4,10 @@ All rays to one column of the detector lie in one plane parallel to the rotation
 y. In every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is sampled
 once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row].
 
-Sixteen rows meet at most 32 neighbouring slices, and sixteen slices as many rows, from which their numbers are picked
-(`picks` says how). With longer steps fewer rows or slices are taken at once. Tiles of the volume stay in the cache, as
-those of `cpu.joseph`. The transpose has the same weights and runs tile by tile: no two threads write to one voxel.
+Sixteen rows cross at most 32 neighbouring slices, and sixteen slices at most 32 rows; their values are picked from
+these (see `picks`). If the steps are longer, fewer rows or slices are processed at once. Tiles of the volume remain in
+the cache, as in `cpu.joseph`. The transpose uses the same weights and runs tile by tile, so that no two threads write
+to the same voxel.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from recon.kernels.cpu.picks import NEAR_STEP, bilinear, bilinear_near, lanes_pe
 
 _f = np.float32
 _WIDTH = lanes.WIDTH
-_BLOCK = 64  # rows or slices of one job, at most
-_ZEROS = 2 * _WIDTH + 2  # around a line: what is picked there is 0
-_LEAST = 1e-3  # slices a row: no sample is nearer to the source
+_BLOCK = 64  # largest number of rows or slices of one job
+_ZEROS = 2 * _WIDTH + 2  # zeros around a line, so that values picked there are 0
+_LEAST = 1e-3  # slices per row; no sample is nearer to the source
 
 # Columns of the table of views. At line y and x of voxels one row is CLIMB + CLIMB_Y y + CLIMB_X x slices high. This,
 # divided into SIDE + SIDE_Y y + SIDE_X x, gives columns from MIDDLE_COL. z = 0 is at row MIDDLE and slice HEIGHT.
@@ -35,7 +36,7 @@ CLIMB, CLIMB_Y, CLIMB_X, SIDE, SIDE_Y, SIDE_X, MIDDLE_COL, MIDDLE, HEIGHT = rang
 
 
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags, F64]:
-    """The rays as `joseph.ray_table` says, and a table of the views: float64 [view, 9], columns above."""
+    """The rays as in `joseph.ray_table`, and a table of the projections: float64 [view, 9], with the columns above."""
     (_, cy, cx), (nz, ny, nx), h = grid.centre, grid.shape, grid.voxel_size
     x, y, rise = cx - (nx - 1) / 2 * h, cy - (ny - 1) / 2 * h, geometry.pixel_pitch / grid.spacing[0]
     cos, sin = np.cos(geometry.angles), np.sin(geometry.angles)
@@ -53,7 +54,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags, F64]:
 
 @njit(inline="always")
 def _box(view, y0, y1, x0, x1):
-    """Least and largest climb, and first and last place of the columns, over lines y0 - 1..y1 and x0 - 1..x1."""
+    """Smallest and largest climb, and first and last position of the columns, over lines y0 - 1..y1 and x0 - 1..x1."""
     low, high, left, right = math.inf, _LEAST, math.inf, -math.inf
     for corner in range(4):
         y, x = y0 - 1 if corner < 2 else y1, x0 - 1 if corner % 2 else x1
@@ -74,7 +75,7 @@ def _columns(view, y0, y1, x0, x1, cols):
 
 @njit(cache=True)
 def _slices(views, row0, row1, y0, y1, x0, x1, nz):
-    """Slices first..end (excluded) of a tile that rows row0..row1 (excluded) see in any view, and zeros before them."""
+    """Slices first..end (excluded) of a tile that rows row0..row1 (excluded) see, and the zeros before them."""
     bottom, top = math.inf, -math.inf
     for v in range(len(views)):
         low, high, _, _ = _box(views[v], y0, y1, x0, x1)
@@ -86,7 +87,7 @@ def _slices(views, row0, row1, y0, y1, x0, x1, nz):
 
 @njit(cache=True)
 def _room(views, row0, row1, shape):
-    """Slices of any tile that rows row0..row1 (excluded) see, with the zeros behind them: an odd number of Lanes."""
+    """Largest number of slices of a tile that rows row0..row1 (excluded) see, with zeros: an odd number of Lanes."""
     most = 0
     for y0 in range(0, shape[0], TILE):
         for x0 in range(0, shape[1], TILE):
@@ -100,7 +101,7 @@ def _room(views, row0, row1, shape):
 def _forward(
     volume: F32, rays: F64, steep: Flags, views: F64, group: int, start: int, end: int, out: F32
 ) -> None:  # fmt: skip
-    """Jobs start to end, of as many as there are groups of views times blocks of rows."""
+    """Jobs start to end; there is one job for each group of projections and block of rows."""
     ny, nx, nz = volume.shape
     _, cols, rows = out.shape
     voxels, lines = volume.reshape(ny * nx, nz), out.reshape(out.shape[0] * cols, rows)
@@ -135,7 +136,7 @@ def _forward(
                         axis = 0 if steep[v, col] else 1
                         j0, j1, low0, low1, across, along, base = tile_of(axis, y0, y1, x0, x1)
                         if low1 < (nx if axis == 0 else ny):
-                            low1 -= 1  # samples whose lower line is the tile's last one are of the next tile
+                            low1 -= 1  # samples whose lower line is the last one of the tile belong to the next tile
                         j, n = samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
                         if n == 0:
                             continue
@@ -165,15 +166,15 @@ def _forward(
 
 @njit(inline="always")
 def _count_at_once(apart):
-    """How many rows or slices are taken at once, where from one to the next a place moves by 1 / apart."""
+    """Number of rows or slices that are processed at once, if the position moves by 1 / apart from one to the next."""
     lanes_sharing = lanes_per_window()
-    steps = (2 * lanes_sharing - 3) * apart  # that fit into a window, rounding and the number beyond included
+    steps = (2 * lanes_sharing - 3) * apart  # number that fits into a window, including rounding and one more value
     return _WIDTH if steps >= lanes_sharing - 1 else math.floor(steps + 1.0)
 
 
 @njit(inline="always")
 def _climbs(rays, v, col, j, n, climbs, steps):
-    """Slices a row at samples 0..n of a ray from plane j on; returns the least and the largest."""
+    """Slices per row at samples 0..n of a ray from plane j on; returns the smallest and the largest."""
     for k in range(n):
         climbs[k] = max(rays[v, col, 2] + rays[v, col, 3] * (j + k), _LEAST)
         steps[k] = climbs[k]
@@ -184,7 +185,7 @@ def _climbs(rays, v, col, j, n, climbs, steps):
 def _ray(lines, line, path, lean, middle, low, high, margin, ray):
     """Rows low..high (excluded) of a ray, times its path from plane to plane, with zeros around them.
 
-    The path is longer where the ray is inclined to the mid-plane.
+    The path is longer if the ray is inclined to the mid-plane.
     """
     for i in range(0, margin, _WIDTH):
         lanes.store(ray, 0, i, lanes.zero())
@@ -201,7 +202,7 @@ def _ray(lines, line, path, lean, middle, low, high, margin, ray):
 def _adjoint(
     projections: F32, rays: F64, steep: Flags, views: F64, block: int, start: int, end: int, volume: F32
 ) -> None:  # fmt: skip
-    """Jobs start to end, of as many as there are tiles times blocks of slices."""
+    """Jobs start to end; there is one job for each tile and block of slices."""
     ny, nx, nz = volume.shape
     _, cols, rows = projections.shape
     voxels, lines = volume.reshape(ny * nx, nz), projections.reshape(len(views) * cols, rows)
@@ -240,7 +241,7 @@ def _adjoint(
                 for k in range(n):
                     back[k] = 1.0 / climbs[k]
                 wide = _count_at_once(low)
-                most = math.floor(2.0 / low) + 1  # rows within a slice of any slice
+                most = math.floor(2.0 / low) + 1  # rows within one slice of any of these slices
                 for z in range(z0, z1, wide):
                     for k in range(n):
                         edge = middle + (z - 1 - views[v, 8]) / climbs[k]
@@ -284,7 +285,7 @@ def forward(volume: F32, rays: F64, steep: Flags, views: F64, out: F32) -> None:
     """Line integrals of volume [y, x, z] into out [view, col, row], mm times the volume's unit; see `ray_table`."""
     (count, cols, rows), voxels = out.shape, np.ascontiguousarray(volume)
     of_view = cols * min(_BLOCK, rows) * min(volume.shape[:2])
-    # A pass over the volume serves few views where a call would otherwise take more than about half a second.
+    # One pass over the volume serves few projections if a call would otherwise take more than about half a second.
     group = max(1, min(shares(count, 1)[0], 4 * CALL // (of_view * get_num_threads())))
     for part in calls(-(-count // group) * -(-rows // _BLOCK), group * of_view):
         _forward(voxels, rays, steep, views, group, part.start, part.stop, out)

@@ -1,8 +1,8 @@
 """Footprints of Gaussians on the detector, and gradients back: exact for a parallel beam, affine for a cone (numba).
 
-Take a ray through the centre t = (tx, ty, tz) of a Gaussian, in the axes (u, v, d) of the view with the source at the
-origin. It meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch. There the image
-moves by the local axes (px per mm, in the object's frame)
+Consider a ray through the centre t = (tx, ty, tz) of a Gaussian, in the axes (u, v, d) of the projection with the
+source at the origin. It meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch.
+At that point the image moves by the local axes (px per mm, in the object's frame)
 
     Ju = g (u - ax d)        Jv = g (v - ay d)        g = f / tz        ray = ax u + ay v + d
 
@@ -56,21 +56,21 @@ _f, _d = np.float32, np.float64
 # Columns of the footprint table.
 U, V, K, SHEAR, KV, W, HU, HV = range(8)
 HIDDEN, INEXACT = -1.0, -2.0  # in HU and HV: not visible; to be integrated ray by ray
-NEAREST = 0.01  # of sod: Gaussians nearer to the source plane are hidden
-_NEVER = 1e30  # an error that no affine footprint reaches (the kernels' arithmetic has no infinities)
+NEAREST = 0.01  # share of sod; Gaussians nearer to the plane of the source are hidden
+_NEVER = 1e30  # an error that no affine footprint reaches (the arithmetic of the kernels has no infinities)
 
 
 class RayCamera(NamedTuple):
-    """One view, in the form that the kernels need.
+    """One projection in the form that the kernels need.
 
     Attributes:
         axes: float32 [3, 3], unit vectors along columns, rows and beam.
-        focal: a cone: sdd / pitch in px; a parallel beam: 1 / pitch in px/mm.
+        focal: for a cone sdd / pitch in px, for a parallel beam 1 / pitch in px/mm.
         sod: mm from the source to the rotation axis; 0: parallel beam.
         col, row: pixel of the object's origin.
-        straight: parallel beam without roll and tilt, which saves a third of the work.
-        spread: variance in px² along columns and rows, and
-        travel: radians, that `cpu.wide_footprints` adds to footprints; 0: rays without a width.
+        straight: True for a parallel beam without roll and tilt, which saves a third of the work.
+        spread, travel: variance in px² along columns and rows, and arc in radians, that `cpu.wide_footprints` adds to
+            footprints; 0: rays without a width.
     """
 
     axes: F32
@@ -95,7 +95,7 @@ def _turned(x, y, z, r):
 
 @njit(inline="always", fastmath=True)
 def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations):
-    """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's own axes (see above)."""
+    """Add the gradients that follow from T, the gradient of a deformation in the Gaussian's own axes (see above)."""
     d_log_scales[i, 0] += t00
     d_log_scales[i, 1] += t11
     d_log_scales[i, 2] += t22
@@ -109,7 +109,8 @@ def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, 
         d_rotations[i, j + 2] += r[j] * y + r[j + 1] * z
 
 
-# `straight` is a constant of the compiled kernel, so its branches fold; those on an argument of a threaded loop do not.
+# `straight` is a constant of the compiled kernel, so its branches are removed; this fails for arguments of threaded
+# loops.
 def _forward(straight: bool) -> Any:
     @njit(**OPTIONS)
     def kernel(
@@ -163,10 +164,11 @@ def _forward(straight: bool) -> Any:
                 uu, uv, vv, hh = uu + a * a, uv + a * b, vv + b * b, hh + h * h
                 hu, hv = hu + h * pu * sharp, hv + h * pv * sharp
             within = _f(1) / np.sqrt(hh)  # mm of the ray in one standard deviation
-            # g / sqrt(det Σ₂); in float64, since a product of three scales of 1e-13 mm would leave float32's range.
+            # g / sqrt(det Σ₂); in float64, because a product of three scales of 1e-13 mm would leave the range of
+            # float32.
             scale = _f(_d(within) / (_d(g) * (_d(scales[i, 0]) * _d(scales[i, 1]) * _d(scales[i, 2]))))
             table[i, U], table[i, V] = _f(col) + f * tu, _f(row) + f * tv
-            # Squares of square roots: products for a Gaussian of 1e-12 px would leave float32's range.
+            # Squares of square roots, because products for a Gaussian of 1e-12 px would leave the range of float32.
             wide, high = np.sqrt(uu), np.sqrt(vv)
             steep, level = high * scale, _f(1) / (high * g)
             table[i, K], table[i, SHEAR], table[i, KV] = steep * steep, uv / vv, level * level

@@ -3,8 +3,8 @@
 A ray is sampled once in every plane of voxels across the axis that is closest to its direction. Samples are
 interpolated linearly between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are
 [y, x, z] and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions
-read their weights from one table of rays, so each is the exact transpose of the other. The transpose runs plane by
-plane, and no two threads write to one voxel.
+read their weights from one table of rays, so that each is the exact transpose of the other. The transpose runs plane by
+plane, and no two threads write to the same voxel.
 """
 
 from __future__ import annotations
@@ -26,15 +26,18 @@ _f = np.float32
 # slices high. It runs PATH mm from plane to plane in x and y; from row to row of a cone its slope changes by LEAN.
 AT, STEP, RISE, CLIMB, PATH, LEAN = range(6)
 
-_BLOCK = 64  # slices of one job, at most
-_GROUP = 16  # views that share one pass over the volume
-_ENOUGH = 4  # blocks a thread, from which on one that is left over costs little
+_BLOCK = 64  # largest number of slices of one job
+_GROUP = 16  # projections that share one pass over the volume
+_ENOUGH = 4  # blocks per thread above which one remaining block costs little
 TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
 EDGE = TILE + 2
-_FLAT = 1e-9  # lines a plane: such a ray stays on its line
+_FLAT = 1e-9  # lines per plane; a ray with a smaller step stays on its line
 
 CALL = 2**28
-"""Samples of one call of a kernel, about: between two calls, 0.1 to 0.5 s on two cores, a signal is heard."""
+"""Approximate number of samples in one call of a kernel.
+
+A call takes 0.1 to 0.5 s on two cores; signals are handled between calls.
+"""
 
 
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
@@ -58,7 +61,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
         run_x, run_y = -sin + 0 * t, cos + 0 * t
     steep = np.abs(run_y) >= np.abs(run_x)
     first_x, first_y = cx - (nx - 1) / 2 * h, cy - (ny - 1) / 2 * h
-    reach = np.hypot(run_x, run_y)  # of a cone, mm from the source to the detector
+    reach = np.hypot(run_x, run_y)  # for a cone, mm from the source to the detector
     # Planes are counted along the axis closest to the ray (a), lines along the other one (b).
     run_a, run_b = np.where(steep, run_y, run_x), np.where(steep, run_x, run_y)
     from_a = np.where(steep, first_y - origin_y, first_x - origin_x)
@@ -78,9 +81,9 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
 def samples(first, step, low0, low1, j0, j1, across, along, at, share):
     """Samples of the ray first + step j, in planes j0..j1 (excluded), whose lower line is low0..low1 (excluded).
 
-    Fills at [sample], the row of the tile that has this line, and share [sample], of the next line. Returns the plane
-    of the first sample, and how many there are.
-    Not by fast arithmetic: each sample is in one tile, and rounding does not decide otherwise from place to place.
+    Fills at [sample], the row of the tile with this line, and share [sample], the share of the next line. Returns the
+    plane of the first sample and the number of samples. Fast arithmetic is not used, because each sample must be in
+    exactly one tile, and rounding must be the same everywhere.
 
     Args:
         across, along: rows of the tile from plane to plane, and from line to line.
@@ -104,14 +107,14 @@ def samples(first, step, low0, low1, j0, j1, across, along, at, share):
         low = min(max(np.floor(exact), np.float64(low0)), np.float64(low1 - 1))
         at[k] = np.int32(a + k - j0) * np.int32(across) + np.int32(low - low0) * np.int32(
             along
-        )  # AVX2 has no int64 of a float64
+        )  # AVX2 cannot convert a float64 to int64
         share[k] = exact - low
     return a, b - a
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
 def _columns(rays, v, low0, low1, j0, j1):
-    """Columns first..end (excluded) beyond which no ray of a parallel view has samples there (see `samples`)."""
+    """Columns first..end (excluded) outside which no ray of a parallel projection has samples there (see `samples`)."""
     cols, step = rays.shape[1], rays[v, 0, STEP]
     per_col = (rays[v, cols - 1, AT] - rays[v, 0, AT]) / max(cols - 1, 1)
     if per_col == 0.0:
@@ -125,8 +128,10 @@ def _columns(rays, v, low0, low1, j0, j1):
 
 @njit(inline="always")
 def tile_of(axis, y0, y1, x0, x1):
-    """How rays cross a tile. Planes are j0..j1 (excluded), lower lines of samples that touch it low0..low1 (excluded).
-    Then rows of the tile from plane to plane and from line to line, and the row of the first sample."""
+    """How rays cross a tile: planes j0..j1 (excluded), and lower lines low0..low1 (excluded) of the samples that touch
+    it.
+
+    Also the rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:
         return y0, y1, x0 - 1, x1, EDGE, 1, EDGE
     return x0, x1, y0 - 1, y1, 1, EDGE, 1
@@ -136,7 +141,7 @@ def tile_of(axis, y0, y1, x0, x1):
 def _forward(
     volume: F32, rays: F64, steep: Flags, group: int, block: int, first: int, end: int, out: F32
 ) -> None:  # fmt: skip
-    """Jobs first to end, of as many as there are groups of views times blocks of slices."""
+    """Jobs first to end; there is one job for each group of projections and block of slices."""
     ny, nx, nz = volume.shape
     views, cols, _ = out.shape
     voxels, lines = volume.reshape(ny * nx, nz), out.reshape(views * cols, nz)
@@ -162,7 +167,7 @@ def _forward(
                     axis = 0 if steep[v, 0] else 1
                     j0, j1, low0, low1, across, along, base = tile_of(axis, y0, y1, x0, x1)
                     if low1 < (nx if axis == 0 else ny):
-                        low1 -= 1  # samples whose lower line is the tile's last one are of the next tile
+                        low1 -= 1  # samples whose lower line is the last one of the tile belong to the next tile
                     col0, col1 = _columns(rays, v, low0, low1, j0, j1)
                     for col in range(col0, col1):
                         _, n = samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
@@ -186,7 +191,7 @@ def _forward(
 
 @njit(**OPTIONS)
 def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, end: int, volume: F32) -> None:
-    """Jobs first to end, of as many as there are tiles times blocks of slices."""
+    """Jobs first to end; there is one job for each tile and block of slices."""
     ny, nx, nz = volume.shape
     views, cols, _ = projections.shape
     voxels, lines = volume.reshape(ny * nx, nz), projections.reshape(views * cols, nz)
@@ -224,9 +229,9 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, 
 
 
 def shares(views: int, nz: int) -> tuple[int, int]:
-    """Views and slices of one job, so that all threads have work and one pass over the volume serves many views."""
+    """Projections and slices of one job, so that all threads have work and a pass serves many projections."""
     threads, blocks = get_num_threads(), -(-nz // _BLOCK)
-    if blocks % threads == 0 or blocks >= _ENOUGH * threads:  # blocks of slices are work for all
+    if blocks % threads == 0 or blocks >= _ENOUGH * threads:  # the blocks of slices are enough work for all threads
         return -(-views // -(-views // _GROUP)), _BLOCK
     rounds = -(-views // (_GROUP * threads))
     group = -(-views // (rounds * threads))
@@ -253,13 +258,13 @@ def adjoint(projections: F32, rays: F64, steep: Flags, out: F32) -> None:
 
 
 def calls(jobs: int, samples: int) -> list[range]:
-    """The jobs of so many samples each, in calls of about `CALL`: as many at least as all threads take, evenly."""
+    """Divides jobs of `samples` samples each evenly into calls of about `CALL`, with a job for each thread."""
     threads = get_num_threads()
     most = max(threads, CALL // max(samples, 1) // threads * threads)
     return [range(first, min(first + most, jobs)) for first in range(0, jobs, most)]
 
 
 def _whole_lanes(nz: int, most: int) -> int:
-    """Slices of one job, at most so many: whole Lanes, alike for all jobs."""
+    """Number of slices of one job, at most `most`: whole Lanes, the same for all jobs."""
     jobs = -(-nz // most)
     return -(-nz // (jobs * lanes.WIDTH)) * lanes.WIDTH

@@ -1,7 +1,7 @@
 """Lanes: sixteen float32 numbers as one numba value, with a vectorised exp (numba's own exp is scalar).
 
-`Lanes` is LLVM's <16 x float>, which LLVM compiles to AVX-512, AVX2, SSE or NEON instructions, as the machine has them.
-`+ - * /` work between Lanes and with scalars (which are broadcast). No compiler is needed at run time.
+`Lanes` is LLVM's <16 x float>, which LLVM compiles to AVX-512, AVX2, SSE or NEON instructions, depending on the
+machine. `+ - * /` work between Lanes and with scalars, which are broadcast. No compiler is needed at run time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _F32, _I32 = ir.FloatType(), ir.IntType(32)
 _VF, _VI = ir.VectorType(_F32, WIDTH), ir.VectorType(_I32, WIDTH)
 _FAST = ("fast",)
 
-# 2^f on [-1/2, 1/2]: polynomial of least relative error (Remez exchange), 2e-9, below float32's rounding.
+# 2^f on [-1/2, 1/2]: polynomial with the smallest relative error (Remez exchange), 2e-9, below the rounding of float32.
 _EXP2 = (1.53458120e-4, 1.33999312e-3, 9.61848896e-3, 5.55032878e-2, 2.40226469e-1, 6.93147206e-1, 1.0)
 
 
@@ -63,7 +63,7 @@ def _vector_function(builder: Any, name: str, arity: int) -> Any:
 
 
 def _register(symbol: Callable[..., Any], instruction: str) -> None:
-    """Typed and lowered by hand: of an `overload` the compiler copies a function into each place that adds."""
+    """Types and lowers an operator by hand; with `overload` the compiler would copy a function to each addition."""
 
     @infer_global(symbol)
     class Operation(AbstractTemplate):
@@ -136,7 +136,7 @@ def store(typing_context, array, row, col, lanes):
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Sixteen vectors transposed: rows and lanes change places, one bit of their numbers at a time."""
+    """Sixteen vectors, transposed: rows and lanes are exchanged, one bit of their numbers at a time."""
     for bit in (1, 2, 4, 8):
         low = [lane if not lane & bit else WIDTH + lane - bit for lane in range(WIDTH)]
         high = [lane + bit if not lane & bit else WIDTH + lane for lane in range(WIDTH)]
@@ -201,7 +201,7 @@ def between(typing_context, lanes, low, high):
 
 @intrinsic
 def sign(typing_context, lanes):
-    """-1, 0 or 1 a lane."""
+    """-1, 0 or 1 for each lane."""
 
     def code(context, builder, signature, args):
         below = builder.select(builder.fcmp_ordered("<", args[0], _constant(0.0)), _constant(-1.0), _constant(0.0))
@@ -212,7 +212,7 @@ def sign(typing_context, lanes):
 
 @intrinsic
 def root(typing_context, lanes):
-    """The square root a lane."""
+    """The square root of each lane."""
 
     def code(context, builder, signature, args):
         return builder.call(_vector_function(builder, "sqrt", 1), args, fastmath=_FAST)
@@ -234,7 +234,7 @@ def quarter_turn(typing_context, lanes):
 
 @intrinsic
 def positive(typing_context, lanes):
-    """max(x, 0) a lane."""
+    """max(x, 0) for each lane."""
 
     def code(context, builder, signature, args):
         return builder.call(_vector_function(builder, "maxnum", 2), [args[0], _constant(0.0)], fastmath=_FAST)
@@ -244,7 +244,7 @@ def positive(typing_context, lanes):
 
 @intrinsic
 def clamp(typing_context, lanes, low, high):
-    """min(max(x, low), high) a lane, with float32 bounds."""
+    """min(max(x, low), high) for each lane, with float32 bounds."""
 
     def code(context, builder, signature, args):
         value, low, high = args[0], _broadcast(builder, args[1]), _broadcast(builder, args[2])
@@ -256,7 +256,7 @@ def clamp(typing_context, lanes, low, high):
 
 @intrinsic
 def larger(typing_context, lanes, size):
-    """The lanes whose size exceeds `size`, a float32; zero in the others."""
+    """The lanes whose absolute value exceeds `size`, a float32; zero in the others."""
 
     def code(context, builder, signature, args):
         size = builder.call(_vector_function(builder, "fabs", 1), args[:1])
@@ -290,7 +290,8 @@ def total(typing_context, lanes):
 def _halve(builder: Any, x: tuple[Any, list[int]], y: tuple[Any, list[int]], width: int) -> tuple[Any, list[int]]:
     """Add the two halves of each group of 2 width lanes: x's sums go to the lower half, y's to the upper one.
 
-    With each vector goes a list that names, for each lane, the vector whose sum it holds; it gives the final positions.
+    Each vector has a list that names, for each lane, the vector whose sum it contains; the list gives the final
+    positions.
     """
     low, high, owners = [], [], []
     for base in range(0, WIDTH, 2 * width):
@@ -327,7 +328,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 @intrinsic
 def load_first(typing_context, array, row, col, count):
-    """array[row, col:col + count], then zeros; memory beyond is not read."""
+    """array[row, col:col + count], followed by zeros; memory beyond is not read."""
 
     def code(context, builder, signature, args):
         mask, pointer = _first(builder, args[3]), _VF.as_pointer()
@@ -356,9 +357,10 @@ def store_first(typing_context, array, row, col, lanes, count):
 
 @intrinsic
 def exp(typing_context, lanes):
-    """e^x a lane, to 2e-7 + 1.2e-7 |x| (relative); exponents are clamped to +-87, so no finite x gives inf or NaN.
+    """e^x for each lane, to 2e-7 + 1.2e-7 |x| (relative); exponents are clamped to +-87, so that it is finite.
 
-    x = (k + f) ln 2 with k whole and |f| <= 1/2; 2^f by a polynomial, 2^k by writing k into the exponent bits.
+    x = (k + f) ln 2 with k whole and |f| <= 1/2. 2^f comes from a polynomial, 2^k from writing k into the exponent
+    bits.
     """
 
     def code(context, builder, signature, args):

@@ -20,11 +20,12 @@ L1, L2, POISSON = range(3)
 
 
 class DataTerm(NamedTuple):
-    """Data term of a pixel x with target y; with the scale δ all three have a similar size where |x - y| is about δ.
+    """Data term of a pixel x with target y; with the scale δ all three have a similar size if |x - y| is about δ.
 
     L1: |x - y|.   L2: (x - y)² / 2δ.   POISSON: e^(-depth y) (x - y)² / 2δ, the second-order expansion of the
     likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). A y
-    below 0 (transmission above 1) gets the weight of y = 0: otherwise a few such pixels would outweigh all others.
+    below 0 (transmission above 1) gets the weight of y = 0, because otherwise a few such pixels would outweigh all
+    others.
     """
 
     kind: int
@@ -88,7 +89,7 @@ def _ssim_terms(
 ) -> None:  # fmt: skip
     """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself.
 
-    With weights the map is w SSIM; for None the kernel is compiled without them.
+    With weights the map is w SSIM; if they are None, the kernel is compiled without them.
     """
     one, two, k1, k2 = _f(1), _f(2), _f(c1), _f(c2)
     rows, width = image.shape
@@ -110,7 +111,7 @@ def _ssim_terms(
             for start in range(0, width, lanes.WIDTH):
                 first, fresh, high = _columns(start, cols, width)
                 mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
-                # Clamp differences of squares: rounding must not make them negative or break Cauchy-Schwarz.
+                # Clamp differences of squares, because rounding must not make them negative or violate Cauchy-Schwarz.
                 vx = lanes.clamp(_across(half, 1, first, window) - mx * mx, _f(0), _LARGEST)
                 vy = lanes.clamp(lanes.load(target_blurred[1], row, first) - my * my, _f(0), _LARGEST)
                 vxy = _across(half, 2, first, window) - mx * my
@@ -180,8 +181,8 @@ class CpuProjectionLoss:
     target's blurred maps do not change during a fit, so they are computed once per view.
 
     With weights w [row, col] >= 0 it is mean w (D(x, y) + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere.
-    For SSIM's windows a pixel of weight 0 counts as outside the image, and its gradient is exactly 0. The mean is over
-    all pixels, so that a ray has the same influence in a masked view as in a complete one.
+    In the windows of SSIM a pixel with weight 0 counts as outside the image, and its gradient is exactly 0. The mean is
+    over all pixels, so that a ray has the same influence in a masked projection as in a complete one.
     """
 
     def __init__(
@@ -195,7 +196,7 @@ class CpuProjectionLoss:
         rows, self._cols = shape
         self.ssim_weight, self.c1, self.c2, self.term = ssim_weight, c1, c2, term
         self.window = gaussian_window()
-        # The kernels take sixteen columns at a time: narrower images get columns of zeros to the right.
+        # The kernels process sixteen columns at a time, so narrower images get columns of zeros on the right.
         self._width = max(self._cols, lanes.WIDTH)
         self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
         self._partials = np.empty((3, rows, self._width), np.float32)

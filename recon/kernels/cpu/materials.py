@@ -20,21 +20,23 @@ from numba import njit, prange
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 BLUR = (0.40262, 0.244201, 0.0544886)
-"""Weights of a voxel, its next and its second neighbour along an axis: a Gaussian of one voxel, cut there."""
+"""Weights of a voxel, its first and its second neighbour along an axis: a Gaussian of one voxel, truncated there."""
 LEAST_OF_MATERIALS, LEAST_OF_EACH = 0.05, 0.01
-_BLOCK, _SHORTEST = 2**15, 8  # voxels of a block, about; lines of its sides, at least
+_BLOCK, _SHORTEST = 2**15, 8  # approximate number of voxels of a block; least number of lines of its sides
 _f = np.float32
 
 
 class MaterialTable(NamedTuple):
-    """What the kernel knows of K materials; row n of a table is of the value `first` + n / `scale`.
+    """Tables of K materials for the kernel; row n of a table is for the value `first` + n / `scale`.
 
     Attributes:
-        shares: [row, K], of each material in a voxel by its value alone; partial voxels count to both sides.
+        shares: [row, K], share of each material in a voxel from its value alone; partial voxels count for both
+            materials.
         likelihoods: [row, K], c.
-        levels, kept: [K], m, and the share of a voxel's difference from it that is the material's own.
+        levels, kept: [K], m, and the share of the difference of a voxel from m that is due to the spread of the
+            material.
         partial: [K - 1], d.
-        least, most: probability of partial voxels between two materials, within one and where both meet.
+        least, most: probability of partial voxels between two materials: inside one material, and where both meet.
     """
 
     shares: F32
@@ -50,7 +52,7 @@ class MaterialTable(NamedTuple):
 
 @njit(inline="always", fastmath=True)
 def _row(y, first, scale, rows):
-    """The row of a value, and how far it is on the way to the next one."""
+    """The row of a value, and the fraction of the way to the next row."""
     at = min(max((y - _f(first)) * _f(scale), _f(0)), _f(rows - 1.001))
     n = int(at)
     return n, at - _f(n)
@@ -69,7 +71,7 @@ def _blur(blur, p0, p1, p2, p3, p4, out):
 
 @njit(inline="always", fastmath=True)
 def _mean(y, f, share, shares, likelihoods, levels, kept, partial, first, scale, least, most):
-    """z of a value y, where neighbours have the shares f [K], and in `share` [K] the posterior of each material."""
+    """z of a value y whose neighbours have the shares f [K]; writes the posterior of each material to `share` [K]."""
     count = levels.size
     n, t = _row(y, first, scale, shares.shape[0])
     own, mass, moment = _f(1), _f(0), _f(0)
@@ -136,8 +138,8 @@ def posterior_mean(x: F32, table: MaterialTable, out: F32, probabilities: F32 | 
     """Replace `out` [a, b, c] by the posterior mean of each voxel of x, another array.
 
     Args:
-        probabilities: [K, a, b, c], replaced by the posterior probability of each material; what is missing to one is
-            that of a partial voxel. None: they are not wanted.
+        probabilities: [K, a, b, c], replaced by the posterior probability of each material; the rest up to one is the
+            probability of a partial voxel. None: they are not needed.
     """
     wide = max(_SHORTEST, min(x.shape[1], round((_BLOCK / x.shape[2]) ** 0.5)))
     tall = max(_SHORTEST, min(x.shape[0], _BLOCK // (x.shape[2] * wide)))

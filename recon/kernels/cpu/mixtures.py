@@ -1,4 +1,4 @@
-"""Densities of a few materials in each voxel, kept from falling below zero."""
+"""Keeps the densities of a few materials in each voxel at zero or above."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ def _nonnegative_mix(z: F32, back: F64, to: F64, gram: F64) -> None:
 
 
 def nonnegative_mix(z: F32, back: F64, to: F64) -> None:
-    """Replace components z [component, ...] by those of the densities clipped at 0, near them.
+    """Replace components z [component, ...] by nearby components whose densities are 0 or more.
 
-    A round of coordinate descent from max(D, 0) on |to (d - D)|², d >= 0, where D = back z. A density that was raised
-    to 0 lowers the others, so that the sum that the views see changes little. Voxels with D >= 0 keep their bits.
+    One round of coordinate descent from max(D, 0) on |to (d - D)|², d >= 0, where D = back z. If a density is raised to
+    0, the others become lower, so that the sum that projections see changes little. Voxels with D >= 0 do not change,
+    bit for bit.
 
     Args:
         back: [material, component], from components to densities.

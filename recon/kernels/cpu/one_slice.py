@@ -1,12 +1,13 @@
-"""Projector of one slice and its adjoint: Joseph's interpolation, sixteen lines of voxels as one (numba, threaded).
+"""Projector of one slice and its adjoint: Joseph's interpolation, sixteen lines of voxels at once (numba, threaded).
 
-The kernels of many slices handle sixteen slices as one; here fifteen of sixteen lanes would be idle. All rays lie in
-the plane of the slice: a parallel beam, or a fan. Slices are [y, x], projections [view, col]. A ray is sampled once in
-every line of voxels across its axis, as the table of `cpu.joseph` says.
+The kernels for many slices process sixteen slices at once; for one slice, fifteen of sixteen lanes would be idle. All
+rays lie in the plane of the slice: a parallel beam, or a fan. Slices are [y, x], projections [view, col]. A ray is
+sampled once in every line of voxels across its axis, as the table of `cpu.joseph` says.
 
-Sixteen neighbouring lines are a band. In a band, lines are moved by whole voxels so that rays of one direction stay
-upright, and are transposed: then the sixteen samples of a ray lie between four rows of the band. Rays of a fan form
-groups of about one direction. The transpose reads the same weights band by band: no two threads write to one voxel.
+Sixteen neighbouring lines form a band. In a band, lines are shifted by whole voxels so that rays of one direction are
+upright, and then transposed. The sixteen samples of a ray are then between four rows of the band. Rays of a fan form
+groups with about the same direction. The transpose reads the same weights band by band, so that no two threads write to
+the same voxel.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from recon.kernels.cpu.joseph import F64, Flags, calls
 
 _f = np.float32
 _BAND = lanes.WIDTH
-_ALIKE = 1 / 16  # voxels a line: rays of a group differ by less, so that in a band they stay within a voxel
+_ALIKE = 1 / 16  # voxels per line; rays of a group differ by less, so that they stay within one voxel in a band
 _BEFORE, _BEHIND = 2 * _BAND, 4 * _BAND  # zeros around a line
 
 
@@ -61,7 +62,7 @@ def _crossing(rays, v, first, end, j, n):
 
 @njit(inline="always")
 def _lean(rays, v, first, end, shifts, offsets):
-    """By how many voxels each line of a band is moved for this group of rays."""
+    """Number of voxels by which each line of a band is shifted for this group of rays."""
     step = (rays[v, first, 1] + rays[v, end - 1, 1]) / 2
     for i in range(_BAND):
         shifts[i] = round(step * i)
@@ -70,9 +71,10 @@ def _lean(rays, v, first, end, shifts, offsets):
 
 @njit(inline="always")
 def _row(rays, v, col, j):
-    """The first of the four rows that a ray runs between, and how far behind it lies in line j, for the first lane.
+    """The first of the four rows between which a ray runs, and the distance of the ray from it in line j, for the first
+    lane.
 
-    Where a ray meets a voxel exactly, calls may be compiled to round differently, and rows then differ by one.
+    If a ray meets a voxel exactly, compiled calls may round differently, and rows then differ by one.
     """
     at = rays[v, col, 0] + rays[v, col, 1] * j
     row = math.floor(at - 1.0)

@@ -1,12 +1,12 @@
-"""Patches on the CPU: all 4 x 4 x 4 blocks of a volume without small cosine coefficients, averaged (numba, threaded).
+"""Patches on the CPU: the mean of all 4 x 4 x 4 blocks of a volume without small cosine coefficients (numba, threaded).
 
     D(x) = 1/64 Σ Rᵀ T⁻¹ H(T R x)        R: a block, T: its orthonormal cosine transform, H: keeps |c| > threshold, c₀
 
 over all blocks that overlap the volume, which is mirrored at its faces. The transform of a plane of a block serves the
 four blocks that share this plane, and their inverse transforms are added before that of the plane.
 
-A volume is [a, b, c]; blocks are 4 x 4 x 1 where it has fewer than four voxels along c. Sixteen neighbouring blocks of
-a plane [b c] are one vector. Those that run over the end of a line along c are computed, and count nothing.
+A volume is [a, b, c]; blocks are 4 x 4 x 1 if it has fewer than four voxels along c. Sixteen neighbouring blocks of a
+plane [b c] are one vector. Blocks beyond the end of a line along c are computed with weight 0.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ EDGE = 4
 """Voxels of a block along an axis."""
 
 _f = np.float32
-_BEYOND = EDGE - 1  # voxels beyond a face that blocks reach
+_BEYOND = EDGE - 1  # number of voxels that blocks reach beyond a face
 _HALF, _LONG, _SHORT = _f(0.5), _f(math.cos(math.pi / 8) / math.sqrt(2)), _f(math.sin(math.pi / 8) / math.sqrt(2))
-_TASKS, _LEAST, _MOST = 32, 4, 32  # tasks, about; planes of one
+_TASKS, _LEAST, _MOST = 32, 4, 32  # approximate number of tasks; planes of one task
 
 
 class PatchScratch(NamedTuple):
-    """The volume beyond its faces, and sums of blocks; see `patch_scratch`.
+    """Memory for the volume extended beyond its faces, and for sums of blocks; see `patch_scratch`.
 
     Attributes:
         given, sums: [a + 6, plane], planes of (b + 6) lines and room for the last vector.
-        share: [1, plane], what a block at each place counts: 1 / 64 (1 / 16 of a flat one), or 0.
+        share: [1, plane], weight of a block at each position: 1 / 64 (1 / 16 for a flat block), or 0.
     """
 
     given: F32
@@ -119,7 +119,7 @@ def _column(given, out, share, first, end, at, line, depth, threshold, found, su
         if depth > 1:
             for j in range(EDGE):
                 _values(sums, slot + j * depth, 1)
-        # The last voxel of a block first: a voxel then sums its blocks in one order, wherever a vector begins.
+        # The last voxel of a block first, so that a voxel sums its blocks in the same order wherever a vector begins.
         for j in range(EDGE - 1, -1, -1):
             for k in range(depth - 1, -1, -1):
                 to, row = at + j * line + k, slot + j * depth + k
@@ -191,14 +191,14 @@ def patch_scratch(shape: tuple[int, int, int]) -> PatchScratch:
 
 
 def scratch_values(shape: tuple[int, int, int]) -> int:
-    """Numbers that `patch_scratch` holds."""
+    """Number of values in `patch_scratch`."""
     na, nb, nc = shape
     line = nc + 2 * _depth(nc)[1]
     return (2 * (na + 2 * _BEYOND) + 1) * (_whole((nb + _BEYOND) * line) + _BEYOND * line + 16)
 
 
 def _depth(nc: int) -> tuple[int, int]:
-    """Voxels of a block along c, and beyond the faces."""
+    """Number of voxels of a block along c, and beyond the faces."""
     return (EDGE, _BEYOND) if nc >= EDGE else (1, 0)
 
 
@@ -209,11 +209,12 @@ def _whole(values: int) -> int:
 def denoise(x: F32, threshold: float, nonnegative: bool, scratch: PatchScratch, out: F32) -> None:
     """out = D(x), at least 0 with `nonnegative`; `out` may be `x`.
 
-    The same bits for any number of threads.
+    The result is bit-identical for any number of threads.
 
     Args:
         x: [a, b, c].
-        threshold: of coefficients, in the unit of x; white noise of deviation σ has coefficients of deviation σ.
+        threshold: threshold for coefficients, in the unit of x; white noise with standard deviation σ has coefficients
+            with standard deviation σ.
     """
     na, nb, nc = x.shape
     depth, beyond = _depth(nc)

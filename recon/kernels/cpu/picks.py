@@ -1,8 +1,8 @@
-"""picks: sixteen numbers out of a line of an array, each lane at a place of its own.
+"""picks: reads sixteen numbers from a line of an array, each lane at its own position.
 
-Lanes pick from a window, neighbours twice as many as lanes. With AVX-512 sixteen lanes share one, and a pick is one
-instruction. With AVX2 eight lanes do: their window begins where the first of them picks. Elsewhere numbers are read one
-by one.
+Lanes pick from a window with twice as many neighbours as lanes. With AVX-512, sixteen lanes share a window, and a pick
+is one instruction. With AVX2, eight lanes share a window, which begins where the first lane picks. On other processors,
+numbers are read one by one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 from recon.kernels.cpu.lanes import LANES, WIDTH
 
 NEAR_STEP = 1 - 1e-5
-"""The longest step from lane to lane at which eight lanes, rounding included, pick from eight neighbours."""
+"""The largest step from lane to lane with which eight lanes, including rounding, pick from eight neighbours."""
 
 _F32, _I32 = ir.FloatType(), ir.IntType(32)
 _VF, _VI = ir.VectorType(_F32, WIDTH), ir.VectorType(_I32, WIDTH)
@@ -27,7 +27,7 @@ _LAST = 2 * WIDTH - 1  # as a mask of bits
 _FAST = ("fast",)
 
 Loader = Callable[[Any, Any], Any]
-"""Emits a load of the neighbours from an offset (LLVM's i64) on, as a vector of a given type."""
+"""Function that emits a load of the neighbours from an offset (LLVM's i64) on, as a vector of a given type."""
 
 
 def _integers(value: int, kind: Any = _VI) -> Any:
@@ -73,7 +73,7 @@ def _pick_eight(builder: Any, numbers: Loader, at: Any, further: Any, first: int
     """Eight lanes from `first` on by AVX2: from eight neighbours, or from one of two eights."""
     places, start = builder.shuffle_vector(at, at, ir.Constant(_HI, list(range(first, first + _HALF)))), further
     if first:
-        # The window lies within 32 neighbours from `further` on, also where lanes that nobody wants begin elsewhere.
+        # The window is within 32 neighbours from `further` on, also if lanes that are not needed begin elsewhere.
         begin = builder.extract_element(places, ir.Constant(_I32, 0))
         for symbol, bound in (("<", 0), (">", WIDTH)):
             begin = builder.select(builder.icmp_signed(symbol, begin, _I32(bound)), _I32(bound), begin)
@@ -106,7 +106,7 @@ def _line(context: Any, builder: Any, kind: Any, array: Any, row: Any, col: Any)
 
 @intrinsic
 def lanes_per_window(typing_context):
-    """Lanes that pick from one window: eight by AVX2, sixteen elsewhere."""
+    """Number of lanes that pick from one window: eight with AVX2, otherwise sixteen."""
 
     def code(context, builder, signature, args):
         return ir.IntType(64)(_lanes_per_window(context))
@@ -173,12 +173,13 @@ def _bilinear(near: bool) -> Any:
 pick, pick_near = _pick(False), _pick(True)
 """pick(array, row, col, at, further): array[row, col + whole(at) + further], lane by lane.
 
-Of lanes that are wanted, whole(at) is 0 or more, and with `further` less than 32; by AVX2 less than 16 from the first
-lane of each eight. Others get some number of the window. `array` is float32, contiguous in the last axis, and is read
-up to col + 32 + further. `pick_near` is for lanes that step by at most NEAR_STEP.
+For lanes that are needed, whole(at) must be 0 or more, and with `further` less than 32; with AVX2 less than 16 from the
+first lane of each eight. Other lanes get any number of the window. `array` is float32, contiguous in the last axis, and
+is read up to col + 32 + further. `pick_near` is for lanes that step by at most NEAR_STEP.
 """
 bilinear, bilinear_near = _bilinear(False), _bilinear(True)
-"""bilinear(array, row, other, share, col, at): the array at col + at, between two rows by the other one's share.
+"""bilinear(array, row, other, share, col, at): the array at col + at, interpolated between two rows with the share of
+the other row.
 
 It picks at `at` and at one column further, as `pick` does. `bilinear_near` is for lanes that step by at most NEAR_STEP.
 """

@@ -1,10 +1,10 @@
-"""Projector of rolled and tilted views and its adjoint: Joseph's interpolation along every ray (numba, threaded).
+"""Projector of rolled and tilted projections, and its adjoint: Joseph's interpolation for every ray (numba, threaded).
 
-With roll, tilt or centres the rays to one column share no plane: each has weights of its own. A ray is sampled once in
-every plane of voxels across one axis: the axis closest to the ray at the middle of its column. In a plane, voxel
-coordinates are ratios of linear functions of the row, so a short table for each column serves all its rays. Volumes are
-[y, x, z], projections [view, col, row]. The transpose reads the same weights and runs plane by plane: no two threads
-write to one voxel.
+With roll, tilt or centres, the rays to one column are not in one plane, so each ray has its own weights. A ray is
+sampled once in every plane of voxels across one axis: the axis closest to the ray at the middle of its column. In a
+plane, voxel coordinates are ratios of linear functions of the row, so a short table for each column serves all its
+rays. Volumes are [y, x, z], projections [view, col, row]. The transpose reads the same weights and runs plane by plane,
+so that no two threads write to the same voxel.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from recon.kernels.cpu.joseph import F64, calls
 
 _f = np.float32
 _COLS = 16  # columns of one job
-_FLAT = 1e-15  # voxels a row: such a line of samples stays at its place
-_LEAST = 0.05  # of the run across the planes in a column's middle, anywhere in that column
+_FLAT = 1e-15  # voxels per row; with a smaller step, a line of samples stays at its position
+_LEAST = 0.05  # least share of the run across the planes, relative to that in the middle of a column
 
 Axes = NDArray[np.int8]
 
@@ -36,7 +36,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     one t4 to t7 say the same. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
 
     Raises:
-        ValueError: if rays of one column differ so much that they share no planes.
+        ValueError: rays of one column differ so much that they do not cross the same planes.
     """
     views, (rows, cols) = geometry.n_views, geometry.detector_shape
     axes = np.stack([geometry.axes(view) for view in range(views)])
@@ -67,8 +67,8 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     last = 1 + narrow * (rows - 1)
     if (np.minimum(last, 1) < _LEAST * (1 + last) / 2).any():
         raise ValueError(
-            "rays of one detector column differ in direction by almost a right angle: views that lean this far need "
-            "a narrower cone or fewer rows"
+            "use a narrower cone or fewer rows: with this tilt, rays of one detector column differ in direction by "
+            "almost a right angle"
         )
     table = np.empty((views, cols, 12))
     for part, axis in ((0, np.where(across == 2, 1, np.where(across == 1, 2, 1))), (4, np.where(across == 0, 2, 0))):
@@ -101,7 +101,7 @@ def _crossed(n0, n1, narrow, low, high, first, end):
 
 @njit(inline="always", error_model="numpy")
 def _rows(t, j, n_b, n_c, rows):
-    """Rows first..end (excluded) of a column whose samples in plane j lie less than one voxel outside it."""
+    """Rows first..end (excluded) of a column whose samples in plane j are less than one voxel outside the plane."""
     b0, b1, c0, c1 = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j
     first, end = _crossed(b0, b1, t[8], -1.0, n_b, 0.0, rows * 1.0)
     first, end = _crossed(c0, c1, t[8], -1.0, n_c, first, end)
@@ -124,7 +124,7 @@ def _samples(t, j, row0, row1, n_b, n_c, of_b, of_c, at, low_b, high_b, low_c, h
     """The samples of rows row0..row1 (excluded) of a column in plane j, as arrays from row0 on.
 
     at: the first of four voxels. low, high: weights of the lower and the upper line, and of their voxels. A line beyond
-    the last one has weight 0, so a sample outside the outermost lines stays on these.
+    the last one has weight 0, so samples outside the outermost lines use only these.
     """
     b0, b1, c0, c1, narrow = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j, t[8]
     last_b, last_c = max(n_b - 2, 0), max(n_c - 2, 0)
@@ -142,7 +142,7 @@ def _samples(t, j, row0, row1, n_b, n_c, of_b, of_c, at, low_b, high_b, low_c, h
 
 @njit(**OPTIONS)
 def _forward(voxels: F32, shape: tuple[int, int, int], rays: F64, axes: Axes, start: int, end: int, out: F32) -> None:
-    """Jobs start to end, of as many as there are views times blocks of columns."""
+    """Jobs start to end; there is one job for each projection and block of columns."""
     _, cols, rows = out.shape
     blocks = (cols + _COLS - 1) // _COLS
     for job in prange(start, end):

@@ -3,9 +3,9 @@
     pixel = Σ_i W_i G_i,   G = exp(E),   E = -1/2 δᵀ K δ = k τ² + l δv²,   τ = δu - r δv
     M₀ = Σ g G,   M₁ = Σ g D ε,   M₂ = Σ g D εεᵀ,   ε = (τ, δv),   D = ∂G / ∂E, which is G itself for a Gaussian
 
-with δ the offset in pixels and g the gradient of the image: every Gaussian gathers its own gradient, without atomics. τ
-is the offset along a row from the axis of a slanted footprint. In moments of δ itself the thin side of a needle would
-be a small difference of large sums.
+with δ the offset in pixels and g the gradient of the image. Every Gaussian gathers its own gradient, without atomics. τ
+is the offset along a row from the axis of a slanted footprint. With moments of δ itself, the thin side of a needle
+would be a small difference of large sums.
 
 E is a parabola along a column, so G follows from the row above by two products, with factors that are the exponentials
 of E's first and second difference:
@@ -14,15 +14,15 @@ of E's first and second difference:
     Q(δv + 1) = Q(δv) q,       ln q = 2 (k r² + l)
 
 Errors grow with the rows, so G is computed directly after every `ANCHOR` rows. A long slanted footprint may start so
-far down its flank that float32 underflows: where the first row would begin below exp(-DEEPEST), every pixel within the
-footprint gets an exponential of its own.
+far down its flank that float32 underflows. If the first row would begin below exp(-DEEPEST), the exponential is
+computed for every pixel of the footprint.
 
 A compact kernel (`recon.base.kernel`) has G = t^p with t = (1 + 2 E / R²)₊ and D = 2 p / R² t^(p - 1): p = 2 in an
 image, p = 3/2 in a slice of voxels. It needs no exponential: t follows from the row above by two sums.
 
-Images are summed over threads in a fixed order: the result is equal to the bit for the same number of threads, and
-equal up to rounding for another. Each thread sums in two levels, `MANY` footprints and then these sums. Adding equal
-float32 numbers one by one loses a part that grows with their number (half a percent for a million).
+Images are summed over threads in a fixed order, so that the result is bit-identical for the same number of threads, and
+equal up to rounding for another number. Each thread sums in two levels: first `MANY` footprints, then these sums.
+(Adding equal float32 numbers one by one loses a part that grows with their number, half a percent for a million.)
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from recon.kernels.cpu.boxes import GROUP, box_of, is_upright, padded, padded_sh
 from recon.kernels.cpu.footprints import KV, SHEAR, K, U, V, W
 
 _f = np.float32
-ANCHOR = 16  # rows of one recurrence; its error stays below 1e-5 of the footprint's weight
+ANCHOR = 16  # rows of one recurrence; the error stays below 1e-5 of the footprint's weight
 MANY = 512  # footprints in one sum
 # What a footprint is made of, a constant of each compiled kernel: exp(-q/2); of a compact kernel its image, t², or the
 # kernel itself, t^(3/2). None, as numba leaves out what `is None` excludes before it compiles the rest.
@@ -91,7 +91,7 @@ def _at(table, i, first, dy, profile):
 
 @njit(fastmath=True, error_model="numpy")
 def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):
-    """Add footprint i to the image, each pixel by itself."""
+    """Add footprint i to the image, computing each pixel separately."""
     for row in range(row0, row1):
         dy = _f(row) - table[i, V]
         low, high = span_of(table, i, dy, col0, col1)
@@ -117,7 +117,7 @@ def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):
 
 @njit(fastmath=True, error_model="numpy")
 def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profile):
-    """Moments of the gradient under footprint i, each pixel by itself."""
+    """Moments of the gradient under footprint i, computing each pixel separately."""
     m0, d0, mt, mv = lanes.zero(), lanes.zero(), lanes.zero(), lanes.zero()
     mtt, mtv, mvv = lanes.zero(), lanes.zero(), lanes.zero()
     for row in range(row0, row1):
@@ -238,13 +238,13 @@ def gather_footprint(table, i, rows, cols, gradient, moments, profile):
                 g0, s0, s1, s2 = _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient)
             else:
                 g0, s0, s1, s2 = _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profile)
-            # `is_upright` limits the slant, so that these differences lose three digits at most.
+            # `is_upright` limits the slant, so that these differences lose at most three digits.
             t0, t1 = dx * s0 - shear * s1, dx * s1 - shear * s2
             m0, d0, mt, mv = m0 + g0, d0 + s0, mt + t0, mv + s1
             mtt, mtv, mvv = mtt + (dx * t0 - shear * t1), mtv + t1, mvv + s2
         _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile)
     else:
-        # One type of the number, whatever that of the loop is: each would be compiled.
+        # One type for the number, independent of the loop, because each type would be compiled separately.
         _gather_by_pixels(table, np.int64(i), row0, row1, col0, col1, gradient, moments, profile)
 
 
@@ -257,7 +257,7 @@ def _join(fresh, image, row0, row1):
             fresh[row, col] = _f(0)
 
 
-# The profile is a constant of the compiled kernels, so that a Gaussian pays nothing for the others.
+# The profile is a constant of the compiled kernels, so that the other profiles cost a Gaussian nothing.
 def _renderer(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, rows: int, cols: int, layers: F32) -> None:
@@ -304,7 +304,7 @@ def _sum_layers(layers: F32, image: F32) -> None:
 
 
 def render_layers(rows: int, cols: int) -> F32:
-    """Scratch of two images a thread, [2 thread, row, col]; it can be reused for any number of renderings."""
+    """Scratch memory of two images per thread, [2 thread, row, col]; it can be reused for any number of renderings."""
     return np.empty((2 * get_num_threads(), *padded_shape(rows, cols)), np.float32)
 
 

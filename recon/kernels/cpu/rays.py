@@ -4,20 +4,20 @@ With H = S⁻¹Rᵀ, t from the source to the centre and D along the ray of a pi
 
     V = ρ sqrt(2π) |D| / |H D| exp(-1/2 |H t x H D|² / |H D|²)
 
-Measured in the offset δ of the pixel from the centre's, that is the affine footprint with three numbers more. Taken to
-the depth of the centre, H D = e + y with e = H t and y linear in δ. The part of y across e is what the footprint's
+As a function of the offset δ of the pixel from that of the centre, it is the affine footprint with three more numbers.
+At the depth of the centre, H D = e + y with e = H t and y linear in δ. The part of y across e is what the footprint's
 quadratic form N = δᵀKδ measures, its part along e is α·δ. So
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   η = 1 / |e|²,   α = η (e·Hu, e·Hv) tz / f
 
-with W, K from `cpu.footprints`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All are sums of
-squares, which are accurate also for thin Gaussians. Rays with N / Q <= c² pass within c standard deviations; they fill
-an ellipse, which limits the columns of each row. Where the Gaussian reaches the plane of the source, whole rows are
-computed.
+with W, K from `cpu.footprints`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All of these are
+sums of squares, which are also accurate for thin Gaussians. Rays with N / Q <= c² pass within c standard deviations.
+They fill an ellipse, which limits the columns of each row. If the Gaussian reaches the plane of the source, whole rows
+are computed.
 
 A compact kernel has (1 - N / (R² Q))₊² in place of the exponential and ends at c² = R².
 
-The integral is over the whole line, also behind the source: a Gaussian must not reach the source.
+The integral is over the whole line, also behind the source, so a Gaussian must not reach the source.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from recon.kernels.cpu.footprints import (
 
 F64 = NDArray[np.float64]
 _f = np.float32
-_BAND = 8  # rows a task: no two tasks write to one pixel
+_BAND = 8  # rows per task; no two tasks write to the same pixel
 # Columns of the terms: α, η, W |f / D₀|, the truncation c² and the box that it fills.
 AU, AV, ETA, WEIGHT, CUT, ROW0, ROW1, COL0, COL1 = range(9)
 _PER = np.float32(1 / Kernel.COMPACT.radius**2)
@@ -100,7 +100,7 @@ def _terms(
         for k in range(9):
             terms[i, k] = 0.0
         broadest = max(scales[i, 0], max(scales[i, 1], scales[i, 2]))
-        most = densities[i] * unit * broadest  # of any ray
+        most = densities[i] * unit * broadest  # the largest value on any ray
         if table[i, HU] < 0.0 or most <= faint:
             continue
         tx = ty = 0.0
@@ -324,7 +324,7 @@ class CpuRays:
         cut: float,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:
-        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them.
+        """Gaussians are cut off at `cut` standard deviations, and left out if no ray gets more than `faint` from them.
 
         `parameters` are means [n, 3], standard deviations [n, 3], rotations [n, 9] and densities [n].
         """

@@ -1,6 +1,6 @@
 """Slopes: a volume under a window along each axis, and the length of its gradient at some voxels (numba, threaded).
 
-scipy's filters run in one thread, and a gradient of their kind passes a volume nine times.
+scipy's filters use one thread, and such a gradient would need nine passes over the volume.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ _f = np.float32
 
 @njit(**OPTIONS)
 def windowed(x: F32, window: F32, out: F32) -> None:
-    """out = x [z, y, x] under the window along each axis; beyond a face the values at the face go on."""
+    """out = x [z, y, x] averaged with the window along each axis.
+
+    Beyond a face, the values at the face are repeated.
+    """
     nz, ny, nx = x.shape
     r = window.size // 2
     for k in prange(nz):
@@ -46,9 +49,10 @@ def windowed(x: F32, window: F32, out: F32) -> None:
 
 @njit(**OPTIONS)
 def slopes_at(x: F32, voxels: I64, out: F32) -> None:
-    """out [n] = half the length of the differences of both neighbours of these voxels of x, by their flat numbers.
+    """out [n] = half the length of the differences between both neighbours, for the voxels of x with these flat
+    indices.
 
-    At a face the voxel is its own neighbour beyond.
+    At a face, the voxel itself is the neighbour on the other side.
     """
     nz, ny, nx = x.shape
     for n in prange(voxels.size):

@@ -1,4 +1,4 @@
-"""spread: what a pixel takes from its neighbours along columns and rows; its own transpose (numba, threaded)."""
+"""spread: blurs or sharpens projections along columns and rows; it is its own transpose (numba, threaded)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
-_MOST = 0.4  # px² of one pass: beyond 0.5 the finest detail would change its sign
+_MOST = 0.4  # px² of one pass; above 0.5 the finest detail would change its sign
 
 
 @njit(**OPTIONS)
@@ -35,15 +35,15 @@ def _pass(lines: F32, shares: F32, out: F32) -> None:
 
 
 def passes_of(*variances: NDArray[np.float64]) -> int:
-    """Passes that `spread` makes for these variances; each keeps 1 - variance / passes (1 - cos 2πf) at f."""
+    """Number of passes of `spread` for these variances. Each pass keeps 1 - variance / passes (1 - cos 2πf) at f."""
     return math.ceil(max(float(np.abs(each).max()) for each in variances) / _MOST)
 
 
 def spread(lines: F32, along_cols: NDArray[np.float64], along_rows: NDArray[np.float64]) -> F32:
-    """The lines [view, col, row] after passes of three neighbours each, of these variances [view] in px².
+    """The lines [view, col, row] after passes over three neighbours, with these variances [view] in px².
 
-    A variance below zero takes so much away: views become sharper, by 1 - variance (1 - cos 2πf) at f cycles a pixel.
-    A pixel at the edge takes from itself what lies beyond. The matrix is symmetric.
+    A variance below zero sharpens the projections by 1 - variance (1 - cos 2πf) at f cycles per pixel. Beyond an edge,
+    the pixel at the edge is repeated. The matrix is symmetric.
     """
     passes = passes_of(along_cols, along_rows)
     if passes == 0:

@@ -2,8 +2,8 @@
 
     (Tᵀ x)[a, b] = Σ w(y, a) w(x, b) x[y, x],    T c = the linear interpolation of c between the centres of cells
 
-w is a tent about the centre of a cell, as wide as two cells. The outer half of the outer cells belongs to them alone,
-so that the weights of a voxel add up to one. Lines along z stay as they are.
+w is a tent (a triangular weight) about the centre of a cell, as wide as two cells. The outer half of the outer cells
+belongs only to these cells, so that the weights of a voxel add up to one. Lines along z are not changed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def cells_of(n: int, width: int) -> int:
 
 
 def tents(n: int, width: int) -> tuple[NDArray[np.int64], F32]:
-    """[n] the first of the two neighbouring cells whose tents reach a voxel, and the weight of the second."""
+    """For each voxel [n], the first of the two cells whose tents reach it, and the weight of the second."""
     last = cells_of(n, width) - 1
     place = np.clip((np.arange(n) + 0.5) / width - 0.5, 0, last)
     first = np.minimum(place.astype(np.int64), max(last - 1, 0))
@@ -85,13 +85,14 @@ def add_tents(x: F32, factor: float, cells: F32, width: int) -> None:
 
 
 def spectrum_of_tents(cycles: NDArray[np.float64], n: int, width: int) -> NDArray[np.float64]:
-    """What T Tᵀ / width leaves of a wave along one axis, but for aliases; `cycles`: along n voxels, up to half of n.
+    """Transfer function of T Tᵀ / width for a wave along one axis, without aliases; `cycles` along n voxels <= n / 2.
 
-    A tent is the sum of `width` voxels, twice, so that each of T and Tᵀ takes the square of Dirichlet's kernel.
+    A tent is a sum over `width` voxels, applied twice, so that T and Tᵀ each contribute the square of Dirichlet's
+    kernel.
     """
     return np.asarray((np.sinc(cycles * width / n) / np.sinc(cycles / n)) ** 4)
 
 
 def least_width(n: int, most: int) -> int:
-    """Voxels of a cell so that n voxels have at most so many cells."""
+    """Width of a cell in voxels, so that n voxels have at most `most` cells."""
     return max(1, math.ceil(n / most))

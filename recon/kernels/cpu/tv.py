@@ -2,8 +2,8 @@
 
     TV(x) = Σ |D x|,   (D x)_a = w_a (x[i + 1] - x[i]) along axis a, zero at the end;   w: for voxels that are not cubes
 
-Volumes are [a, b, c], dual fields three of them. Each thread takes a run of planes and keeps two of them in its cache,
-so a step reads and writes every array once.
+Volumes are [a, b, c]; a dual field has three of them. Each thread processes a run of planes and keeps two of them in
+its cache, so that a step reads and writes every array once.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
 _NO_FLOOR = -3.0e38
-_FASTEST = 1e15  # pace: squares of the dual fields stay within float32, and one step saturates any difference
-_APART = 17 * 16  # values: 17 lines of the cache
-_PIECE = 512  # voxels of one loop, about
+_FASTEST = 1e15  # largest pace; squares of the dual fields stay within float32, and one step saturates any difference
+_APART = 17 * 16  # values, 17 cache lines
+_PIECE = 512  # approximate number of voxels of one loop
 Weights = tuple[float, float, float]
 DualField = tuple[F32, F32, F32]
 
 
 class DualScratch(NamedTuple):
-    """Planes of the primal point, for each run of planes that one thread makes.
+    """Planes of the primal point, for each run of planes that one thread processes.
 
     Attributes:
-        plane: [run, b c + 1], the first one. The value beyond the last voxel is read, times 0, and must be finite.
-        planes: [run, 2, b c + 1], this one and the next.
+        plane: [run, b c + 1], the first plane. The value after the last voxel is read and multiplied by 0, so it must
+            be finite.
+        planes: [run, 2, b c + 1], the present plane and the next one.
         zero: [b c], the differences before the first plane.
     """
 
@@ -40,8 +41,9 @@ class DualScratch(NamedTuple):
     zero: F32
 
 
-# The kernels see planes [b c], in pieces of some rows: of rows of sixteen voxels, what goes before a loop takes longer
-# than the loop. Fields must be zero where there is no difference: in the last plane of pa, row of pb and column of pc.
+# The kernels process planes [b c] in pieces of several rows, because for rows of sixteen voxels, the start of a loop
+# takes longer than the loop. Fields must be zero where there is no difference: in the last plane of pa, row of pb and
+# column of pc.
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
@@ -141,7 +143,7 @@ def _primal(
 
 
 def dual_pace(threshold: float, weights: Weights) -> float:
-    """The length of a dual step: 0.75 of the longest one that converges by itself, see `dual_step`."""
+    """The length of a dual step: 0.75 of the longest step that converges by itself, see `dual_step`."""
     return min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
 
 
@@ -152,13 +154,13 @@ def dual_step(
     """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
-    2009, eq. 4.6), at 0.75 of the longest step that converges by itself. Nearer to the longest, the sign of the finest
+    2009, eq. 4.6), at 0.75 of the longest step that converges by itself. With longer steps, the sign of the finest
     differences alternates from step to step, and an outer iteration with momentum amplifies them.
 
     Args:
         scratch: see `dual_scratch`.
-        back: of the first two axes: 1 where |p| of a voxel takes the difference from the voxel before, 0 where it
-            takes the one to the next. It is total variation as a mirror image sees it.
+        back: for the first two axes, 1: |p| of a voxel uses the difference from the previous voxel; 0: the difference
+            to the next voxel. This is total variation in a mirror image.
     """
     pace = dual_pace(threshold, weights)
     floor = 0.0 if nonnegative else _NO_FLOOR
@@ -179,10 +181,10 @@ def _in_planes(*arrays: F32) -> list[F32]:
 
 
 def dual_field(shape: tuple[int, int, int]) -> DualField:
-    """Zeros [a, b, c] for the differences along each axis: at i, that from i to i + 1.
+    """Zeros [a, b, c] for the differences along each axis; element i is the difference from i to i + 1.
 
-    Each begins some cache lines later than a multiple of its size. Fields a power of two apart share one set of the
-    cache: a step of 1024 x 1024 x 64 voxels took three times as long.
+    Each array begins some cache lines after a multiple of its size. Fields at a distance of a power of two would share
+    one set of the cache, and a step of 1024 x 1024 x 64 voxels would take three times as long.
     """
     size = math.prod(shape)
     room = np.zeros(3 * (size + _APART), np.float32)
@@ -193,8 +195,8 @@ def dual_field(shape: tuple[int, int, int]) -> DualField:
 def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     """Scratch for `dual_step` and `primal`.
 
-    Arrays of their own, without gaps: from parts of one the compiler makes code that gathers single numbers. That takes
-    three times as long.
+    They are separate arrays without gaps. For parts of one array, the compiler would make code that gathers single
+    numbers, which takes three times as long.
     """
     runs, (_, b, c) = _runs(shape), shape
     shapes = (runs, b * c + 1), (runs, 2, b * c + 1), (b * c,)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
-_RUN = 4096  # values summed in float32 before they join the float64 sum
-_PARTS = 64  # of a sum; not the number of threads, so that results do not depend on it
+_RUN = 4096  # values that are summed in float32 before they are added to the float64 sum
+_PARTS = 64  # parts of a sum; independent of the number of threads, so that results are, too
 
 
 @njit(**OPTIONS)
@@ -74,7 +74,7 @@ def _replace_by_residual(data: F32, model: F32, weight: F32, scale: F32, sums: N
         total = np.float64(0)
         end = (part + 1) * data.size // parts
         for start in range(part * data.size // parts, end, _RUN):
-            some = slice(start, min(start + _RUN, end))  # of slices the compiler makes vectors
+            some = slice(start, min(start + _RUN, end))  # the compiler vectorises slices
             p, q, run = data[some], model[some], _f(0)
             w, s = weight[some] if weight.size else p, scale[some] if scale.size else p
             for i in range(p.size):
@@ -111,7 +111,7 @@ def _turn_of_steps(before: F32, start: F32, end: F32, sums: NDArray[np.float64])
 
 
 def turn_of_steps(before: F32, start: F32, end: F32) -> float:
-    """<start - end, end - before>: above zero where the step from `start` to `end` points back to `before`."""
+    """<start - end, end - before>: above zero if the step from `start` to `end` points back to `before`."""
     sums = np.empty(_PARTS)
     _turn_of_steps(before.reshape(-1), start.reshape(-1), end.reshape(-1), sums)
     return float(sums.sum())

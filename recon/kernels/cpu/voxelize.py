@@ -1,4 +1,4 @@
-"""Voxelisation of Gaussians on the CPU, slice by slice: a slice of a Gaussian is a footprint (numba, threaded).
+"""Voxelisation of Gaussians on the CPU, slice by slice, because a slice of a Gaussian is a footprint (numba, threaded).
 
 With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squares without any subtraction of them:
 
@@ -38,9 +38,9 @@ from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, add_shap
 from recon.kernels.cpu.project import COMPACT, GAUSSIAN, add_footprint, gather_footprint
 
 _f = np.float32
-_SLAB = 4  # slices a task: few enough to give all threads work on a 32-voxel cube, enough to keep rows in the cache
-_TASK = 1024  # Gaussians a task of the search
-_SHARE = 16  # Gaussians a task of the backward pass
+_SLAB = 4  # slices per task: few enough that all threads have work on a 32-voxel cube, enough to keep rows in the cache
+_TASK = 1024  # Gaussians per task of the search
+_SHARE = 16  # Gaussians per task of the backward pass
 # Columns of the table, besides K, SHEAR and KV of the footprints. They are centre, shift of the centre per slice, 1 /
 # Σzz, half widths of the middle slice over the reach, reach in standard deviations.
 _X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
@@ -65,7 +65,7 @@ def _near(
             reach = _f(cut) * max(scales[i, 0], scales[i, 1], scales[i, 2])
             x, y, z = means[i, 0], means[i, 1], means[i, 2]
             across = (x + reach >= x0) & (x - reach <= x1) & (y + reach >= y0) & (y - reach <= y1)
-            found[k] = i  # overwritten by the next Gaussian if this one is outside: no branch
+            found[k] = i  # the next Gaussian overwrites this entry if this one is outside, so no branch is needed
             k += across & (z + reach >= z0) & (z - reach <= z1)
         counts[task] = k - begin
 
@@ -88,7 +88,7 @@ def _place(
 ) -> None:
     """Fill table [k, 12] and slices [k, 2] (first, last + 1; 0, 0 outside the grid) of the Gaussians `near`.
 
-    With `ends` a kernel ends at `cut` by itself, however dense it is.
+    With `ends`, a kernel ends at `cut` by itself for any density.
     """
     nz, ny, nx = shape
     for j in prange(near.shape[0]):
@@ -156,8 +156,8 @@ def _cut(table, j, z, weight, piece, profile):
 
 
 def _as_function(inlined: Any) -> Any:
-    """A function of its own, that LLVM copies into the loops: where numba copies it, it compiles it several times."""
-    plain = getattr(inlined, "py_func", inlined)  # with NUMBA_DISABLE_JIT it is plain already
+    """A separate function, which LLVM copies into the loops. If numba copied it, it would be compiled several times."""
+    plain = getattr(inlined, "py_func", inlined)  # with NUMBA_DISABLE_JIT it is already a plain function
     return njit(fastmath=True, error_model="numpy", forceinline=True)(plain)
 
 
@@ -169,7 +169,10 @@ def _filler(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
                ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
-        """volume [z, y, x] of padded slices: each task fills `_SLAB` of them, so no two write to one voxel."""
+        """volume [z, y, x] of padded slices.
+
+        Each task fills `_SLAB` slices, so that no two tasks write to the same voxel.
+        """
         for task in prange(pieces.shape[0]):
             low, high = task * _SLAB, min(volume.shape[0], (task + 1) * _SLAB)
             piece = pieces[task]
@@ -284,7 +287,7 @@ class Layout:
         corner = np.asarray(origin, np.float64)
         edge = self._spacing[::-1]
         found, counts = np.empty(n, np.int64), np.empty(-(-n // _TASK), np.int64)
-        # Half a voxel more on all sides, since the search rounds to float32.
+        # Half a voxel more on all sides, because the search rounds to float32.
         _near(means, scales, corner - edge / 2, corner + (np.asarray(shape[::-1]) - 0.5) * edge, cut, found, counts)
         pieces = [found[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
         near = np.concatenate(pieces) if pieces else found
@@ -311,7 +314,7 @@ class Layout:
         *,
         means_too: bool = True,
     ) -> None:
-        """Back-propagate `gradient` [z, y, x], adding to the others; `means_too=False` leaves positions out."""
+        """Back-propagate `gradient` [z, y, x], adding to the other gradients; `means_too=False`: not to positions."""
         _, ny, nx = self.shape
         _, scales, rotations, densities = self.parameters
         pieces = np.empty((-(-self.hits.size // _SHARE), 2, 16), np.float32)

@@ -1,4 +1,4 @@
-"""Displaced volumes: each voxel takes its value from another place, between eight voxels; with the transpose and slope.
+"""Displaced volumes: each voxel is interpolated at another position; with the transpose and the derivatives.
 
     (W x)(r) = x(r + u(r)),    trilinear, 0 beyond the volume
 
@@ -20,7 +20,10 @@ _LEAST_SLAB = 8  # planes of a slab of the transpose
 
 @njit(inline="always")
 def _corner(at, size):
-    """The voxel below a place and the share of the one above; places beyond one voxel outside share nothing."""
+    """The voxel below a position and the share of the voxel above.
+
+    Positions more than one voxel outside have no share.
+    """
     at = min(max(at, _f(-1)), _f(size))
     low = min(math.floor(at), size - 1)
     return low, at - _f(low)
@@ -71,7 +74,7 @@ def _add(out, j, i, k, value):
 
 @njit(**OPTIONS)
 def _push(y: F32, u: F32, slab: int, first: int, out: F32) -> None:
-    """Adds the planes of every other slab. These reach no common plane, so the sums have one order."""
+    """Adds the planes of every other slab. These slabs have no common plane, so the sums always have the same order."""
     ny, nx, nz = y.shape
     slabs = (ny + slab - 1) // slab
     for half in prange((slabs - first + 1) // 2):
@@ -91,7 +94,7 @@ def _push(y: F32, u: F32, slab: int, first: int, out: F32) -> None:
 
 
 def push(y: F32, u: F32, out: F32) -> None:
-    """Wᵀ y, into `out`; the same bits with any number of threads."""
+    """Wᵀ y, into `out`; bit-identical for any number of threads."""
     out[...] = 0
     slab = max(_LEAST_SLAB, 2 * math.ceil(float(np.abs(u[0]).max(initial=0.0))) + 4)
     for first in (0, 1):
@@ -121,5 +124,5 @@ def _slopes(x: F32, u: F32, out: F32) -> None:
 
 
 def slopes(x: F32, u: F32, out: F32) -> None:
-    """Derivatives of W x at each voxel by its own u, into `out` [3, y, x, z]."""
+    """Derivatives of W x at each voxel with respect to its own u, into `out` [3, y, x, z]."""
     _slopes(x, u, out)

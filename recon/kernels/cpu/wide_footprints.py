@@ -1,19 +1,20 @@
-"""Footprints of Gaussians on pixels that have a width, while the stage turns, and gradients back (numba).
+"""Footprints of Gaussians on pixels with a width, during rotation of the stage, and their gradients (numba).
 
 A footprint keeps its mass, and its covariance grows by that of the pixel and by the path of its centre:
 
     Σ' = Σ₂ + s 1 + e eᵀ        W' = W sqrt(det Σ₂ / det Σ')        e = arc / sqrt(12) (∂ centre / ∂ angle)
 
 with s from `RayWidth.variance` and Σ₂, W as in `cpu.footprints`. For a parallel beam e is the Gaussian's coordinate
-along the beam, times the arc, along the columns. A compact kernel keeps its profile: its second moment is exact, its
-shape is not. In a cone, Gaussians that are integrated ray by ray keep their rays: they are many pixels wide.
+along the beam, times the arc, along the columns. A compact kernel keeps its profile, so that its second moment is exact
+but its shape is not. In a cone, Gaussians that are integrated along each ray are not widened, because they are many
+pixels wide.
 
 Backward, a, b and the deformation T are those of `cpu.footprints`:
 
     G = ∂L/∂Σ' = W' / 2 (K' M₂ K' - M₀ K')        T = 2 (G_uu aaᵀ + G_uv (abᵀ + baᵀ) + G_vv bbᵀ) + W' M₀ 1
 
-Unlike there, needles lose no accuracy: Σ' is never
-thinner than the pixel. e moves with the centre, which is included.
+In contrast to `cpu.footprints`, needles do not lose accuracy, because Σ' is never thinner than the pixel. The change of
+e with the centre is included.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def _seen(x, y, z, axes, focal, sod):
 
 @njit(inline="always", fastmath=True)
 def _path(x, y, axes, ax, ay, g, travel):
-    """e of a centre in px, and how fast it goes along the beam."""
+    """e of a centre in px, and its change along the beam."""
     along = axes[2, 1] * x - axes[2, 0] * y
     eu = travel * g * (axes[0, 1] * x - axes[0, 0] * y - ax * along)
     ev = travel * g * (axes[1, 1] * x - axes[1, 0] * y - ay * along)
@@ -62,7 +63,7 @@ def _widen(
         eu, ev, r = _d(e0), _d(e1), _d(table[i, SHEAR])
         vv, thin = _d(1) / _d(table[i, KV]), _d(1) / _d(table[i, K])
         uu, uv, det = thin + r * r * vv, r * vv, thin * vv
-        # det Σ' as a sum of what is not negative: eᵀ adj(Σ₂) e = thin e_v² + vv (e_u - r e_v)²
+        # det Σ' as a sum of non-negative terms: eᵀ adj(Σ₂) e = thin e_v² + vv (e_u - r e_v)²
         across = eu - r * ev
         wide = det + s * (uu + vv + s + eu * eu + ev * ev) + thin * ev * ev + vv * across * across
         uu, uv, vv = uu + s + eu * eu, uv + eu * ev, vv + s + ev * ev
@@ -135,7 +136,10 @@ def _backward(
 
 
 def widen(table: F32, means: F32, camera: RayCamera, faint: float, cut: float, kernel: Kernel) -> None:
-    """Footprints of rays without a width to those of the camera's; arguments as of `footprints`."""
+    """Convert footprints of rays without a width to those with the width of the camera.
+
+    Arguments as for `footprints`.
+    """
     _widen(
         table, means, camera.axes, camera.focal, camera.sod, camera.spread, camera.travel, faint, kernel.reach(cut),
         kernel.is_compact,
@@ -155,7 +159,7 @@ def wide_footprints_backward(
 
     Args:
         parameters: means, scales, rotations.
-        gradients: on means, log scales, rotations and densities, which are added to.
+        gradients: gradients of means, log scales, rotations and densities, to which the result is added.
     """
     _backward(
         table, moments, *parameters, camera.axes, camera.focal, camera.sod, camera.travel, kernel.length, *gradients,

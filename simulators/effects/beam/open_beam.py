@@ -17,15 +17,16 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class BeamBend(ImageEffect):
-    """A change of the beam behind the sample: -log of each ray's light changes by level + drift t + Σ curvature x².
+    """A change of the beam in the projections: -log of each ray's light changes by level + drift t + Σ curvature x².
 
-    x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t in s since the camera
-    was connected. Flats and darks stay as they are. Negative: the views have more light than the flats predict.
+    x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t is in s since the
+    camera was connected. Flats and darks do not change. If the value is negative, the projections have more light than
+    the flats predict.
 
     Attributes:
-        curvature: (horizontal, vertical), at the edges of the frame.
-        level: everywhere.
-        drift: everywhere, 1/s.
+        curvature: (horizontal, vertical), value at the edges of the frame.
+        level: constant value.
+        drift: constant change, 1/s.
     """
 
     curvature: tuple[float, float] = (0.0, 0.0)
@@ -52,9 +53,9 @@ class RingCurrent(ImageEffect):
     Attributes:
         lifetime: s to fall to 1/e.
         top_up_every: s from the start of one top-up to the start of the next; None: not periodic.
-        top_up_below: share of the full current at which a top-up starts; None: not by the current. Without either the
-            current only decays.
-        refill: s that a top-up takes, with a linearly rising current; 0: it is instantaneous.
+        top_up_below: share of the full current at which a top-up starts; None: not by the current. Without both
+            settings the current only decays.
+        refill: duration of a top-up in s, with a linearly rising current; 0: instantaneous.
     """
 
     lifetime: Positive
@@ -83,7 +84,7 @@ class RingCurrent(ImageEffect):
         if not self.tops_up:
             x = duration / self.lifetime
             return math.exp(-start / self.lifetime) * (-math.expm1(-x) / x if x > 0 else 1.0)
-        start %= self._falls() + self.refill  # within its cycle: differences of small numbers lose fewer digits
+        start %= self._falls() + self.refill  # within its cycle, because differences of small numbers lose fewer digits
         return (self._charge(start + duration) - self._charge(start)) / duration
 
     def _charge(self, time: float) -> float:
@@ -109,12 +110,12 @@ class RingCurrent(ImageEffect):
 
 @dataclass(frozen=True)
 class LostBeam(ImageEffect, Anomaly):
-    """The beam is off for a range of views or of time; a frame loses the light of the overlap.
+    """The beam is off for a range of projections or of time; a frame loses the light of the overlap.
 
     Attributes:
-        views: [first, one after the last]; flats taken just before one of them lose their light, too.
+        views: [first, one after the last]; flats taken just before one of them also lose their light.
         seconds: [from, to] since the camera was connected.
-        share: of the light that is left.
+        share: share of the light that remains.
     """
 
     views: Views | None = None
@@ -151,8 +152,8 @@ class LostBeam(ImageEffect, Anomaly):
 class Ghost(ImageEffect, Anomaly):
     """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
 
-    An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
-    view has. Its cause is unknown. It may brighten (light scattered into the detector) or darken.
+    It was seen in an early data set of a battery: "fog" crosses the frame in a few projections, with intensities that
+    no other projection has. The cause is unknown. The ghost may be bright (light scattered into the detector) or dark.
 
     Attributes:
         view: the first view that shows it, at the right edge.
@@ -183,11 +184,11 @@ class Ghost(ImageEffect, Anomaly):
         return [Label(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
-        """The first column that it covers, and the relative change of the light from there to the right."""
+        """The first column that the ghost covers, and the relative change of the light from there to the right."""
         cols, pitch = shot.detector.shape[1], shot.detector.pitch
         if not shot.sample or shot.view < self.view:
             return 0, np.zeros(0)
-        # The middle, in columns: half a step after the hump's left end has touched the frame's right edge.
+        # middle in columns, half a step after the left end of the hump has touched the right edge of the frame
         middle = cols - 0.5 + (self.width - self.speed * (shot.view - self.view + 0.5)) / pitch
         reach = self.width / pitch
         first = max(0, math.ceil(middle - reach))
@@ -197,13 +198,13 @@ class Ghost(ImageEffect, Anomaly):
 
 @dataclass(frozen=True)
 class BlackBand(ImageEffect, Anomaly):
-    """The band's edge is soft by the penumbra of the source; flats have the band too.
+    """A slit darkens a band at the left, with an edge that is soft because of the penumbra; flats also have the band.
 
     Attributes:
         width: mm from the left edge of the frame, for any ROI, to half of the light.
         penumbra: mm over which the light rises from none to all.
-        share: of the light that is left in the band.
-        views: [first, one after the last] in which the slit is in the beam; None: all.
+        share: share of the light that remains in the band.
+        views: [first, one after the last] projection with the slit in the beam; None: all.
     """
 
     width: Positive
@@ -275,12 +276,15 @@ class NarrowField(ImageEffect, Anomaly):
         return self._between(detector.v() - self.centre[1], self.height), across
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        # The part of the source that neither edge covers. The edges cover it from opposite ends.
+        # The part of the source that is not covered. The two edges cover it from opposite ends.
         one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
         return np.maximum(one + other - 1, 0.0)
 
 
 def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
-    """First pixel with at least 1 - `less` of the light and the one after the last; it falls off to both sides."""
+    """First pixel with at least 1 - `less` of the light, and the one after the last.
+
+    The light falls off on both sides.
+    """
     full = np.flatnonzero(light >= 1 - less)
     return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)

@@ -22,7 +22,7 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, 
 
 TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
 NEGLIGIBLE = 1e-9
-"""Share of a kernel's light beyond its last tap; the taps are normalised to a sum of 1."""
+"""Share of the light of a kernel beyond its last tap; the taps are normalised to a sum of 1."""
 MAX_CORE = 64.0
 """Largest sigma of the core in pixels; the work grows with it."""
 
@@ -33,11 +33,11 @@ class ScintillatorBlur(ImageEffect):
 
     The core's taps go as exp(-b n²) with the b that gives the Gaussian's variance, however narrow (the discrete normal
     law, Kemp 1997, J. Stat. Plan. Inference 63:223); from 1 pixel of sigma on that is the Gaussian, with the transfer
-    exp(-2 (pi f sigma)²). No tap is negative. Name it before the effects behind the optics.
+    exp(-2 (pi f sigma)²). No tap is negative. Name this effect before the effects behind the optics.
 
     Attributes:
         fwhm_um: full width at half maximum of the core, um at the sample.
-        tail_share: of the light that goes into the tail, 0 ... 1 (excluded).
+        tail_share: share of the light that goes into the tail, 0 ... 1 (excluded).
         tail_um: width w of the tail, um at the sample.
         tail: "exponential", exp(-r/w) / 2πw² with the transfer (1 + (2πfw)²)^-1.5; or "lorentzian",
             w / 2π(r² + w²)^1.5 with the transfer exp(-2πfw), which reaches much farther.
@@ -76,7 +76,7 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
         return unscaled / (2 * unscaled.sum() - 1)
 
     steepness = 0.5 / variance
-    if variance < 1:  # narrower than the sampling: a steeper law, because the continuous one would lose variance
+    if variance < 1:  # narrower than the sampling; a steeper law, because the continuous one would lose variance
         steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
     kept = taps(steepness)
     beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap and beyond
@@ -117,7 +117,7 @@ def _mirrored(index: int, n: int) -> int:
 
 
 Reals = NDArray[np.float64]
-REACH = 4.0  # A Gaussian is drawn up to so many sigmas; less than 4e-4 of its depth lies beyond
+REACH = 4.0  # a Gaussian is drawn up to this number of sigmas; less than 4e-4 of its depth is beyond
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ class FlatStructure(ImageEffect):
     """Each speck and scratch multiplies the light by 1 - depth x Gaussian.
 
     A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them. Name dust on the
-    scintillator before scintillator_blur, dust on the camera's window after it. They are computed for sensor pixels and
-    averaged over binned ones, so that any ROI and binning shows the same ones.
+    scintillator before scintillator_blur, dust on the camera's window after it. Specks and scratches are computed for
+    sensor pixels and averaged over binned pixels, so that they are the same for any ROI and binning.
 
     Attributes:
         specks: number of specks on the whole sensor.
@@ -153,7 +153,7 @@ class FlatStructure(ImageEffect):
         return image
 
     def transmission(self, shot: Shot) -> Image:
-        """Share of the light that is left, float64 [row, col]."""
+        """Share of the light that remains, float64 [row, col]."""
         pixel_um = shot.detector.pitch / shot.binning * 1e3
         row0, col0, rows, cols = shot.roi
         left = np.ones((rows, cols))
@@ -196,10 +196,10 @@ def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: flo
         left, row, col, angle = left.T, col, row, np.pi / 2 - angle
     along, beside = np.sin(angle), np.cos(angle)
     steps = _window(row, abs(along) * length / 2 + REACH * width, left.shape[0])
-    # Across an inclined line a width w is w / cos along the axis: √2 w at most.
+    # Along the axis, an inclined line of width w has the width w / cos, at most √2 w.
     reach = int(np.ceil(REACH * width * np.sqrt(2)))
     middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
-    whole = 2 * reach >= left.shape[1]  # wider than the frame: each of its columns once
+    whole = 2 * reach >= left.shape[1]  # wider than the frame; each column of the frame once
     at = np.arange(left.shape[1]) + 0 * middle[:, None] if whole else middle[:, None] + np.arange(-reach, reach + 1)
     dy, dx = (steps - row)[:, None], at - col
     t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across
@@ -220,8 +220,8 @@ class Afterglow(SamplingEffect):
 
     The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
     times. A Gauss rule of `samples` moments replaces it, exact for its powers up to 2 x samples - 1 (Golub & Welsch
-    1969). So only `samples` line integrals are added. An edge that moves by many pixels within a decay time
-    appears as that many ghosts instead of a trail.
+    1969). So only `samples` line integrals are added. An edge that moves by many pixels within a decay time appears as
+    `samples` separate edges instead of a trail.
 
     Shutter, sample and beam are assumed unchanged over the delays. Not simulated are the light that is missing just
     after the shutter opens, and the light in a dark just after it closes. The weights sum to 1.
@@ -247,8 +247,9 @@ class Afterglow(SamplingEffect):
             raise ValueError(f"the sum of the shares must lie in 0 ... 1 (both excluded), got {sum(self.shares)}")
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        """The given moments with smaller weights, and moments of the past. The moments of the rows must differ only by
-        shifts, as after blur and rolling shutter."""
+        """The given times with smaller weights, and times in the past.
+
+        The times of the rows must differ only by shifts, as after blur and rolling shutter."""
         share = sum(self.shares)
         middle = moments.weights @ moments.times  # [row]
         spread = moments.times[:, 0] - middle[0]

@@ -19,7 +19,7 @@ from simulators.pixels.pattern import binned, normals, places
 class Prnu(ImageEffect):
     """The expected light times 1 + spread * a normal number of the sensor pixel, not below 0.
 
-    It acts on the light, so that the photon noise stays Poisson. Name it after all effects that blur light.
+    It acts on the light, so that the photon noise remains Poisson. Name this effect after all effects that blur light.
 
     Attributes:
         spread: standard deviation as a share of the light; 1 % is typical of sensors (Janesick 2007, "Photon
@@ -44,9 +44,9 @@ class HotPixels(ImageEffect):
     """The same pixels of the sensor in every frame, for any ROI.
 
     Attributes:
-        fraction: of the sensor's pixels.
+        fraction: fraction of the sensor's pixels.
         rate: mean of their dark currents (exponentially distributed), electrons/s.
-        seed: of their places and dark currents.
+        seed: seed of their positions and dark currents.
     """
 
     fraction: float = setting(1e-4, ge=0, le=0.1)
@@ -66,9 +66,9 @@ class DeadPixels(ImageEffect):
     noise, which dead pixels have like others. A binned pixel loses the share of its dead ones.
 
     Attributes:
-        fraction: of the sensor's pixels.
-        charge: electrons that they hold: 0, or 7000 for pixels that are stuck at the full well.
-        seed: of their places.
+        fraction: fraction of the sensor's pixels.
+        charge: their electrons: 0, or 7000 for pixels that are stuck at the full well.
+        seed: seed of their positions.
     """
 
     fraction: float = setting(1e-4, ge=0, le=0.1)
@@ -83,7 +83,7 @@ class DeadPixels(ImageEffect):
         return image
 
 
-DROPS = 200  # Number of parts into which a spread charge is split
+DROPS = 200  # number of parts into which a spread charge is divided
 MOST = 100_000  # Largest number of zingers in a frame; the work grows with it
 
 
@@ -106,7 +106,7 @@ class Zingers(ImageEffect):
     radius: NotNegative = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError if a frame has more than MOST: the units are probably wrong."""
+        """Raises CannotExposeError if a frame has more than MOST zingers, because then the units are probably wrong."""
         rng = frame_rng(self.name, shot)
         expected = self.rate * shot.exposure
         if expected > MOST:

@@ -42,7 +42,7 @@ class Crumb:
         middle, size = np.array([self.row, self.col]), np.array(shape)
         aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # the frame may contain only a cap of the circle
         reach = np.sqrt(np.maximum(2 * math.log(self.depth / VISIBLE) * self.sigma**2 - aside**2, 0.0))
-        # Clipped first: close to a cone's source positions exceed the range of integers.
+        # clipped first, because close to the source of a cone, positions exceed the range of integers
         top, left = np.clip(np.ceil(middle - reach), 0, size).astype(int).tolist()
         below, right = np.clip(np.floor(middle + reach) + 1, 0, size).astype(int).tolist()
         return top, below, left, right
@@ -54,7 +54,7 @@ class Floaters(ImageEffect, Anomaly):
 
     Turning particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a
     turn, in front of the axis and behind it. Within 180 degrees it crosses once, in a range of views, on one side.
-    Loose particles drift across at a speed of their own. All rows show a loose particle at its place when the
+    Loose particles drift across at their own speed. All rows show a loose particle at its position at the time when the
     first row is exposed.
 
     Attributes:

@@ -62,19 +62,19 @@ class EncoderError(PoseEffect):
         return pose.turned_by(np.radians(1e-3 * error))
 
 
-STILL = 1e-9  # Radians below which the stage does not move
-LOOK = 1e-3  # s: first step back in time; also the precision of the end of the last move
-HISTORY = 3600.0  # s before the frame; an earlier move is not looked for
+STILL = 1e-9  # radians; the stage counts as at rest below this
+LOOK = 1e-3  # s; first step back in time, and precision of the end of the last move
+HISTORY = 3600.0  # s before the frame; earlier moves are not searched for
 
 
 @dataclass(frozen=True)
 class Backlash(PoseEffect):
     """Lost motion of a gear (ISO 230-2:2014, reversal value) between the encoder, on the motor's side, and the sample.
 
-    While the stage turns forwards (angles grow) its angles hold. Backwards the other flanks of the teeth push, and the
-    sample is `lost_motion_deg` ahead of the stage's angle. For a standing stage its last move decides; without a move
-    within an hour, forwards is assumed. The lost motion at the beginning of a move is not simulated: a scan's first
-    view comes after it.
+    While the stage turns forwards (angles grow), its angles are right. When it turns backwards, the other flanks of the
+    teeth push, and the sample is `lost_motion_deg` ahead of the stage's angle. If the stage is at rest, its last move
+    decides; if there was no move within an hour, forwards is assumed. The lost motion at the beginning of a move is not
+    simulated, because the first projection of a scan comes after it.
 
     Attributes:
         lost_motion_deg: degrees by which the sample is ahead while the stage turns backwards.
@@ -162,10 +162,10 @@ SEEN_PX = 0.01  # Smallest shift in pixels that is labelled; a shift along the b
 
 @dataclass(frozen=True)
 class Jump(PoseEffect, Anomaly):
-    """A jump: from view `view` on the sample is elsewhere on the stage, first turned, then shifted.
+    """A jump: from projection `view` on, the sample is at another position on the stage: first rotated, then shifted.
 
-    All views from the jump on are labelled, because the jump changes them. Errors of the stage precede the jump in a
-    scene: they depend on the stage's angle, not on the sample's.
+    All projections from the jump on are labelled, because the jump changes them. In a scene, errors of the stage come
+    before the jump, because they depend on the angle of the stage and not on that of the sample.
 
     Attributes:
         view: the first after the jump.
@@ -179,7 +179,7 @@ class Jump(PoseEffect, Anomaly):
 
     def __post_init__(self) -> None:
         if not (any(self.shift_um) or self.turn_deg):
-            raise ValueError("shift_um or turn_deg must be other than 0")
+            raise ValueError("at least one of shift_um and turn_deg must be other than 0")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         if shot.view < self.view:

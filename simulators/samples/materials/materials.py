@@ -35,8 +35,9 @@ Reals = NDArray[np.float64]
 MassAttenuation = Callable[[Reals], Reals]  # Mass attenuation in cm²/g at energies in keV, as tabulated
 
 NEAR, FAR = 60.0, 150.0
-MOST_SHIFT = 20.0  # eV: an edge may move so far, so that it stays in the range where the form replaces the table
-CLEAR = 1.0  # eV from the edge at which a table is read: closer, an interpolating spline may still be rising
+MOST_SHIFT = 20.0  # eV; largest shift of an edge, so that it stays in the range in which the form replaces the table
+# eV from the edge at which a table is read, because closer to it an interpolating spline may still be rising
+CLEAR = 1.0
 
 
 @dataclass(frozen=True)

@@ -84,13 +84,13 @@ class Voxels:
             raise ValueError(f"voxels must be {LEAST:g} ... {MOST:g} mm in size, got {spacing}")
         volume = padded(attenuation)
         if not np.isfinite(volume).all():
-            raise ValueError("the volume holds values that are not finite")
+            raise ValueError("the volume contains values that are not finite")
         label_volume, steps = None, None
         if labels is not None:
             if thresholds:
                 raise ValueError("labels come from thresholds or from a volume, not from both")
             if labels.shape != attenuation.shape:
-                raise ValueError(f"labels of shape {labels.shape} do not match a volume of {attenuation.shape}")
+                raise ValueError(f"labels must have the shape of the volume, {attenuation.shape}, got {labels.shape}")
             if not np.issubdtype(labels.dtype, np.integer):
                 raise ValueError(f"labels must be integers, got {labels.dtype}")
             low, n = int(labels.min()), int(labels.max())
@@ -103,7 +103,7 @@ class Voxels:
                 raise ValueError(f"thresholds must ascend and be {MOST_LABELS} at most, got {thresholds}")
             n = len(steps)
         if names and len(names) < n:
-            raise ValueError(f"{n} labels need as many names, got {', '.join(names)}")
+            raise ValueError(f"{n} labels need {n} names, got {', '.join(names)}")
         named = tuple(names) if names else ("matter",) if n == 1 else tuple(f"phase_{k}" for k in range(1, n + 1))
         return cls(volume, along, steps, label_volume, named, _radius(volume, along))
 

@@ -1,8 +1,8 @@
 """Simulated motor record: the fields of one axis, read and written by name, over a motor with whole steps.
 
 From the record's reference (motor R7): a value written to VAL, HOMF, HOMR or STOP acts before the write is answered;
-DMOV is 0 at once. Nothing is shared with the driver but the form of a value. Without a network it stands behind
-`sim://` URLs; tests serve it by PVAccess and Channel Access.
+DMOV is 0 at once. The simulation shares only the form of a value with the driver. Without a network it has `sim://`
+URLs; tests serve it over PVAccess and Channel Access.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class EpicsBuild:
         fastest: VMAX; 0: none.
         home_at: step at which its home switch is.
         switch_at: step at which its upper limit switch ends a move.
-        late: s after the write of VAL until DMOV falls, as of a slow IOC.
-        early: s before the end of a move at which DMOV rises.
+        late: s from the write of VAL until DMOV becomes 0, as with a slow IOC.
+        early: s before the end of a move at which DMOV becomes 1.
     """
 
     counts_per_turn: int = 360_000
@@ -57,11 +57,11 @@ class EpicsBuild:
 
 
 class MotorRecord(BytesWire):
-    """Safe from several threads. It has fields instead of bytes, which it ignores.
+    """A motor record; it can be used from several threads. It has fields and ignores bytes.
 
     Attributes:
-        state: the fields that do not follow from the motor; a test changes them as a person at the record's screen.
-        broken: the IOC has lost the controller, and values of the motor are INVALID.
+        state: the fields that do not follow from the motor; a test changes them like a person at the record's screen.
+        broken: True: the IOC has lost the controller, and values of the motor are INVALID.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: EpicsBuild) -> None:
@@ -101,7 +101,7 @@ class MotorRecord(BytesWire):
             return PvValue(value, labels[int(value)] if labels else "")
 
     def write(self, suffix: str, value: float | str) -> None:
-        """Set a field, as a client does; a disabled record ignores it. KeyError: it cannot be set."""
+        """Set a field, as a client does; a disabled record ignores it. KeyError: the field cannot be set."""
         with self._lock:
             if self.state[".DISP"] and suffix != ".DISP":
                 return
@@ -167,7 +167,7 @@ class SimulatedChannel:
     def __init__(self, name: str, device: str, timeout: float) -> None:
         record = plugged(SCHEME + name)
         if not isinstance(record, MotorRecord):
-            raise DeviceError(device, f"{SCHEME}{name} is no simulated record", state="Nothing was asked")
+            raise DeviceError(device, f"there is no simulated record {SCHEME}{name}", state="Nothing was asked")
         self.name, self._device = name, device
         self._record: MotorRecord | None = record
 

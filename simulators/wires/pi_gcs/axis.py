@@ -2,7 +2,7 @@
 
 Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis' own
 zero, which before a reference move is wherever it was switched on. Nothing runs in the background: the effects of a
-move's end happen at the next call. Where a manual is silent the axis is strict: it refuses a move during a move.
+move's end happen at the next call. If a manual says nothing, the axis is strict: it rejects a move during a move.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ REFERENCE_VELOCITY = 5.0  # degrees/s
 
 
 class GcsError(Exception):
-    """A refused command, which only sets the error register."""
+    """A rejected command, which only sets the error register."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -29,18 +29,18 @@ class GcsError(Exception):
 
 @dataclass(frozen=True)
 class PiAxisBuild:
-    """How this specimen is built, and its faults.
+    """How this axis is built, and its faults.
 
     Attributes:
         low, high: travel range and limit switches, degrees.
         found_at: degrees of true angle at which it is switched on.
-        referenced: its zero is the reference switch already; else its zero is where it was found.
-        reference_switch, limit_switches: it has them.
-        reference_fails: a reference move ends with error 45.
+        referenced: True: its zero is already the reference switch; False: its zero is its position at switching on.
+        reference_switch, limit_switches: True if the axis has them.
+        reference_fails: True: a reference move ends with error 45.
         first_pulse: see `PiFirstPulse`.
         pulse_width: s that the firmware holds a pulse.
-        rising: the camera in the trigger output takes rising edges, else falling ones.
-        servo_period: s; positions are compared and read once a period. 0 compares at every instant.
+        rising: True: the camera at the trigger output reacts to rising edges; False: to falling ones.
+        servo_period: s; positions are compared and read once per period. 0: continuously.
         settle: s after a move until the axis reports to be on target.
         max_velocity, max_acceleration: degrees/s, degrees/s².
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
@@ -90,7 +90,7 @@ class GcsAxis(MovedAxis):
         self._referencing = False
         self._hit = 0
 
-    # what it tells
+    # queries
 
     def moving(self) -> bool:
         self.catch_up()
@@ -121,7 +121,7 @@ class GcsAxis(MovedAxis):
         here = self._counts(self._clock.now()) / self.per_degree
         return here <= self.build.low or self._hit < 0, here >= 0, here >= self.build.high or self._hit > 0
 
-    # what it does
+    # actions
 
     def switch_servo(self, on: bool) -> None:
         if not on and self.moving():
@@ -160,13 +160,13 @@ class GcsAxis(MovedAxis):
         self._at_end = self._found
 
     def brake(self) -> None:
-        """HLT: decelerate to a whole count and stand."""
+        """HLT: decelerate and stop at a whole count."""
         if self.moving():
             self._cut(self.move.slowed(self._clock.now(), self.deceleration * self.per_degree))
         self.error = 10
 
     def halt(self) -> None:
-        """STP, #24: stand at once."""
+        """STP, #24: stop at once."""
         if self.moving():
             self._stand_at(self._counts(self._clock.now()))
         self.error = 10
@@ -204,7 +204,7 @@ class GcsAxis(MovedAxis):
         self._cut(self.move.halted(counts))
 
     def _cut(self, move: TrapezoidMove) -> None:
-        """Give the move another end."""
+        """Change the end of the move."""
         self._referencing, self._at_end = False, None
         self._end(move)
         self._target = (move.target - self._zero) / self.per_degree

@@ -1,8 +1,8 @@
 """Simulated Tsuji PM16C-04XD, the controller box: sixteen motors, four position controllers, error flags.
 
-Behaviour as in the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Where the manual is
-silent this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed only sets the command-error
-flag.
+Behaviour as in the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. If the manual says
+nothing, this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed only sets the
+command-error flag.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Pm16cError(IntFlag):
 
 
 class Refused(Exception):  # noqa: N818 - not an error of this program
-    """A refused command, which only sets an error flag."""
+    """A rejected command, which only sets an error flag."""
 
     def __init__(self, flag: Pm16cError) -> None:
         super().__init__(flag)
@@ -52,8 +52,8 @@ class Refused(Exception):  # noqa: N818 - not an error of this program
 class HomeSwitch:
     """The home switch of a channel. `at`: its place in pulses since power-on; None without a switch.
 
-    The run of a search is from memory: it starts towards the switch, which tells the side, passes it, slows down and
-    stands beyond. A preset of the counter does not change the remembered place.
+    The course of a search is from memory: the motor starts towards the switch (the switch shows the side), passes it,
+    decelerates and stops beyond it. A preset of the counter does not change the stored position.
     """
 
     def __init__(self, motor: PulseMotor, at: int | None) -> None:
@@ -64,7 +64,7 @@ class HomeSwitch:
 
     def search(self, speed: float, acceleration: float) -> None:
         """Begin to search (pulses/s, pulses/s²) and forget the result of an earlier search."""
-        assert self.at is not None, "the box refuses a search without a switch"
+        assert self.at is not None, "the box rejects a search without a switch"
         here, home = self._motor.position(), self.at + self._motor.zero
         self._found, self._searched_for = None, home
         beyond = math.ceil(speed**2 / (2 * acceleration)) if home != here else 0
@@ -105,7 +105,7 @@ class Channel:
 
     @property
     def letter(self) -> str:
-        """P, N or S: turns CW, CCW, stands."""
+        """P, N or S: turns CW, turns CCW, is at rest."""
         return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
 
     def status(self) -> int:
@@ -171,7 +171,7 @@ class PM16CBox:
         return sum(channel.motor.moving() for channel in self.channels.values())
 
     def standing(self, c: str) -> Channel:
-        """The channel, if it stands; raises Refused if it moves."""
+        """The channel if it is at rest; raises Refused if it moves."""
         if self.channels[c].motor.moving():
             raise Refused(Pm16cError.COMMAND)
         return self.channels[c]
@@ -182,7 +182,10 @@ class PM16CBox:
         self.remote = remote
 
     def map(self, wanted: str) -> None:
-        """Channels to position controllers A..D; `-` leaves one as it is. A channel that sat elsewhere swaps places."""
+        """Assign channels to position controllers A..D; `-` keeps a controller's channel.
+
+        A channel assigned elsewhere is exchanged.
+        """
         if any(self.channels[c].motor.moving() for c in (*wanted.replace("-", ""), *self.mapped)):
             raise Refused(Pm16cError.COMMAND)
         places = list(self.mapped)

@@ -74,7 +74,7 @@ ALWAYS: tuple[tuple[str, Setting], ...] = (
     (r"AESTP", lambda box: box.for_moving(lambda c: box.channels[c].motor.halt())),
     (r"ERRC", _clear_errors),
 )
-"""Settings that LOCAL accepts too."""
+"""Settings that are also accepted in LOCAL."""
 
 REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
     (r"SETCH([0-9A-F-]{4})", PM16CBox.map),
@@ -102,7 +102,7 @@ class PM16CBuild:
 
     Attributes:
         box: the controller behind the wire.
-        silent, garbled: queries (from 0, since power-on) that get no reply, or a damaged one.
+        silent, garbled: queries (counted from 0 since power-on) that get no reply, or a damaged reply.
     """
 
     box: BoxBuild = field(default=BoxBuild())

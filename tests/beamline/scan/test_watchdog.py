@@ -100,7 +100,7 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
         assert not controller.output_is_high(2)
         time.sleep(0.3)
         assert line.angle_at(clock.now()) == stood < 2.9  # it was on its way to 3
-        assert "a program that was killed, or lost this stage, changed" in text and not list(
+        assert "an earlier program that was killed, or lost the connection, changed" in text and not list(
             (tmp_path / "state").rglob("*.json")
         )
         assert speed is None or speed.settings == before
@@ -288,7 +288,9 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         stage.close()
     assert (served.values.get("blade", 0.0), served.values["M.STOP"], served.values["F.STOP"]) == (0.0, 1.0, 1.0)
     stopped, shutter, mover, changer, crystal, left, disarmed = said
-    assert re.match(r"stage: a program that was killed, or lost this stage, changed \.VELO 28\.6\d+ for 1\.0", left)
+    assert re.match(
+        r"stage: an earlier program that was killed, or lost the connection, changed \.VELO 28\.6\d+ for 1\.0", left
+    )
     assert (crystal, served.values["E.STOP"]) == ("The monochromator was told to stop.", 1.0)
     assert changer == "The filter was told to stop."
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")

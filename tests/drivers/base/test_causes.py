@@ -94,6 +94,6 @@ def test_a_server_that_refuses_is_told_from_a_cable() -> None:
 
 def test_bytes_of_telnet_are_noise_on_a_serial_line() -> None:
     assert "Telnet" in of_bytes("socket://here:7777", "\xff\xfb\x01")[0]
-    assert "no text" in of_bytes("/dev/ttyUSB0", "\xff\xfb\x01")[0]
+    assert "not text" in of_bytes("/dev/ttyUSB0", "\xff\xfb\x01")[0]
     for good in ("", "@01 0 00 OK BUSY WR 0", "1=0.5 \n2=3", "R0S100+0000000\r\n"):
         assert of_bytes("socket://here:7777", good) == of_bytes("/dev/gerät", good) == ("", "")

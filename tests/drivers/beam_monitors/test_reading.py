@@ -247,7 +247,7 @@ def test_line_ends_and_setup(end: bytes, tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [b"", b"\xfe\x00\x9c", b"A,+1.0", b"NAN,+1.0,+0.0", b"BUSY"])
 def test_garbage_is_no_reading_and_then_it_goes_on(text: bytes) -> None:
     monitor = over(ElectrometerWire(VirtualClock(), spoilt={0: text}))
-    with pytest.raises(DeviceError, match="have the form"):
+    with pytest.raises(DeviceError, match="have the expected form"):
         monitor.reading()
     assert monitor.reading().value == 1e-9
 

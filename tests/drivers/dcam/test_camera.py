@@ -80,12 +80,12 @@ def test_an_overrun_ring_is_an_error_that_leaves_a_gap_and_a_count(small_ring: D
     """10 frames into 4 slots: 6 are gone and the oldest of the 4 may go at any moment."""
     small_ring.arm(100)
     world.pulses(10)
-    with pytest.raises(DeviceError, match=r"numbers 0 to 6"):
+    with pytest.raises(DeviceError, match=r"frames 0 to 6"):
         small_ring.next_frame(1.0)
     assert take(small_ring, 3) == [7, 8, 9]
     assert small_ring.describe()["frames_overwritten"] == 7
     world.pulses(8)
-    with pytest.raises(DeviceError, match=r"numbers 10 to 14"):
+    with pytest.raises(DeviceError, match=r"frames 10 to 14"):
         small_ring.next_frame(1.0)
     world.pulses(2)  # another overrun before anything could be taken is no second error: taking must go on
     assert take(small_ring, 3) == [17, 18, 19]
@@ -237,7 +237,7 @@ def test_an_index_too_high_is_said(world: World) -> None:
 
 def test_a_camera_that_refuses_its_first_setting_is_let_go(world: World) -> None:
     world.fault("refuse", 0x00100110)
-    with pytest.raises(DeviceRefused, match="refuses TRIGGERSOURCE"):
+    with pytest.raises(DeviceRefused, match="rejects TRIGGERSOURCE"):
         world.connect()
     assert world.live == 0
 

@@ -31,7 +31,7 @@ def test_exposure_is_the_value_that_the_camera_accepted(camera: DcamCamera) -> N
         ({"exposure": 2000.0}, "out of range"),
         (
             {"binning": 3},
-            r"refuses BINNING = 3\..* 'INVALIDVALUE \(0x80000821\)'.* legal: 1, 2, 4",
+            r"rejects BINNING = 3\..* 'INVALIDVALUE \(0x80000821\)'.* legal: 1, 2, 4",
         ),
         ({"roi": (0, 0, 30, 40)}, r"set SUBARRAYVSIZE = 32 instead of 30\..* legal: 4 to 48 in steps of 4"),
         (

@@ -64,7 +64,7 @@ LINE: tuple[LineFault, ...] = (
         "garbage",
         _garbage,
         DeviceError,
-        "the reply does not have the form",
+        "the reply does not have the expected form",
         replied=True,
     ),
     LineFault(
@@ -89,7 +89,7 @@ LINE: tuple[LineFault, ...] = (
         "echo",
         lambda rig, reply: rig.cable.last_request + reply,
         DeviceError,
-        "the reply does not have the form",
+        "the reply does not have the expected form",
         replied=True,
         harmless_on={"zaber": "what a host sends begins with another sign than a reply, and is passed over"},
     ),
@@ -97,7 +97,7 @@ LINE: tuple[LineFault, ...] = (
         "a line that nobody asked for",
         lambda rig, reply: rig.kind.unasked(rig.controller) + reply,
         DeviceError,
-        "the reply does not have the form",
+        "the reply does not have the expected form",
         replied=True,
         harmless_on={
             "pm16c": "it tells of stops without being asked; such a line is passed over",
@@ -135,8 +135,8 @@ UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
 NOT_RESTORED: Mapping[str, str] = MappingProxyType(
     {
-        kind: f"a program that was killed, or lost this stage, changed {settings}; "
-        "the values from before are restored at the end"
+        kind: f"an earlier program that was killed, or lost the connection, changed {settings}; "
+        "the original values are restored at the end"
         for kind, settings in {
             "pm16c": r"RTE 042 for 024, SPDH \d+ for 1000",
             "pi_gcs": r"VEL \d+\.0{6} for 10\.0{6}, SPA 0xB 60\.0{6} for 100\.0{6}, SPA 0xC 60\.0{6} for 100\.0{6}",
@@ -180,7 +180,7 @@ MOTION: tuple[MotionFault, ...] = (
         "limit switch",
         lambda rig: rig.block(switch_at=BETWEEN),
         {"pm16c": "limit", "pi_gcs": "positive limit switch", "zaber": r"limit error \(FE\)"},
-        flags={"zaber": r"limit error \(FE\), a limit switch came where none was expected \(WL\)"},
+        flags={"zaber": r"limit error \(FE\), reached a limit switch at an unexpected position \(WL\)"},
     ),
     MotionFault(
         "stopped by somebody else",
@@ -249,7 +249,7 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("camera absent at start", DeviceError, "DCAM finds no camera"),
     CameraFault("an error of the library", DeviceError, "the camera's library reports an error"),
     CameraFault("camera unplugged", DeviceError, "NOCONNECTION"),
-    CameraFault("setting refused", DeviceRefused, "it refuses EXPOSURETIME"),
+    CameraFault("setting refused", DeviceRefused, "it rejects EXPOSURETIME"),
     CameraFault("frame lost in the camera", LedgerError, "were exposed but never delivered by the camera"),
     CameraFault("ring overrun", LedgerError, "projections are missing"),
     CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
@@ -280,7 +280,7 @@ OF_LINES = (
     ),
     FaultElsewhere(
         "a terminal server in Telnet mode, one that asks for a login, the port of another service",
-        "the server speaks Telnet",
+        "the server uses Telnet",
         ("drivers/stages/test_terminal_server.py", "test_who_speaks_in_the_place_of_the_controller_is_named"),
     ),
     FaultElsewhere(
@@ -290,7 +290,7 @@ OF_LINES = (
     ),
     FaultElsewhere(
         "another protocol (Zaber's Binary), another baud rate",
-        "it has bytes that are no text",
+        "it contains bytes that are not text",
         ("drivers/serial/test_line.py", "test_bytes_that_are_no_text_are_refused_in_a_reply_of_any_form"),
     ),
     FaultElsewhere(
@@ -322,7 +322,7 @@ OF_MOTION = (
 OF_CAMERA = (
     FaultElsewhere(
         "the camera's library hangs, or crashes",
-        "ends the process that starts it",
+        "ends every process that starts it",
         ("drivers/dcam/test_abi.py", "test_a_library_that_would_end_or_hang_this_process_is_refused"),
     ),
 )

@@ -159,7 +159,7 @@ def test_a_late_answer_to_an_earlier_probe_is_not_left_behind() -> None:
 def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None:
     echo = Echo({0: [(0.0, reply)]})
     line = connect(echo)
-    with pytest.raises(DeviceError, match="have the form") as error:
+    with pytest.raises(DeviceError, match="have the expected form") as error:
         ask(line, 1)
     assert not isinstance(error.value, DeviceTimeout)
     assert ask(line, 2) == 2
@@ -169,7 +169,7 @@ def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None
 @pytest.mark.parametrize("reply", [b"\xff\xfb\x0112\r\n", b"1\x002\r\n", b"\xb112\r\n", b"\x7f\r\n"])
 def test_bytes_that_are_no_text_are_refused_in_a_reply_of_any_form(reply: bytes) -> None:
     line = connect(Echo({0: [(0.0, reply)]}))
-    with pytest.raises(DeviceError, match=r"have the form it must have: it has bytes that are no text.*baud rate"):
+    with pytest.raises(DeviceError, match=r"have the expected form: it contains bytes that are not text.*baud rate"):
         line.query("N?1", ".*", "anything")
     assert ask(line, 2) == 2
 
@@ -253,7 +253,7 @@ def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
     line = connect(Echo({9: [(0.0, b"x" * 900 + b"\r\n")]}))
     for n in range(9):
         ask(line, n)
-    with pytest.raises(DeviceError, match="have the form") as error:
+    with pytest.raises(DeviceError, match="have the expected form") as error:
         ask(line, 9)
     lines = error.value.wire.split(", ")
     assert len(lines) == RECENT_LINES

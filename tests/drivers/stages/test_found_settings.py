@@ -103,7 +103,9 @@ def test_those_of_a_killed_program_are_restored_by_the_next_and_said(
     second = rig.open()
     assert settings_file(second.describe(), tmp_path) == settings_file(first.describe(), tmp_path)
     second.keep_found_settings(settings_file(second.describe(), tmp_path))
-    assert "a program that was killed, or lost this stage, changed" in str(second.describe()["found_at_opening"])
+    assert "an earlier program that was killed, or lost the connection, changed" in str(
+        second.describe()["found_at_opening"]
+    )
     _moved(second, 5, FAST)
     second.close()
     # PM16C: REMOTE was set by the program that died

@@ -51,7 +51,7 @@ class Server:
         return data
 
 
-TELNET = ("the server speaks Telnet", "raw TCP: no Telnet")
+TELNET = ("the server uses Telnet", "raw TCP, without Telnet")
 FOREIGN = {
     "negotiates": ({"first": NEGOTIATION}, TELNET),
     "echoes": ({"first": NEGOTIATION[:6]}, TELNET),
@@ -59,15 +59,15 @@ FOREIGN = {
     "notes in between": ({"note": LINE_STATE, "n": 5}, TELNET),
     "login": (
         {"first": b"\r\nTS 4\r\nlogin: ", "answer": b"\r\nPassword: "},
-        ("a login is asked for", "without a login"),
+        ("the server asks for a login", "without a login"),
     ),
     "web server": ({"answer": b"HTTP/1.1 400 Bad Request\r\n\r\n"}, ("a web or SSH server", "the number of the port")),
     "SSH server": ({"first": b"SSH-2.0-OpenSSH_9.2p1\r\n", "answer": b""}, ("a web or SSH", "the number of the port")),
     "in use": (
         {"first": b"Port already in use\r\n", "answer": b""},
-        ("another client holds", "Close the other program"),
+        ("another client uses", "Close the other program"),
     ),
-    "serves another": ({"answer": b""}, ("no whole reply", "allow one client only: another program may use this port")),
+    "serves another": ({"answer": b""}, ("no whole reply", "allow only one client: another program may use this port")),
 }
 
 
@@ -126,6 +126,6 @@ def test_only_a_reply_must_be_text_and_neither_line_ends_nor_what_a_server_said(
         with closing(line):
             time.sleep(2 * NETWORK)
             assert line.query("ID", "OK", "OK")[0] == "OK"
-            with pytest.raises(DeviceError, match="have the form") as told:
+            with pytest.raises(DeviceError, match="have the expected form") as told:
                 line.query("ID", "NO", "NO")
-            assert "no text" not in str(told.value)
+            assert "not text" not in str(told.value)

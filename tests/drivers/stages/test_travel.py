@@ -74,7 +74,7 @@ def test_the_least_interval_is_the_fewest_units_that_take_the_spacing(
 def test_a_train_at_the_least_interval_is_taken_and_a_closer_one_is_not(unit: int, sign: int) -> None:
     travel = Travel("stage", replace(LIMITS, interval_unit=unit))
     travel.refuse_train(TriggerTrain(5000, sign * 60, 9))
-    with pytest.raises(DeviceRefused, match=r"than 0\.002 s.*max_speed"):
+    with pytest.raises(DeviceRefused, match=r"least 0\.002 s.*max_speed"):
         travel.refuse_train(TriggerTrain(5000, sign * (60 - unit), 9))
     travel.refuse_train(TriggerTrain(5000, sign, 1))
 

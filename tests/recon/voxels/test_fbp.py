@@ -182,7 +182,7 @@ def test_direct_methods_refuse_a_climb_that_they_have_no_weights_for(cone: bool)
         else Geometry.parallel(angles, (12, 16), shifts=heights, roll=0.05)
     )
     assert not has_direct_method(geometry)
-    with pytest.raises(ValueError, match=r"by 10 of 12.*an iterative method"):
+    with pytest.raises(ValueError, match=r"an iterative method.*by 10 of 12"):
         direct(np.zeros((90, 12, 16), np.float32), geometry, Grid.matching(geometry))
     assert has_direct_method(replace(geometry, shifts=heights / 4))
 

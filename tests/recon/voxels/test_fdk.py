@@ -123,7 +123,7 @@ def test_a_voxel_off_the_detector_gets_nothing() -> None:
 def test_misfits_are_named() -> None:
     views = np.ones((12, 4, 6), np.float32)
     geometry = Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0)
-    with pytest.raises(ValueError, match="is for fbp"):
+    with pytest.raises(ValueError, match="use fbp"):
         fdk(views, Geometry.parallel(circle(12), (4, 6)))
     with pytest.raises(ValueError, match="rolled or tilted"):
         fdk(views, Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0, tilt=0.1))

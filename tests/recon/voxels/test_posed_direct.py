@@ -81,7 +81,7 @@ def test_values_that_are_not_finite_and_boxes_at_the_source_are_named() -> None:
         data[3, 2, 1] = value
         with pytest.raises(ValueError, match="NaN"), np.errstate(over="ignore", invalid="ignore"):
             posed_direct(data, views, _GRID)
-    with pytest.raises(ValueError, match=r"source stands at 10"):
+    with pytest.raises(ValueError, match=r"source is at 10"):
         posed_direct(data, views, Grid((4, 60, 60), 0.5))
     with pytest.raises(ValueError, match=r"must have shape \(90, 60, 80\) .* got \(89, 60, 80\)"):
         posed_direct(data[1:], views, _GRID)

@@ -70,5 +70,5 @@ def test_a_large_camera_is_binned() -> None:
 @pytest.mark.parametrize("views", [1, 3])
 def test_views_without_their_angles_are_refused(views: int) -> None:
     angles = np.arange(1 if views == 1 else 4) * GOLDEN
-    with pytest.raises(ValueError, match=f"{views} views"):
+    with pytest.raises(ValueError, match=f"{views} projections"):
         orthogonal_slices(list(ball(angles, 30.0)[:views]), Geometry.parallel(angles, SHAPE, pixel_pitch=PITCH))

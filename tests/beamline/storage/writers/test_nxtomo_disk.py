@@ -36,7 +36,7 @@ def test_a_full_disk_is_named_and_earlier_rows_stay(
     full = Mock(side_effect=OSError(28, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
-        with pytest.raises(DataError, match=r"s\.h5 could not.*No space left.*are free.*first 1 frames"):
+        with pytest.raises(DataError, match=r"store the frame in .*s\.h5.*No space left.*are free.*first 1 frames"):
             append(writer, frames[1])
     with pytest.raises(DataError, match="earlier write failed"):
         append(writer, frames[1])
@@ -53,7 +53,7 @@ def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
     append(writer, *frames[:3])
     with monkeypatch.context() as patch:
         patch.setattr(h5py.Dataset, "resize", Mock(side_effect=OSError(28, "No space left on device")))
-        with pytest.raises(DataError, match=r"s\.h5 could not store the end of a pass.*No space left.*first 3 frames"):
+        with pytest.raises(DataError, match=r"store the end of a pass in .*s\.h5.*No space left.*first 3 frames"):
             writer.end_pass()
     writer.add_decision({"choice": "next"})  # nothing more is written
     writer.close()

@@ -148,7 +148,7 @@ def test_a_done_that_falls_late_or_comes_early_ends_no_move(build: dict[str, flo
     [
         (lambda record: record.write(".SPMG", "Pause"), r"SPMG is Pause: somebody paused"),
         (lambda record: record.write(".STOP", 1), r"no reason given"),
-        (lambda record: record.write(".VAL", 3.0), r"VAL is 3\.0: another client sent it somewhere else"),
+        (lambda record: record.write(".VAL", 3.0), r"VAL is 3\.0: another client sent the motor somewhere else"),
     ],
     ids=["paused", "stopped", "sent elsewhere"],
 )
@@ -172,6 +172,6 @@ def test_a_disabled_record_that_takes_no_value_is_named() -> None:
     stage = _stage(url, clock)
     record.write(".DISP", 1)
     stage.start_move(math.radians(20), SPEED)
-    with pytest.raises(DeviceError, match=r"0\.0000 deg, 0 counts: DISP is 1:"):
+    with pytest.raises(DeviceError, match=r"0\.0000 deg, 0 counts: DISP is 1,"):
         stage.wait(60)
     stage.close()

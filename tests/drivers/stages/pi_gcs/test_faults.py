@@ -88,12 +88,12 @@ def test_a_code_after_a_command_is_given_in_words(rig: Rig, code: int) -> None:
 @pytest.mark.parametrize(
     ("reply", "says"),
     [
-        (b"2=0.000000\n", "does not have the form"),
-        (b"1=nan\n", "does not have the form"),
-        (b"1=1.79769e+308\n", "does not have the form"),
-        (b"\n", "does not have the form"),
+        (b"2=0.000000\n", "does not have the expected form"),
+        (b"1=nan\n", "does not have the expected form"),
+        (b"1=1.79769e+308\n", "does not have the expected form"),
+        (b"\n", "does not have the expected form"),
         (b"1=0.000000 \n", "no whole reply within 1 s"),
-        (b"1=0.000000 \n2=0.000000\n", "does not have the form"),
+        (b"1=0.000000 \n2=0.000000\n", "does not have the expected form"),
     ],
 )
 def test_a_spoilt_reply_is_named_and_the_next_request_is_in_step_again(rig: Rig, reply: bytes, says: str) -> None:

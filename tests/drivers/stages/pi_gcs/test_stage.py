@@ -74,7 +74,7 @@ def test_the_limits_of_an_endless_stage_may_be_as_large_as_numbers_are(rig: Rig,
     ("spoilt", "says"),
     [
         ((b"(c)2026 Physik Instrumente", b"(c)2026 Somebody"), "identity of a PI controller"),
-        ((b"2.0\n", b"1.1\n"), "does not talk GCS 2.0"),
+        ((b"2.0\n", b"1.1\n"), "does not use GCS 2.0"),
     ],
 )
 def test_another_controller_on_the_port_is_named(rig: Rig, spoilt: tuple[bytes, bytes], says: str) -> None:

@@ -95,7 +95,7 @@ def test_pulses_are_the_widest_that_the_interval_allows(rig: Rig) -> None:
 def test_a_chosen_width_is_the_one_set_and_a_single_pulse_may_be_wide(rig: Rig) -> None:
     stage = rig.open(pulse_width=1e-3)
     assert stage.describe()["pulse_width_s"] == 1e-3
-    with pytest.raises(DeviceRefused, match=r"not closer than 0\.002 s"):
+    with pytest.raises(DeviceRefused, match=r"at least 0\.002 s apart"):
         stage.arm(TriggerTrain(100, 14, 3))
     for train in (TriggerTrain(100, 15, 3), TriggerTrain(100, 1, 1)):
         stage.arm(train)

@@ -79,7 +79,7 @@ def test_a_reply_that_a_device_frames_is_read_back(
 def test_flags_become_words_and_advice_the_gravest_first() -> None:
     meaning = meaning_of(("FS", "WL", "WR"))
     assert meaning is not None
-    assert meaning.text.startswith("stalled and stopped (FS), a limit switch")
+    assert meaning.text.startswith("stalled and stopped (FS), reached a limit switch")
     assert "blocks the stage" in meaning.advice
     assert meaning_of(("WR", "NR")) is None
     unknown = meaning_of(("FX",))

@@ -70,7 +70,7 @@ def test_a_real_stages_turn_is_checked() -> None:
         ({"axis": 0}, "axis is 0"),
         ({"output": 0}, "output is 0"),
         ({"toggle": True, "pulse_width": 1e-3}, "choose a width or toggle"),
-        ({"acceleration": 1e-6}, "native values of .* and 0"),
+        ({"acceleration": 1e-6}, "native values .* and 0"),
         ({"max_speed": 0.0}, "max_speed is 0.0"),
     ],
 )
@@ -122,7 +122,7 @@ SLIPS = [
     ("WS", "stalled and recovered"),
     ("WM", "displaced while at rest"),
     ("NC", "moved by its knob"),
-    ("WL", "a limit switch came where none was expected"),
+    ("WL", "reached a limit switch at an unexpected position"),
 ]
 
 
@@ -216,7 +216,7 @@ def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -
 
 def test_the_reply_to_another_message_is_named_and_the_next_request_is_in_step_again() -> None:
     stage = Rig(faults={REPLIES_TO_OPEN: Fault.OTHER_ID}).open()
-    with pytest.raises(DeviceError, match=r"does not have the form.*reply to message"):
+    with pytest.raises(DeviceError, match=r"does not have the expected form.*reply to message"):
         stage.position()
     assert stage.position() == 0.0
 
