@@ -181,7 +181,7 @@ class OsSirtTv(VoxelMethod):
 
     @property
     def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume stands still."""
+        """Usual number of iterations until the volume has converged."""
         return min(self.iterations, USUAL_SWEEPS)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
