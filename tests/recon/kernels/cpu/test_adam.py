@@ -48,7 +48,7 @@ def test_what_would_be_updated_as_a_copy_is_refused() -> None:
             zeros = np.zeros(bad.shape, np.float32)
             values, gradients, first, second = _four(bad, zeros, zeros, zeros)
             adam_all(values, gradients, first, second, (0.1,) * 4, 1)
-    with pytest.raises(ValueError, match="of one shape"):
+    with pytest.raises(ValueError, match="have the same shape"):
         values, gradients, first, second = _four(whole, *[np.zeros((6, 4), np.float32)] * 3)
         adam_all(values, gradients, first, second, (0.1,) * 4, 1)
 
