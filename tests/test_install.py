@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import warnings
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -35,7 +36,9 @@ def loaded(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"install_{name}", FILES / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with warnings.catch_warnings():  # setuptools warns if another test has imported distutils before pip
+        warnings.filterwarnings("ignore", "Setuptools is replacing distutils")
+        spec.loader.exec_module(module)
     return module
 
 
