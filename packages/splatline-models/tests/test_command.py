@@ -83,8 +83,8 @@ def test_views_of_a_model_of_displaced_views_are_in_their_place(folder: Path) ->
 
 
 REFUSED = [
-    (("voxelise", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
-    (("render", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
+    (("voxelise", "f.h5", "-o", "x.h5"), 5, "contains no Gaussians"),
+    (("render", "f.h5", "-o", "x.h5"), 5, "contains no Gaussians"),
     (("render", "f.h5", "-o", "x.tif"), 2, "projections are written as HDF5"),
     (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "expected angles FIRST:END:STEP"),
     (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "expected angles FIRST:END:STEP"),
