@@ -382,9 +382,9 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),
-            "devices.camera.trigger_active level means that the exposure lasts as long as the pulse. Set "
-            f"devices.stage.pulse_width_s ({width}) to scan.exposure_s ({scan.exposure_s:g}), or "
-            "trigger_active: edge",
+            "with devices.camera.trigger_active: level, the exposure lasts as long as the pulse. Set "
+            f"devices.stage.pulse_width_s (now {width}) to the value of scan.exposure_s ({scan.exposure_s:g}), or set "
+            "devices.camera.trigger_active to edge",
         )
 
 

@@ -235,7 +235,7 @@ def write_legend(file: h5py.File) -> None:
     group.create_dataset("meaning", data=[check.meaning for check in CHECKS], dtype=text)
     file[SCORES].attrs["description"] = (
         "score of each check of flag_legend; NaN if the check did not flag the frame, or flagged it only "
-        "after later frames"
+        "when later frames had been taken"
     )
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"

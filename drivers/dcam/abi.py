@@ -167,7 +167,7 @@ def try_out(name: str, device: str) -> None:
         *_, last = process.communicate(timeout=STARTS_WITHIN)[1].decode(errors="replace").splitlines() or [""]
         if process.returncode == _SURVIVED:
             return
-        how = f"ends every process that starts it (code {process.returncode}{last and ', '}{last})"
+        how = f"ends every process that loads it (code {process.returncode}{last and ', '}{last})"
     except subprocess.TimeoutExpired:
         how = f"did not finish starting within {STARTS_WITHIN:g} s"
         process.kill()

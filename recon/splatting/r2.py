@@ -46,9 +46,9 @@ class R2(Fit):
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
         early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
             the lowest residual.
-        finish: iterations of the voxel refinement after the fit, see `finish.finish`. None: 8, then discrete levels or
-            PnP-DCT steps if these predict held-out projections better. `gaussians` of the result remain the fitted
-            model.
+        finish: iterations of the voxel refinement after the fit, see `finish.finish`. None: 8 iterations, and after
+            them discrete levels, or steps of PnP-DCT, if one of these predicts held-out projections better. `gaussians`
+            of the result remain the fitted model.
         allow_negative: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
         fit: weights, learning rates and limits.
     """

@@ -132,7 +132,7 @@ def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> Non
 @pytest.mark.parametrize(
     ("method", "iterations", "margin"),
     others_slow([("fista-tv", 10, 3.0), ("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0),
-                 ("os-sirt-tv", 20, 3.0)]),
+                 ("os-sirt-tv", 16, 3.0)]),
 )  # fmt: skip
 def test_classical_methods_by_the_same_call_beat_fbp(
     phantom: Phantom, noisy: np.ndarray, method: str, iterations: int, margin: float

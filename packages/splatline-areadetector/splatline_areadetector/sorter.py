@@ -89,7 +89,7 @@ class Basis(Enum):
     """How the number of a block's first frame was found, as the end of a sentence."""
 
     GIVEN = "the frame that ride.first_id states"
-    NUMBERS = "the frame whose number is the next after the last frame before the block"
+    NUMBERS = "the frame whose number follows the number of the last frame before the block"
     COUNTER = "the frame that the camera's own count shows"
     WAITED = "the first frame that arrived"
     UNKNOWN = "the first frame that arrived, although others may have come before it"

@@ -211,8 +211,8 @@ def _refuse_unlike(first: Any, own: Any, number: int, pixels: float) -> None:
     alike &= all(math.isclose(*turn, rel_tol=_ARCS_ALIKE) for turn in turns)
     if (own.detector_shape, own.sod, own.sdd) != (first.detector_shape, first.sod, first.sdd) or not alike:
         raise ConfigError(
-            f"Scan {number} does not fit scan 1: it has {own.detector_shape} pixels of {own.pixel_pitch:g} mm and "
-            f"turns {math.degrees(own.width.arc):.3g}° in an exposure; scan 1 has {first.detector_shape} pixels of "
-            f"{first.pixel_pitch:g} mm and {math.degrees(first.width.arc):.3g}°. If only the pixel sizes differ, by up "
-            "to a tenth, give --register."
+            f"Scan {number} does not fit scan 1: it has {own.detector_shape} pixels of {own.pixel_pitch:g} mm, and "
+            f"its stage turns by {math.degrees(own.width.arc):.3g}° in an exposure. Scan 1 has {first.detector_shape} "
+            f"pixels of {first.pixel_pitch:g} mm, and its stage turns by {math.degrees(first.width.arc):.3g}°. If only "
+            "the pixel sizes differ, by up to a tenth, give --register."
         )

@@ -82,7 +82,7 @@ class Discrete(VoxelMethod):
         return with_quality(self, quality)
 
     def refit(self, share: float) -> VoxelMethod:
-        """`EarlyTv` with `share` times the number of iterations for which the error bars are calibrated."""
+        """`EarlyTv` with a part of its iterations: `share` times the number that the calibration of error bars used."""
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
     @property
@@ -115,7 +115,7 @@ class Discrete(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because the levels need the iterations of the test reconstructions."""
+        """Empty: no time limit can end the method, because it needs all iterations of its tests to find levels."""
         return {}
 
     def toy(self) -> Self:

@@ -46,7 +46,7 @@ def test_poses_of_a_volume_come_back_as_a_table_that_gives_the_same_volume(tmp_p
     np.testing.assert_allclose(read(tmp_path / "a.h5", "view_shifts_px"), SHIFTS / 2)
     np.testing.assert_allclose(read(tmp_path / "a.h5", "view_roll_deg"), TURNS[:, 0])
     np.testing.assert_allclose(read(tmp_path / "a.h5", "view_tilt_deg"), TURNS[:, 1])
-    assert "Poses of the views" in (tmp_path / "a.html").read_text()
+    assert "Poses of the projections" in (tmp_path / "a.html").read_text()
     code, said = run("export", tmp_path / "a.h5", "-o", tmp_path / "a.csv", "--poses")
     axis = f"use --axis {read(tmp_path / 'a.h5', 'axis_col'):.2f} together with these --poses"
     assert code == 0 and "40" in said and axis in said, said

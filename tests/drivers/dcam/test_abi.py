@@ -98,7 +98,7 @@ def test_without_a_path_the_installed_library_is_looked_for() -> None:
         pytest.skip("the vendor's library is installed here")
 
 
-FATAL = {  # "did not finish starting" and "ends every process that starts it" stand in docs/faults.md
+FATAL = {  # "did not finish starting" and "ends every process that loads it" stand in docs/faults.md
     "crashes": ("int dcamapi_init(void *p) { return *(volatile int *)0; }", r"ends every process .*code (-11|1)\b"),
     "crashes as it is loaded": (
         "__attribute__((constructor)) void on(void) { __builtin_trap(); }",

@@ -322,7 +322,7 @@ OF_MOTION = (
 OF_CAMERA = (
     FaultElsewhere(
         "the camera's library hangs, or crashes",
-        "ends every process that starts it",
+        "ends every process that loads it",
         ("drivers/dcam/test_abi.py", "test_a_library_that_would_end_or_hang_this_process_is_refused"),
     ),
 )
