@@ -62,7 +62,7 @@ def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
     path, level = config.config_folder() / "instrument.yaml", "devices.camera.trigger_active=level"
     with pytest.raises(ConfigError, match=r"scan\.exposure_s \(0\.05\)"):
         load(path, level)
-    with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
+    with pytest.raises(ConfigError, match=r"pulse_width_s \(now 0\.001\)"):
         load(path, level, "devices.stage.pulse_width_s=0.001")
     zaber = "{kind: zaber, port: COM3, counts_per_turn: 384000, max_speed_deg_s: 30, acceleration_deg_s2: 60}"
     load(path, level, f"devices.stage={zaber}", "devices.stage.pulse_width_s=0.05")
