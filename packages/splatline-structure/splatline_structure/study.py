@@ -101,8 +101,8 @@ def study_structure(
             record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
             if record.length_unit != "mm":
                 raise DataError(
-                    f"{scan} does not state the pixel size. Make a copy that states it: `beamline ingest {scan} COPY.h5 "
-                    "--pixel-size-um SIZE`. Nothing was written."
+                    f"{scan} does not state the pixel size. Make a copy that states it: `beamline ingest {scan} "
+                    "COPY.h5 --pixel-size-um SIZE`. Nothing was written."
                 )
             axis_col = record.axis_col
             try:
