@@ -100,7 +100,7 @@ def test_the_two_images_are_made_by_the_same_lines() -> None:
     assert stated == arguments
     only_here = {"set -e", "export PATH=/opt/splatline/bin:$PATH", "rm -rf /src"}
     assert [line for line in lines if line not in only_here] == ran
-    assert f"docker.io/library/{re.findall('From: (.*)', text_of('splatline.def'))[0]}" == dict(docker)["FROM"]
+    assert re.findall("From: (.*)", text_of("splatline.def")) == [dict(docker)["FROM"]]
     assert 'exec beamline "$@"' in sections["runscript"]
 
 
