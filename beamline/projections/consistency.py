@@ -244,8 +244,8 @@ def _steady(
     )
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
-        size, more = odd, f"{odd:.2f} more in line integral than the neighbours differ from each other"
-        what = f"The intensity of the whole frame {frames[at]} differs from its neighbours in angle: {more}"
+        size, more = odd, f"{odd:.2f} in line integral more than these differ from each other"
+        what = f"The intensity of the whole frame {frames[at]} differs from its neighbours in angle, by {more}"
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
         "filter changed, or projections of another scan are among them. Use --views to choose "

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class Kernel(StrEnum):
-    """Profile f(q) of the squared distance q from the centre, in standard deviations; f(0) = 1.
+    """Profile f(q) of a Gaussian; q is the square of the distance from the centre in standard deviations, f(0) = 1.
 
         gaussian       exp(-q / 2)
         compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
 
-    R is chosen so that the compact kernel has the same second moment as the Gaussian; a covariance then means the same
-    for both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for
+    R is chosen so that both kernels have the same second moment. Therefore a covariance describes the same width for
+    both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for
     m = 3/2. Nothing has to be truncated. ∫ (1
     - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its projection is steeper at the edge and has no
       tail, which suits samples with sharp edges.

@@ -46,8 +46,8 @@ class CorrectionSettings:
         zinger_threshold: a pixel counts as a zinger if it is brighter by this many standard deviations than its
             surroundings and than the neighbouring projections, see `recon.prep.spots.spots`; inf: no zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
-            Each projection is divided by the level of these columns. If both sides have such columns, it is divided by
-            the line through the levels of both sides.
+            Each projection is divided by the level of these columns. If both sides have such columns, it is divided
+            by a straight line between the levels of the left and the right side.
         sample_from: limit of the line integral at the edges of the detector. Above it, "auto" decides that the edges
             show sample and not air, see `references.edge_depth`.
     """

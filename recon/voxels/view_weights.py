@@ -232,14 +232,10 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     order, beta, cells = _arc(geometry.angles)
     lacking = missing_arc(geometry)
     if lacking > 0:
-        need = (
-            f"another {np.rad2deg(lacking):.4g} degrees are"
-            if lacking < math.inf
-            else "angles without several gaps are"
-        )
+        need = f"another {np.rad2deg(lacking):.4g} degrees" if lacking < math.inf else "angles without several gaps"
         raise ValueError(
-            f"use an iterative method (fista-tv, sirt): for FDK {need} needed, because no projection sees some rays of "
-            "the field of view. FDK needs a full circle, or a short scan of 180 degrees plus the fan angle"
+            f"FDK needs {need}, because some rays through the field of view are in no projection. A full circle, or a "
+            "short scan of 180 degrees plus the fan angle, has them all. Or use an iterative method (fista-tv, sirt)"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
     most = (arc - np.pi) / 2

@@ -95,9 +95,9 @@ class StacksSource(ScanSource):
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(
-                    f"{self.path}: expected frames [frame, row, col] of one shape, apart from dimensions "
-                    f"of length one; found {shapes}. --order view,row,col states another order of "
-                    "dimensions."
+                    f"{self.path}: expected frames [frame, row, col] with equal numbers of rows and columns "
+                    f"(dimensions of length one do not count); found {shapes}. If the dimensions have another "
+                    "order, state the order, such as --order row,view,col."
                 )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset | NamedArray):

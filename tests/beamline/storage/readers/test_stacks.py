@@ -80,7 +80,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"data_path": "/raw"}, "has no dataset /raw. It has"),
         ({"flats_path": "/flat"}, "has no dataset /flat. It has"),
         ({"angles_path": "/theta"}, "has no dataset /theta. It has"),
-        ({"data_path": "/raw/before/one"}, r"expected frames \[frame, row, col\] of one shape"),
+        ({"data_path": "/raw/before/one"}, r"expected frames \[frame, row, col\] with equal numbers"),
         ({"data_path": "/note"}, r"expected frames .* found .*/note \(\)"),
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
         ({"angles_path": "/raw/before/one"}, r"has the shape \(4, 6\); expected a list of angles"),
