@@ -98,7 +98,7 @@ def with_points(numbers: Sequence[str]) -> list[str]:
         beside = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         raise ValueError(
             f"{one_line(commas[0], 40)} has a comma{beside}, and it is not clear whether this is a decimal "
-            "comma: write one number per line, with a decimal point"
+            "comma: write one number on a line, with a decimal point"
         )
     return [text.replace(",", ".") for text in numbers]
 
