@@ -78,7 +78,7 @@ def test_the_volume_is_that_without_a_cluster_to_the_bit(
     for more in (("-o", "here.h5"), ("--cluster", scheduler, "-o", "there.h5")):
         result = beamline(*fista, *more)
         assert result.exit_code == 0, result.output
-    assert "96 of 96 slices are there" in result.stderr
+    assert "96 of 96 slices are done" in result.stderr
     here, there = (read_reconstruction(Path(name)) for name in ("here.h5", "there.h5"))
     np.testing.assert_array_equal(there.volume.data, here.volume.data)
     assert there.metrics["residual"] == here.metrics["residual"]

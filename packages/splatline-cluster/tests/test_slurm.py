@@ -78,7 +78,7 @@ def test_a_batch_is_made_in_slabs_by_workers_of_slurm(environment: dict[str, str
     )
     worker = (tmp_path / "worker.log").read_text(encoding="utf-8")
     assert done.returncode == 0, done.stderr[-4000:] + worker[-2000:]
-    assert "96 of 96 slices are there" in done.stderr
+    assert "96 of 96 slices are done" in done.stderr
     with (tmp_path / "DAY" / "batch.csv").open(encoding="utf-8-sig", newline="") as file:
         assert [(row["name"], row["state"]) for row in csv.DictReader(file)] == [("a", "done"), ("b", "done")]
     assert (tmp_path / "DAY" / "a" / "recon.h5").is_file()
