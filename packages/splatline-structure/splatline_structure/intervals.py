@@ -197,7 +197,7 @@ def _interval(
     kind = name.split("_")[0]
     if not math.isfinite(value):
         nothing = (
-            "no part of the material connects the two faces"
+            "nothing connects the two faces within the material"
             if math.isinf(value)
             else "no particle is completely in the measured box"
         )
