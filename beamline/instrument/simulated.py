@@ -183,7 +183,10 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     try:
         phantom = mapping.get("phantom")
         of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # which may change
-        scene = (_scene.__wrapped__ if of_files else _scene)(_StatedScene(repr(mapping), mapping), folder)
+        if of_files:
+            scene = load_scene(mapping, volumes_beside(folder))
+        else:
+            scene = _kept_scene(_StatedScene(repr(mapping), mapping), folder)
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
@@ -200,8 +203,8 @@ class _StatedScene:
 
 
 @lru_cache(maxsize=2)
-def _scene(stated: _StatedScene, folder: Path) -> Scene:
-    """The scene, built once for the many scans of a queue that state it."""
+def _kept_scene(stated: _StatedScene, folder: Path) -> Scene:
+    """A scene without files, which is built once for all scans of a queue that state it."""
     return load_scene(stated.mapping, volumes_beside(folder))
 
 
