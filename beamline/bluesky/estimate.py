@@ -23,8 +23,8 @@ from beamline.scan.queue_plan import PlannedScan, ScanFault
 from beamline.scan.queue_planning import plan_of_config
 from drivers.base.protocols import TriggerSource
 
-MOST = 1_000_000
-"""Messages after which a plan counts as one without an end."""
+MOST = 500_000
+"""Messages after which a plan counts as one without an end: about a second."""
 _DONE = SimpleNamespace(done=True, success=True, exception=lambda timeout=None: None)
 """What a plan gets for a message that a RunEngine answers with a status."""
 

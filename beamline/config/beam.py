@@ -57,8 +57,8 @@ class StageMover(MotorSection):
     out_deg: float = setting(doc="Position of the sample while flats are taken.")
     mm_per_deg: float | None = setting(
         None,
-        "mm by which the sample moves towards higher columns of the frame per unit of the axis of the mover; "
-        "null: unknown, or the sample does not move across the beam.",
+        "Distance in mm that the sample moves per unit of the axis of the mover; positive: towards higher columns of "
+        "the frame. null: unknown, or the sample does not move across the beam.",
         ge=-1e3,
         le=1e3,
     )
@@ -87,8 +87,8 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter of which only the names of the positions are known: simulated without an effect on the intensity, or
-    changed by the operator."""
+    """A filter whose positions are known only by their names. It is simulated, without an effect on the intensity, or
+    the operator changes it by hand."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Setting(min_length=1)]

@@ -118,7 +118,7 @@ class TargetSection(Section):
     quality_db: float | None = setting(
         None,
         (
-            "Accepted loss: number of dB by which the PSNR of the volume may be lower than the PSNR after the "
+            "Accepted loss in dB: the PSNR of the volume may be lower by this much than it would be after the "
             "whole plan."
         ),
         gt=0,

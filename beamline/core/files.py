@@ -133,7 +133,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     """The path of a regular file at a relative path below a folder, for a library that opens it by its name.
 
     Use it for files that other people wrote: the folder itself may be a link, but nothing below it. Raises OSError as
-    `require_regular`, and if there is no file.
+    `require_regular` does, and if the file does not exist.
     """
     parts, place = PurePosixPath(name).parts, folder
     for part in parts:

@@ -98,9 +98,9 @@ class ShownScan:
         self._source.close()
 
     def facts(self) -> dict[str, Any]:
-        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each projection so far
-        (null: not read), two projections about 180 degrees apart and the difference of their angle from 180 degrees
-        (null: there are none)."""
+        """What the page shows of the scan: its format and angles, in a sentence; the kinds of frames that have a mean;
+        the mean intensity of each projection so far (null: not read). And two projections about 180 degrees apart, with
+        the difference of their angles from 180 degrees (null: the scan has no such pair)."""
         known = self._degrees[np.isfinite(self._degrees)]
         angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
         over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"
