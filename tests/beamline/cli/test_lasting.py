@@ -1,6 +1,7 @@
 """If a terminal or disk accepts no output, no command ends, and no exit code of a command that writes files changes."""
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ POSIX = pytest.mark.skipif(not FULL.exists(), reason="the system has no device t
 
 
 def _run(folder: Path, redirected: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    words = " ".join([sys.executable, "-m", "beamline.cli.main", *arguments])
+    words = shlex.join([sys.executable, "-m", "beamline.cli.main", *arguments])
     return subprocess.run(
         ["bash", "-c", f"{words} {redirected}"], cwd=folder, capture_output=True, text=True, timeout=200
     )
