@@ -37,6 +37,7 @@ def test_a_run_is_paused_resumed_and_complete(tmp_path: Path) -> None:
     def pause() -> None:
         (run,) = tmp_path.iterdir()
         asked(run, Verb.PAUSE)
+        asked(run, Verb.PAUSE)  # requests are obeyed one after the other: once this one is taken, the first is obeyed
 
     def resume(event: Event) -> None:
         if event.data.get("state") == State.PAUSED:
