@@ -29,6 +29,7 @@ from recon.assess.metrics import psnr
 from recon.base.method import Progress, Reconstruction
 from recon.prep.projections import Projections
 from recon.splatting.stream import StreamingFit
+from recon.splatting.stream_states import Growing
 from tests.beamline.reconstruct.growing_scan import (
     BRIEF,
     EPOCH,
@@ -153,8 +154,9 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     assert not told or ((air, gain) == ("none", 1.3) and all("in line integral" in each for each in told))
     np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
     np.testing.assert_array_equal(judged[0].projections.view_ids, whole.projections.view_ids)
-    problem = fits[0]._problem
-    assert problem is not None
+    model = fits[0]._stage
+    assert isinstance(model, Growing)
+    problem = model.problem
     np.testing.assert_array_equal(np.stack(problem.images), whole.projections.data / problem.scale)
     again = [event for event in events if event.event == "state" and event.data["state"] == "correcting"]
     assert [event.data["message"].split(",")[0] for event in again] == ["Correcting all projections again"]

@@ -16,6 +16,7 @@ from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.splatting.stream import StreamingFit
+from recon.splatting.stream_states import Growing
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
@@ -184,9 +185,9 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
         model.replace_newest(data[last - 1] + 1)
         model.replace_newest(data[last - 1])
         model.advance(0.0)
-    assert model.started and model._problem is not None and model.n_views == 22
-    np.testing.assert_allclose(model._problem.projections, data[:22], atol=1e-5)
-    np.testing.assert_allclose(model._problem.geometry.angles, ANGLES[:22])
+    assert isinstance(model._stage, Growing) and model.n_views == 22
+    np.testing.assert_allclose(model._stage.problem.projections, data[:22], atol=1e-5)
+    np.testing.assert_allclose(model._stage.problem.geometry.angles, ANGLES[:22])
     with pytest.raises(ValueError, match="no projection to replace"):
         StreamingFit(VIEWS, GRID).replace_newest(data[0])
     with pytest.raises(ValueError, match="were not added"):

@@ -1,0 +1,411 @@
+"""States of a streamed fit: before it has a model, with a model that grows, and in its final fit.
+
+`Waiting` becomes `Growing` when there are enough projections. `Growing` becomes `Waiting` again if very different line
+integrals replace those that it was placed with. `Finishing` is the final fit of a `Growing` model.
+
+A function of a state returns the next state and leaves the state as it was, except the model `Growing.state`. Functions
+change the model in place, because a copy of it takes as long as a step. So use only the newest `Growing` of a fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.base.view_data import Views
+from recon.base.volume import Grid, Volume
+from recon.splatting import optimise as fit
+from recon.splatting.anytime import (
+    HALF,
+    average,
+    averaged,
+    covered_angle,
+    fallen,
+    is_held_out,
+    next_view,
+    shift_with_axis,
+)
+from recon.splatting.initialise import default_count, first_volume, place, sample_gaussians, scale_to_data
+from recon.splatting.problem import FitProblem, extend, with_projections
+from recon.splatting.settings import FitSettings, growth
+from recon.voxels.beyond_field import sample_radius
+
+_GROWTH = 1.5  # a new round begins when the number of projections has grown by this factor
+_YOUNG = 16  # a round that begins with fewer projections, after HALF steps, places all Gaussians again
+_LAST_GROWTH = 0.5  # density control ends at this share of the final fit
+_AXIS_ANEW = 0.3  # px; if the axis moves by this much, the rates start again; a smaller move raises them in part
+_OTHERS = 0.2  # if replaced projections change by more than this share of their norm, the Gaussians are placed again
+# Without it: -0.4 to -13.5 dB on three scenes (texture, plates, points) in which the first 3 to 16 of 48 projections
+# are empty.
+_BLIND = 100.0  # if data are larger than the density unit implies by this factor, the first projections were empty
+# largest number of voxels, so that a placement takes about a second; new projections wait meanwhile
+_PLACED_FROM = 2**22
+# share of the first number of Gaussians that a round may add; the final fit may add the rest of the growth
+_ROUND_GROWTH = 0.25
+
+
+@dataclass(frozen=True)
+class StreamPlan:
+    """How a streamed fit is made. It never changes.
+
+    Attributes:
+        settings: settings of the fitting steps.
+        grid: grid of the snapshots.
+        count: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
+        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
+            π).
+    """
+
+    settings: FitSettings
+    grid: Grid
+    count: int | None
+    first_views: int
+    first_span: float
+
+
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """The projections of a streamed fit in the order of their arrival, without their pixels.
+
+    Attributes:
+        template: geometry of each of them, at the angle 0.
+        angles: [view] radians.
+        held_out: [view] True for a projection that no step uses until the final fit. The value stays if earlier
+            projections are dropped.
+        n_ever: number of projections that ever arrived, including those that were dropped.
+    """
+
+    template: Geometry
+    angles: F64 = field(default_factory=lambda: np.empty(0))
+    held_out: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
+    n_ever: int = 0
+
+    @property
+    def n(self) -> int:
+        return self.angles.size
+
+    @property
+    def geometry(self) -> Geometry:
+        return self.template.at(self.angles)
+
+    def followed_by(self, angles: F64) -> Arrivals:
+        """These projections and new ones at `angles`."""
+        held_out = [is_held_out(self.n_ever + k) for k in range(angles.size)]
+        return replace(
+            self,
+            angles=np.append(self.angles, angles),
+            held_out=np.append(self.held_out, np.array(held_out, bool)),
+            n_ever=self.n_ever + angles.size,
+        )
+
+    def only(self, which: NDArray[np.intp]) -> Arrivals:
+        """Those with these numbers, in this order."""
+        return replace(self, angles=self.angles[which], held_out=self.held_out[which])
+
+    def about(self, axis_col: float) -> Arrivals:
+        """The same projections with the rotation axis at another column."""
+        return replace(self, template=replace(self.template, axis_col=axis_col))
+
+
+@dataclass(frozen=True, eq=False)
+class Waiting:
+    """A streamed fit without a model: there are too few projections, or they show no material.
+
+    Attributes:
+        views: the projections so far.
+        images: line integrals [row, col] of each; NaN: no data.
+        rng: of the placement and the steps.
+        round_views: number of projections at the last attempt to place Gaussians; 0: there was none.
+    """
+
+    views: Arrivals
+    images: tuple[F32, ...]
+    rng: np.random.Generator
+    round_views: int = 0
+
+    def followed_by(self, images: F32, angles: F64) -> Waiting:
+        """With new projections [view, row, col]."""
+        return replace(self, views=self.views.followed_by(angles), images=(*self.images, *images))
+
+    def with_newest(self, image: F32) -> Waiting:
+        """With other line integrals [row, col] of the newest projection."""
+        return replace(self, images=(*self.images[:-1], image))
+
+    def with_images(self, images: F32, kept: NDArray[np.intp] | None) -> Waiting:
+        """With other line integrals [view, row, col] of projections `kept`; None: of all."""
+        views = self.views if kept is None else self.views.only(kept)
+        return Waiting(views, tuple(images), self.rng)
+
+    def about(self, axis_col: float) -> Waiting:
+        """With the rotation axis at another column."""
+        return replace(self, views=self.views.about(axis_col))
+
+    def next_round(self, plan: StreamPlan) -> Waiting | Growing:
+        """Place the first Gaussians if half as many projections again have arrived, and they cover enough angles.
+
+        If they show no material, the fit waits for half as many again.
+        """
+        angles = self.views.angles
+        early = self.views.n < _GROWTH * self.round_views or angles.size < plan.first_views
+        if early or covered_angle(angles) < plan.first_span:
+            return self
+        try:
+            model = _placed(self.views, self.images, plan, self.rng, all_views=False)
+        except ValueError:  # these projections show no material
+            return replace(self, round_views=self.views.n)
+        return model._with_room(plan, final=False)
+
+    def completed(self, plan: StreamPlan) -> Growing:
+        """The model for the final fit, placed with all projections.
+
+        Raises:
+            ValueError: the projections show no material.
+        """
+        return _placed(self.views, self.images, plan, self.rng, all_views=True)._with_room(plan, final=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Growing:
+    """A streamed fit with a model.
+
+    Attributes:
+        views: the projections so far.
+        problem: their line integrals as the steps use them, with the geometry of `views`.
+        state: the model. The steps, a new round and a move of the axis change it in place.
+        placed: number of Gaussians at the last placement.
+        schedule_step: the step from which the decay of the learning rates is counted.
+        round_views: number of projections at the begin of this round.
+        unseen: projections that no step has used, in the order of arrival.
+    """
+
+    views: Arrivals
+    problem: FitProblem
+    state: fit.FitState
+    placed: int
+    schedule_step: int = 0
+    round_views: int = 0
+    unseen: tuple[int, ...] = ()
+
+    def followed_by(self, images: F32, angles: F64) -> Growing:
+        """With new projections [view, row, col]; a projection is used in the first step after its arrival.
+
+        Raises:
+            ValueError: a projection has no usable value.
+        """
+        problem, views = extend(self.problem, images, angles), self.views.followed_by(angles)
+        new = tuple(view for view in range(self.views.n, views.n) if not views.held_out[view])
+        return replace(self, problem=problem, views=views, unseen=self.unseen + new)
+
+    def with_newest(self, image: F32) -> Growing:
+        """With other line integrals [row, col] of the newest projection.
+
+        Raises:
+            ValueError: it has no usable value.
+        """
+        problem, angles = self.problem, self.views.angles
+        others = replace(
+            problem, geometry=self.views.template.at(angles[:-1]), images=problem.images[:-1],
+            target_maps=problem.target_maps[:-1], weights=problem.weights[:-1],
+        )  # fmt: skip
+        return replace(self, problem=extend(others, image[None], angles[-1:]))
+
+    def with_images(self, images: F32, kept: NDArray[np.intp] | None) -> Growing | Waiting:
+        """With other line integrals [view, row, col] of projections `kept`; None: of all.
+
+        The model goes if they differ by a fifth from those with which it was placed. If some projections are dropped,
+        the learning rates start again, because the model has learnt from bad projections.
+
+        Raises:
+            ValueError: a projection has no usable value.
+        """
+        which = np.arange(self.views.n) if kept is None else kept
+        views = self.views.only(which)
+        if self._others(images, which):
+            return Waiting(views, tuple(images), self.state.rng)
+        problem = with_projections(replace(self.problem, geometry=views.geometry), images)
+        if kept is None:
+            return replace(self, problem=problem)
+        self.state.drawn, self.state.mean = [], None
+        return replace(
+            self, views=views, problem=problem, unseen=(), schedule_step=self.state.step,
+            round_views=min(self.round_views, views.n),
+        )  # fmt: skip
+
+    def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
+        """Whether these line integrals differ from projections `which` by more than a fifth (norm)."""
+        changed = total = 0.0
+        for view, image in zip(which, images, strict=True):
+            before = self.problem.backend.numpy(self.problem.images[view]) * self.problem.scale
+            changed += float(np.nansum(np.square(image - before, dtype=np.float64)))
+            total += float(np.nansum(np.square(image, dtype=np.float64)))
+        return changed > _OTHERS**2 * total
+
+    def about(self, axis_col: float) -> Growing:
+        """With the rotation axis at another column. The model moves with it to its position in the projections.
+
+        The remaining errors are double edges, which the model must correct, so the learning rates rise again.
+        """
+        template, state = self.views.template, self.state
+        moved = axis_col - template.axis_col
+        shift = shift_with_axis(self.views.angles, moved * template.sample_pitch)
+        for parameters in (state.parameters, state.mean):
+            if parameters is not None:
+                parameters["means"][:, :2] -= shift
+        kept = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
+        return replace(
+            self,
+            views=self.views.about(axis_col),
+            problem=replace(self.problem, geometry=replace(self.problem.geometry, axis_col=axis_col)),
+            schedule_step=state.step - round(kept * (state.step - self.schedule_step)),
+        )
+
+    def next_round(self, plan: StreamPlan) -> Growing:
+        """Begin a round if half as many projections again have arrived: there is room for more Gaussians, and steps
+        draw from all projections. After many steps with few projections, all Gaussians are placed again.
+        """
+        if self.views.n < _GROWTH * self.round_views:
+            return self
+        young = self.views.n < _YOUNG and self.state.step >= HALF
+        return self._placed_again(plan, young=young, final=False)._with_room(plan, final=False)
+
+    def completed(self, plan: StreamPlan) -> Growing:
+        """The model for the final fit: with room for all Gaussians, from the better parameters (the running mean)."""
+        model = self._placed_again(plan, young=False, final=True)._with_room(plan, final=True)
+        if model.state.mean is not None:
+            model.state.parameters = {name: values + 0 for name, values in model.state.mean.items()}
+        return replace(model, unseen=())
+
+    def _placed_again(self, plan: StreamPlan, young: bool, final: bool) -> Growing:
+        """With all Gaussians placed again if the model is young, or if the first projections were empty."""
+        # Either the sample or the beam came later, so the density unit is noise; or the projections were too few.
+        problem = self.problem
+        blind = max(float(image.max()) for image in problem.images) > _BLIND
+        if not (blind or young):
+            return self
+        views = zip(problem.projections, problem.weights, strict=True)
+        images = [view if w is None else np.where(w == 0, np.float32(np.nan), view) for view, w in views]
+        return _placed(self.views, images, plan, self.state.rng, all_views=final, known=None if blind else self)
+
+    def _with_room(self, plan: StreamPlan, final: bool) -> Growing:
+        """With room for more Gaussians; the steps draw from all projections that are there now.
+
+        Early projections span a narrow angle and would use all Gaussians for streaks, so a round adds only some.
+        """
+        most = round(self.placed * growth(plan.settings))
+        self.state.limit = most if final else min(most, self.state.n + round(_ROUND_GROWTH * self.placed))
+        self.state.drawn = []
+        return replace(self, round_views=self.views.n)
+
+    def stepped(self, settings: FitSettings) -> Growing:
+        """After one more step: on a projection that no step has used if there is one."""
+        state = self.state
+        if len(state.drawn) < settings.views_per_step:
+            drawn = state.rng.permutation(self.views.n)
+            state.drawn = drawn[~self.views.held_out[drawn]].tolist()
+        view = self.unseen[0] if self.unseen else next_view(self.views.n, state.rng)
+        if view is not None and self.views.held_out[view]:
+            view = None
+        fit.step(state, self.problem, settings, self.fraction(settings), view)
+        average(state, self.schedule_step)
+        return replace(self, unseen=self.unseen[1:]) if self.unseen else self
+
+    def fraction(self, settings: FitSettings) -> float:
+        """Position of the learning rates in their decay, 0 to 1."""
+        return fallen(self.state.step - self.schedule_step, settings)
+
+    def newest(self, settings: FitSettings) -> tuple[F32, F32]:
+        """The newest projection and that of the model, line integrals [row, col]; equal in pixels without data."""
+        problem = self.problem
+        (image,) = fit.renders(averaged(self.state), problem, settings, [self.views.n - 1])
+        measured, weight = problem.images[-1] * problem.scale, problem.weights[-1]
+        rendered: F32 = problem.backend.numpy(image) * problem.scale
+        return measured, rendered if weight is None else np.where(weight == 0, measured, rendered)
+
+    def volume(self, grid: Grid, settings: FitSettings) -> Volume:
+        """The volume of the model in 1/mm."""
+        return fit.volume_of(averaged(self.state), grid, self.views.template, settings)
+
+
+@dataclass(frozen=True, eq=False)
+class Finishing:
+    """The final fit of a model: the learning rates decay to their end.
+
+    Attributes:
+        model: the model, `completed`.
+        steps: number of steps of the final fit, unless a time limit ends it.
+        begun: number of steps before the final fit.
+        first: position of the learning rates in their decay at its begin, 0 to 1.
+    """
+
+    model: Growing
+    steps: int
+    begun: int
+    first: float
+
+    @classmethod
+    def of(cls, model: Growing, steps: int, settings: FitSettings) -> Finishing:
+        """The final fit of a model, before its first step."""
+        return cls(model, steps, model.state.step, model.fraction(settings))
+
+    @property
+    def share(self) -> float:
+        """Share of the steps that are done."""
+        return (self.model.state.step - self.begun) / self.steps
+
+    def step(self, settings: FitSettings, share: float) -> None:
+        """One step. `share` is the share of the final fit that is over, by steps or by time; density control ends in
+        the middle.
+        """
+        state = self.model.state
+        settings = settings if share < _LAST_GROWTH else replace(settings, policy=None)
+        fit.step(state, self.model.problem, settings, self.first + (1 - self.first) * share)
+        average(state, self.begun)
+
+
+def _placed(
+    views: Arrivals,
+    images: Sequence[F32],
+    plan: StreamPlan,
+    rng: np.random.Generator,
+    *,
+    all_views: bool,
+    known: Growing | None = None,
+) -> Growing:
+    """A model placed with an FBP of the projections, or with the volume of a `known` model and an FBP of its residual.
+
+    Held-out projections are not used, unless `all_views` is True.
+
+    Raises:
+        ValueError: the projections show no material.
+    """
+    all_of = Views(np.stack(images), views.geometry).masked()
+    learnt = [view for view in range(views.n) if all_views or not views.held_out[view]]
+    geometry, seen = all_of.geometry.select(learnt), all_of.data[learnt]
+    wider = sample_radius(all_of)
+    box = plan.grid if wider is None else plan.grid.reaching(wider.radius, views.template)
+    field = Grid.for_fit(views.template, box, wider=wider is not None)
+    coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / _PLACED_FROM) / 3))
+    shape = (field.shape[0], *(math.ceil(n / coarser) for n in field.shape[1:]))
+    rough = replace(field, shape=shape, voxel_size=coarser * field.voxel_size)
+    rough = Grid.for_fit(views.template, rough, wider=wider is not None)
+    count = plan.count or default_count(views.template, field.voxel_size)
+    kernel = plan.settings.kernel
+    if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
+        volume = first_volume(seen, geometry, rough)
+        gaussians = place(volume, seen, geometry, count, rng, kernel=kernel)
+    else:
+        model, problem = averaged(known.state), known.problem
+        rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))
+        left = first_volume(seen - rendered * problem.scale, geometry, rough)
+        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + left.data, rough)
+        radius = geometry.reach if wider is None else math.inf
+        gaussians = sample_gaussians(volume, count, rng, field_radius=radius, kernel=kernel)
+        gaussians = scale_to_data(gaussians, seen, geometry)
+    problem = fit.problem_of(all_of, field, gaussians.density_unit, plan.settings)
+    return Growing(views, problem, fit.init(gaussians, rng), gaussians.n)
