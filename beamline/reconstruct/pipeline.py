@@ -80,7 +80,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 channels.warn(
                     f"Stopped during the scan: the volume is reconstructed from the first {count(n, 'projection')}."
                 )
-            prepared = follower.prepared()
+            last = follower.end()
 
         def facts() -> ScanFacts:
             # Open it again, because HDF5 may still have the old texts, from before the scan ended.
@@ -90,9 +90,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
         phases = Phases(sink, clock)  # a new one, because waiting for projections does not count as work
         phases.enter("final fit")
-        final_fit = follower.final_fit(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
+        final_fit = follower.final_fit(last, options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
-        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
+        yield Job(options, channels, last.prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
     follower.snapshots.remove()
 
 

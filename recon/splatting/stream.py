@@ -31,7 +31,8 @@ from recon.splatting import optimise as fit
 from recon.splatting.anytime import WHILE_VIEWS_COME, BetterVolume, PredictionErrors, averaged, checked_views
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from recon.splatting.stream_states import Arrivals, Finishing, Growing, StreamPlan, Waiting
+from recon.splatting.stream_placement import Arrivals, StreamPlan
+from recon.splatting.stream_states import Finishing, Growing, Waiting
 
 _NEW = 0.2  # weight of the newest projection in the running mean of residuals before a projection is used
 
@@ -174,6 +175,12 @@ class StreamingFit:
         The remaining errors are double edges, which the model must correct, so the rates rise again.
         """
         self._stage = self._stage.about(float(axis_col))
+
+    def clear(self) -> None:
+        """Drop all projections and the model, so that their memory is free."""
+        views = self._stage.views
+        rng = self._stage.state.rng if isinstance(self._stage, Growing) else self._stage.rng
+        self._stage = Waiting(Arrivals(views.template), (), rng)
 
     def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step if there is a model), and return the progress."""

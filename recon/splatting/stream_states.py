@@ -9,16 +9,12 @@ change the model in place, because a copy of it takes as long as a step. So use 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.geometry import Geometry
-from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -27,14 +23,12 @@ from recon.splatting.anytime import (
     averaged,
     covered_angle,
     fallen,
-    is_held_out,
     next_view,
     shift_with_axis,
 )
-from recon.splatting.initialise import default_count, first_volume, place, sample_gaussians, scale_to_data
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.voxels.beyond_field import sample_radius
+from recon.splatting.stream_placement import Arrivals, Placement, StreamPlan, place_gaussians
 
 _GROWTH = 1.5  # a new round begins when the number of projections has grown by this factor
 _YOUNG = 16  # a round that begins with fewer projections, after HALF steps, places all Gaussians again
@@ -44,73 +38,8 @@ _OTHERS = 0.2  # if replaced projections change by more than this share of their
 # Without it: -0.4 to -13.5 dB on three scenes (texture, plates, points) in which the first 3 to 16 of 48 projections
 # are empty.
 _BLIND = 100.0  # if data are larger than the density unit implies by this factor, the first projections were empty
-# largest number of voxels, so that a placement takes about a second; new projections wait meanwhile
-_PLACED_FROM = 2**22
 # share of the first number of Gaussians that a round may add; the final fit may add the rest of the growth
 _ROUND_GROWTH = 0.25
-
-
-@dataclass(frozen=True)
-class StreamPlan:
-    """How a streamed fit is made. It never changes.
-
-    Attributes:
-        settings: settings of the fitting steps.
-        grid: grid of the snapshots.
-        count: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
-        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
-            π).
-    """
-
-    settings: FitSettings
-    grid: Grid
-    count: int | None
-    first_views: int
-    first_span: float
-
-
-@dataclass(frozen=True, eq=False)
-class Arrivals:
-    """The projections of a streamed fit in the order of their arrival, without their pixels.
-
-    Attributes:
-        template: geometry of each of them, at the angle 0.
-        angles: [view] radians.
-        held_out: [view] True for a projection that no step uses until the final fit. The value stays if earlier
-            projections are dropped.
-        n_ever: number of projections that ever arrived, including those that were dropped.
-    """
-
-    template: Geometry
-    angles: F64 = field(default_factory=lambda: np.empty(0))
-    held_out: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
-    n_ever: int = 0
-
-    @property
-    def n(self) -> int:
-        return self.angles.size
-
-    @property
-    def geometry(self) -> Geometry:
-        return self.template.at(self.angles)
-
-    def followed_by(self, angles: F64) -> Arrivals:
-        """These projections and new ones at `angles`."""
-        held_out = [is_held_out(self.n_ever + k) for k in range(angles.size)]
-        return replace(
-            self,
-            angles=np.append(self.angles, angles),
-            held_out=np.append(self.held_out, np.array(held_out, bool)),
-            n_ever=self.n_ever + angles.size,
-        )
-
-    def only(self, which: NDArray[np.intp]) -> Arrivals:
-        """Those with these numbers, in this order."""
-        return replace(self, angles=self.angles[which], held_out=self.held_out[which])
-
-    def about(self, axis_col: float) -> Arrivals:
-        """The same projections with the rotation axis at another column."""
-        return replace(self, template=replace(self.template, axis_col=axis_col))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +85,10 @@ class Waiting:
         if early or covered_angle(angles) < plan.first_span:
             return self
         try:
-            model = _placed(self.views, self.images, plan, self.rng, all_views=False)
+            first = place_gaussians(self.views, self.images, plan, self.rng, all_views=False)
         except ValueError:  # these projections show no material
             return replace(self, round_views=self.views.n)
-        return model._with_room(plan, final=False)
+        return Growing.of(self.views, first)._with_room(plan, final=False)
 
     def completed(self, plan: StreamPlan) -> Growing:
         """The model for the final fit, placed with all projections.
@@ -167,7 +96,8 @@ class Waiting:
         Raises:
             ValueError: the projections show no material.
         """
-        return _placed(self.views, self.images, plan, self.rng, all_views=True)._with_room(plan, final=True)
+        first = place_gaussians(self.views, self.images, plan, self.rng, all_views=True)
+        return Growing.of(self.views, first)._with_room(plan, final=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +121,11 @@ class Growing:
     schedule_step: int = 0
     round_views: int = 0
     unseen: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, views: Arrivals, first: Placement) -> Growing:
+        """A model before its first step and its first round."""
+        return cls(views, first.problem, first.state, first.state.n)
 
     def followed_by(self, images: F32, angles: F64) -> Growing:
         """With new projections [view, row, col]; a projection is used in the first step after its arrival.
@@ -290,7 +225,9 @@ class Growing:
             return self
         views = zip(problem.projections, problem.weights, strict=True)
         images = [view if w is None else np.where(w == 0, np.float32(np.nan), view) for view, w in views]
-        return _placed(self.views, images, plan, self.state.rng, all_views=final, known=None if blind else self)
+        known = None if blind else Placement(problem, self.state)
+        again = place_gaussians(self.views, images, plan, self.state.rng, all_views=final, known=known)
+        return Growing.of(self.views, again)
 
     def _with_room(self, plan: StreamPlan, final: bool) -> Growing:
         """With room for more Gaussians; the steps draw from all projections that are there now.
@@ -366,46 +303,3 @@ class Finishing:
         settings = settings if share < _LAST_GROWTH else replace(settings, policy=None)
         fit.step(state, self.model.problem, settings, self.first + (1 - self.first) * share)
         average(state, self.begun)
-
-
-def _placed(
-    views: Arrivals,
-    images: Sequence[F32],
-    plan: StreamPlan,
-    rng: np.random.Generator,
-    *,
-    all_views: bool,
-    known: Growing | None = None,
-) -> Growing:
-    """A model placed with an FBP of the projections, or with the volume of a `known` model and an FBP of its residual.
-
-    Held-out projections are not used, unless `all_views` is True.
-
-    Raises:
-        ValueError: the projections show no material.
-    """
-    all_of = Views(np.stack(images), views.geometry).masked()
-    learnt = [view for view in range(views.n) if all_views or not views.held_out[view]]
-    geometry, seen = all_of.geometry.select(learnt), all_of.data[learnt]
-    wider = sample_radius(all_of)
-    box = plan.grid if wider is None else plan.grid.reaching(wider.radius, views.template)
-    field = Grid.for_fit(views.template, box, wider=wider is not None)
-    coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / _PLACED_FROM) / 3))
-    shape = (field.shape[0], *(math.ceil(n / coarser) for n in field.shape[1:]))
-    rough = replace(field, shape=shape, voxel_size=coarser * field.voxel_size)
-    rough = Grid.for_fit(views.template, rough, wider=wider is not None)
-    count = plan.count or default_count(views.template, field.voxel_size)
-    kernel = plan.settings.kernel
-    if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
-        volume = first_volume(seen, geometry, rough)
-        gaussians = place(volume, seen, geometry, count, rng, kernel=kernel)
-    else:
-        model, problem = averaged(known.state), known.problem
-        rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))
-        left = first_volume(seen - rendered * problem.scale, geometry, rough)
-        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + left.data, rough)
-        radius = geometry.reach if wider is None else math.inf
-        gaussians = sample_gaussians(volume, count, rng, field_radius=radius, kernel=kernel)
-        gaussians = scale_to_data(gaussians, seen, geometry)
-    problem = fit.problem_of(all_of, field, gaussians.density_unit, plan.settings)
-    return Growing(views, problem, fit.init(gaussians, rng), gaussians.n)

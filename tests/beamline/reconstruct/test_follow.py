@@ -15,10 +15,9 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.sinks import Warnings
 from beamline.projections.selection import Selection
-from beamline.reconstruct import live_fit as module
-from beamline.reconstruct import snapshots
-from beamline.reconstruct.followed_views import FollowState
+from beamline.reconstruct import live_steps, snapshots
 from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.live_states import Feeds, WaitsForAxis, WaitsForReferences
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
@@ -118,7 +117,7 @@ def test_a_stop_delivers_the_views_so_far_if_they_make_a_volume(
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     if np.isinf(seconds):
         close(clock)
-        monkeypatch.setattr(module, "BATCH_VIEWS", 8)
+        monkeypatch.setattr(live_steps, "BATCH_VIEWS", 8)
 
     @contextmanager
     def soon() -> Iterator[Callable[[], bool]]:
@@ -261,12 +260,11 @@ def test_it_waits_for_references_then_for_the_axis_then_feeds(tmp_path: Path) ->
         for n in (4, 1, 29):  # references, the first view, the others
             clock.sleep(n)
             assert follower.take_new_frames(False)
-            states.append((follower.state, follower.n_views_taken))
-        assert follower.axis_col == pytest.approx(SCAN.axis_col, abs=0.5)
+            states.append((type(follower.state), follower.n_views_taken))
+        assert isinstance(follower.state, Feeds)
+        assert follower.state.axis_col == pytest.approx(SCAN.axis_col, abs=0.5)
     close(clock)
-    assert states == [
-        (FollowState.WAITS_FOR_REFERENCES, 0), (FollowState.WAITS_FOR_AXIS, 0), (FollowState.FEEDS, 30)
-    ]  # fmt: skip
+    assert states == [(WaitsForReferences, 0), (WaitsForAxis, 0), (Feeds, 30)]
 
 
 def test_references_that_follow_the_views_are_waited_for_until_the_scan_has_ended(tmp_path: Path) -> None:
@@ -276,10 +274,10 @@ def test_references_that_follow_the_views_are_waited_for_until_the_scan_has_ende
         for _ in range(2):
             clock.sleep(20.0)
             follower.take_new_frames(False)
-            assert follower.state is FollowState.WAITS_FOR_REFERENCES
+            assert isinstance(follower.state, WaitsForReferences)
         assert [event.data["state"] for event in events] == ["waiting"]
         follower.take_new_frames(True)
-        assert follower.state is FollowState.FEEDS and follower.n_views_taken == 30
+        assert isinstance(follower.state, Feeds) and follower.n_views_taken == 30
     close(clock)
 
 

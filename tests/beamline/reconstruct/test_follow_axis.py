@@ -97,10 +97,11 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
-    search = followed_views.AxisSearch(source, selected, warn)
+    followed = followed_views.FollowedViews(source, selected)
+    search, col = followed_views.AxisSearch(), None
     for n in range(1, 101):
-        search.look(correction, np.arange(n), False)
-        assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
-    assert 50 in looks and looks[-1] == 100 and search.col == 20.7
+        search, col = search.look(followed, correction, np.arange(n), col, ended=False, warn=warn)
+        assert (col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
+    assert 50 in looks and looks[-1] == 100 and col == 20.7
     assert len(set(told)) == 1 and "--axis COLUMN" in told[0] and "optics.axis_col" in told[0]
     assert warn.messages == []  # the report does not say that the axis is unknown, which was found

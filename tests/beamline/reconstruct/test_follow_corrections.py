@@ -16,8 +16,8 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct import pipeline
-from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct import live_end, live_steps, pipeline
+from beamline.reconstruct.live_states import Feeds, LiveScan
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.record import write_result
 from beamline.storage.parts import join
@@ -182,13 +182,14 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     schedule(clock, tmp_path / "rest.h5", later, plan=json.dumps(plan))
 
     live: list[Projections] = []
-    again = ScanFollower.correct_again
+    again = live_steps.corrected_again
 
-    def as_it_was(self: ScanFollower, *given: Any) -> None:
-        live.append(self._joined())
-        again(self, *given)
+    def as_it_was(scan: LiveScan, state: Feeds, *given: Any) -> Feeds:
+        live.append(live_steps.joined(state))
+        return again(scan, state, *given)
 
-    monkeypatch.setattr(ScanFollower, "correct_again", as_it_was)
+    for module in (live_steps, live_end):
+        monkeypatch.setattr(module, "corrected_again", as_it_was)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
     source = SourceOptions(tmp_path / "rest.h5", earlier=(tmp_path / "scan.h5",))
     wanted = options(tmp_path, source=source, selection=selection, method=BRIEF)

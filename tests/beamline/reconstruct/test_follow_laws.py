@@ -15,9 +15,9 @@ from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct import live_fit
-from beamline.reconstruct.followed_views import Cursor
+from beamline.reconstruct import live_steps
 from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.live_states import Cursor
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
@@ -62,7 +62,7 @@ class Laws:
 @pytest.fixture
 def laws(monkeypatch: pytest.MonkeyPatch) -> Laws:
     stand_in = Laws()
-    monkeypatch.setattr("beamline.reconstruct.followed_views.measured_law", stand_in)
+    monkeypatch.setattr("beamline.reconstruct.pass_laws.measured_law", stand_in)
     return stand_in
 
 
@@ -140,7 +140,7 @@ def test_a_pass_that_the_next_one_overtakes_is_left_out_and_later_views_have_no_
 def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
     laws: Laws, follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_fit, "BATCH_VIEWS", 8)
+    monkeypatch.setattr(live_steps, "BATCH_VIEWS", 8)
     scan, asked = follow(), []
     for n in (28, 0, 0):
         scan.seconds(n)
@@ -248,7 +248,7 @@ def test_the_pass_before_wide_views_is_not_measured_again_and_they_are_among_the
     for n in (14, 3):
         scan.seconds(n)
     assert laws.sizes == [[10], [10, 10]]
-    prepared = scan.follower.prepared()
+    prepared = scan.follower.end().prepared
     assert prepared.geometry.is_centred.tolist() == [True] * 10 + [False] * 3
     np.testing.assert_allclose(prepared.geometry.shifts[:, 0] * prepared.geometry.pixel_pitch, [0] * 10 + [18.0] * 3)
     assert (prepared.n_projections, prepared.centred.geometry.n_views) == (10, 10)

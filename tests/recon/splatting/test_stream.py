@@ -194,6 +194,16 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
         model.replace_newest(np.full(SHAPE, np.nan, np.float32))
 
 
+@pytest.mark.parametrize("views", [5, 20])
+def test_a_cleared_fit_has_neither_projections_nor_a_model(data: np.ndarray, views: int) -> None:
+    model = StreamingFit(VIEWS, GRID, gaussians=500, now=SteppedClock(tick=0.01))
+    for _ in range(2):
+        model.add_views(data[:views], ANGLES[:views])
+        assert model.advance(0.0).n_views == views and model.started == (views == 20)
+        model.clear()
+        assert (model.n_views, model.n_unlearnt, model.started) == (0, 0, False)
+
+
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="joined_pixels=2"):
         StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))

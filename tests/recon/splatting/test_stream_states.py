@@ -13,7 +13,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import DensityPolicy
-from recon.splatting.stream_states import Arrivals, Finishing, Growing, StreamPlan, Waiting
+from recon.splatting.stream_placement import Arrivals, StreamPlan
+from recon.splatting.stream_states import Finishing, Growing, Waiting
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

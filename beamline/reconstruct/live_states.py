@@ -1,0 +1,183 @@
+"""States of the live fit: reconstructs a volume from the frames of a running scan.
+
+```
+WaitsForReferences --darks and flats can be used--> WaitsForAxis --its column is known--> Feeds --end--> LastFit
+```
+
+`live_steps` has the functions from one state to the next. Each reading of the file goes as far as possible: with the
+first projection the fit may pass two states and take a batch. A known axis is not waited for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.events import Sink, StateEntered
+from beamline.core.sinks import Warnings
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import ScanSelection
+from beamline.projections.step import StepDone
+from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
+from beamline.reconstruct.job import corrections_done
+from beamline.reconstruct.options import ReconOptions
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
+from drivers.base.clock import Clock
+from recon.base.method import Progress
+from recon.prep.projections import Projections
+from recon.splatting.stream import StreamingFit
+
+
+@dataclass(frozen=True, eq=False)
+class LiveScan:
+    """A running scan, and how its volume is made. Nothing of it changes; only the file of `views` grows.
+
+    Attributes:
+        evidence: what the scan showed when the live fit began; `renewed` has the frames recorded since then.
+        begin: time at which the live fit began to wait for projections.
+    """
+
+    options: ReconOptions
+    views: FollowedViews
+    evidence: ScanEvidence
+    sink: Sink
+    clock: Clock
+    warn: Warnings
+    begin: float
+
+    @property
+    def source(self) -> ScanSource:
+        return self.views.source
+
+    @property
+    def selection(self) -> ScanSelection:
+        return self.views.selection
+
+    def enter(self, state: str, message: str) -> None:
+        """Report what the live fit does now, and why."""
+        self.sink(StateEntered(state, message, time=self.clock.now()))
+
+    def tell_done(self, done: Mapping[str, StepDone]) -> None:
+        """Report what correction steps did."""
+        corrections_done({name: each.sentence for name, each in done.items()}, self.sink, self.clock)
+
+
+@dataclass(frozen=True, eq=False)
+class Cursor:
+    """What a growing file has, and how much of it the fit has used.
+
+    Attributes:
+        frames: number of frames in the file when it was last read.
+        views: rows of the projections among them that may be used.
+        ended: the scan has ended, so that no frame comes after these.
+        taken: number of the frames that were corrected, or that are not projections.
+    """
+
+    frames: int = 0
+    views: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    ended: bool = False
+    taken: int = 0
+
+    @property
+    def behind(self) -> bool:
+        """Whether the file has frames that the fit has not read yet."""
+        return self.taken < self.frames
+
+    @property
+    def new(self) -> NDArray[np.int64]:
+        """Rows of the projections that were not corrected yet."""
+        return self.views[self.views >= self.taken]
+
+
+@dataclass(frozen=True, eq=False)
+class WaitsForReferences:
+    """The correction cannot begin: no projection is there, or darks or flats are missing.
+
+    Attributes:
+        evidence: what the scan showed when it was last looked at.
+        axis_col: the rotation axis in pixels of the file, as it is stated; None: it must be found.
+        come_last: darks or flats come after the projections, which was reported; so the fit waits for the end.
+    """
+
+    evidence: ScanEvidence
+    axis_col: float | None
+    come_last: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class WaitsForAxis:
+    """Projections can be corrected, but they do not show the rotation axis yet.
+
+    Attributes:
+        correction: with the references known by now; it has corrected no projection yet.
+        search: the search so far.
+    """
+
+    correction: ScanCorrection
+    search: AxisSearch
+
+
+@dataclass(frozen=True, eq=False)
+class Feeds:
+    """The fit takes the projections as they come.
+
+    `correction`, `fit` and `batches` change in place, the last one so that a scan is in memory only once. So only the
+    newest `Feeds` is valid.
+
+    Attributes:
+        correction: corrects the next projections; it remembers those before.
+        axis_col: the rotation axis in pixels of the file.
+        search: how the axis was found. While it is not settled, a better axis may be found.
+        fit: has the projections of `batches` and the newest one.
+        batches: line integrals of the projections with their final correction.
+        newest: the projection after them. The fit uses it already, but it is corrected again together with the next
+            one; None: there is none.
+        part: the part of the file whose projections were corrected last.
+        history: progress so far, also of fits before the axis moved.
+        told_behind: it was reported that the fit is slower than the scan.
+    """
+
+    correction: ScanCorrection
+    axis_col: float
+    search: AxisSearch
+    fit: StreamingFit
+    batches: list[Projections] = field(default_factory=list)
+    newest: Projections | None = None
+    part: int = 0
+    history: tuple[Progress, ...] = ()
+    told_behind: bool = False
+
+    @property
+    def corrected(self) -> tuple[Projections, ...]:
+        """Line integrals of all projections that the fit has, in batches, the newest projection last."""
+        return (*self.batches, *(() if self.newest is None else (self.newest,)))
+
+    @property
+    def n_views(self) -> int:
+        """Number of projections that the fit has."""
+        return sum(batch.view_ids.size for batch in self.corrected)
+
+
+@dataclass(frozen=True, eq=False)
+class LastFit:
+    """The scan has ended, and all projections are corrected: only the final fit remains.
+
+    Attributes:
+        prepared: all projections with their final correction, as the model was fitted to them, and the laterally offset
+            projections.
+        fit, axis_col, history: see `Feeds`.
+    """
+
+    prepared: PreparedProjections
+    fit: StreamingFit
+    axis_col: float
+    history: tuple[Progress, ...]
+
+
+Following = WaitsForReferences | WaitsForAxis | Feeds
+"""The states in which the file is read."""

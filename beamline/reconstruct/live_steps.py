@@ -1,0 +1,242 @@
+"""Steps of the live fit: what the new frames of a growing file make of its state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.recon_events import ReconStarted
+from beamline.core.text import count
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.selection import check_axis
+from beamline.projections.usable_views import UsableViews
+from beamline.projections.views import refuse
+from beamline.reconstruct.followed_views import AxisSearch
+from beamline.reconstruct.live_states import Cursor, Feeds, Following, LiveScan, WaitsForAxis, WaitsForReferences
+from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
+from recon.base.method import Progress
+from recon.prep.projections import Projections, merge_and_empty
+from recon.splatting.stream import StreamingFit
+
+NO_VIEWS = np.empty(0, np.int64)  # rows of the file
+_ONE_VIEW = np.zeros(1)  # rad
+BATCH_VIEWS = 32  # projections that are corrected before the fit continues
+_BEHIND = (
+    0.5  # steps per projection; below this, FBP matches the projections better (tests/bench/test_live_accuracy.py)
+)
+_AXIS_MOVES = 1.0  # px; a larger change of the axis restarts the fit
+
+# Reasons to correct all projections again.
+_NEXT_PART = (
+    "Correcting all projections again, because the next part of the run starts: each projection is corrected "
+    "with the flats of its own part"
+)
+_SHADED = (
+    "Correcting all projections again, because an object is in the beam in all projections, but not in the "
+    "flats: its rays are no longer used"
+)
+
+
+def first_state(live: LiveScan) -> WaitsForReferences:
+    """The state before any frame is read."""
+    stated = live.selection.axis_col
+    return WaitsForReferences(live.evidence, live.source.axis_col if stated is None else stated)
+
+
+def next_state(live: LiveScan, state: Following, file: Cursor) -> tuple[Following, Cursor]:
+    """Go through the states as far as the projections of the file allow, and feed the fit with one batch.
+
+    Returns:
+        The next state, and the cursor behind the projections that were taken.
+
+    Raises:
+        ConfigError, DataError: the scan has no references or no axis, and none will come; or projections that cannot be
+            corrected.
+    """
+    if isinstance(state, WaitsForReferences):
+        state = with_references(live, state, file.ended)
+    if isinstance(state, WaitsForAxis):
+        state = with_axis(live, state, file)
+    elif isinstance(state, Feeds) and not state.search.settled:
+        state = with_better_axis(live, state, file)
+    return fed(live, state, file) if isinstance(state, Feeds) else (state, file)
+
+
+def with_references(live: LiveScan, state: WaitsForReferences, ended: bool) -> Following:
+    """The correction begins if darks and flats can be used.
+
+    Those that come after the projections are all there when the scan has ended, not before.
+
+    Raises:
+        DataError: the scan has ended, or something else is missing, and nothing will come.
+    """
+    evidence = state.evidence.renewed()
+    blockers = findings_of(evidence, BEFORE_VIEWS)
+    if not ended and (state.come_last or any(finding.rule == "references" for finding in blockers)):
+        if not state.come_last:
+            live.enter(
+                "waiting",
+                "No live volume during this scan, because no darks or no flats were taken before the projections. "
+                "The reconstruction starts after the scan",
+            )
+        return replace(state, evidence=evidence, come_last=True)
+    refuse(live.source, blockers)
+    correction = ScanCorrection(evidence, live.selection, live.warn)
+    live.tell_done(correction.plan.done)
+    if state.axis_col is None:
+        return WaitsForAxis(correction, AxisSearch())
+    return _begun(live, correction, state.axis_col, AxisSearch(settled=True))
+
+
+def with_axis(live: LiveScan, state: WaitsForAxis, file: Cursor) -> WaitsForAxis | Feeds:
+    """The fit begins if the projections show the axis.
+
+    Raises:
+        DataError: the scan has ended, and no axis is found.
+    """
+    search, axis_col = state.search.look(live.views, state.correction, file.views, None, file.ended, live.warn)
+    if axis_col is None:
+        return replace(state, search=search)
+    return _begun(live, state.correction, axis_col, search)
+
+
+def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
+    """After a large move of the axis the fit begins again with all projections; after a small one it continues."""
+    before = state.axis_col
+    search, axis_col = state.search.look(live.views, state.correction, file.views, before, file.ended, live.warn)
+    if axis_col is None or axis_col == before:
+        return replace(state, search=search)
+    if abs(axis_col - before) <= _AXIS_MOVES:
+        state.fit.move_axis(live.selection.geometry(axis_col, _ONE_VIEW).axis_col)
+        return replace(state, search=search, axis_col=axis_col)
+    state.fit.clear()  # not both in memory
+    fit = _new_fit(live, axis_col, again=bool(state.history))
+    for batch in state.batches:
+        fit.add_views(batch.measured, live.views.angles(axis_col, batch.view_ids))
+    return replace(state, search=search, axis_col=axis_col, fit=fit, newest=None)  # the next views bring it again
+
+
+def _begun(live: LiveScan, correction: ScanCorrection, axis_col: float, search: AxisSearch) -> Feeds:
+    return Feeds(correction, axis_col, search, _new_fit(live, axis_col, again=False))
+
+
+def _new_fit(live: LiveScan, axis_col: float, again: bool) -> StreamingFit:
+    """A fit without projections.
+
+    Raises:
+        ConfigError: the axis lies outside the detector.
+    """
+    check_axis(live.source, axis_col)
+    options, now = live.options, live.clock.now()
+    live.sink(ReconStarted(live.source.path, options.method.name, live.views.n, axis_col, again, time=now))
+    return options.streaming.stream(live.selection.geometry(axis_col, _ONE_VIEW), options.seed, live.clock.now)
+
+
+def fed(live: LiveScan, state: Feeds, file: Cursor) -> tuple[Feeds, Cursor]:
+    """Feed the fit with the next projections, all of one part of the file, because each part has its own references."""
+    new = file.new
+    parts = np.searchsorted(live.source.table.part_starts, new, "right") - 1
+    if new.size and parts[0] != state.part:
+        state = _in_part(live, state, int(parts[0]))
+    batch = new[parts == parts[:1]][:BATCH_VIEWS]
+    all_taken = batch.size == new.size
+    state = _with_frames(live, state, batch, last=file.ended and all_taken)
+    return state, replace(file, taken=file.frames if all_taken else int(batch[-1]) + 1)
+
+
+def _in_part(live: LiveScan, state: Feeds, part: int) -> Feeds:
+    """Begin a later part of the file: its projections are corrected with its own references.
+
+    The fit takes the last projection of the part before, which waited for the next, and learns all projections again.
+    """
+    state = settled(live, replace(state, part=part))
+    if state.batches:
+        return corrected_again(live, state, live.views.usable(), _NEXT_PART)
+    return replace(state, correction=state.correction.renewed())
+
+
+def settled(live: LiveScan, state: Feeds) -> Feeds:
+    """Correct the newest projection for good: no other comes that it waits for."""
+    return state if state.newest is None else _with_frames(live, state, NO_VIEWS, last=True)
+
+
+def _with_frames(live: LiveScan, state: Feeds, frames: NDArray[np.int64], last: bool) -> Feeds:
+    """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
+    newest, batch = state.newest, state.correction.feed(frames, last=last)
+    if batch is not None:
+        data, views = batch.measured, batch.view_ids
+        if newest is not None:
+            if not np.array_equal(data[0], newest.measured[0], equal_nan=True):
+                state.fit.replace_newest(data[0])
+            data, views, newest = data[1:], views[1:], None
+        state.batches.append(batch)
+        if views.size:
+            state.fit.add_views(data, live.views.angles(state.axis_col, views))
+    if newest is None and (newest := state.correction.newest()) is not None:
+        state.fit.add_views(newest.measured, live.views.angles(state.axis_col, newest.view_ids))
+    return replace(state, newest=newest)
+
+
+def corrected_again(
+    live: LiveScan, state: Feeds, usable: UsableViews, why: str, wide: NDArray[np.int64] = NO_VIEWS
+) -> Feeds:
+    """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
+
+    Does nothing if all projections belong to one part, references and air columns are unchanged, no object is in
+    the beam of all projections, and no `wide` (laterally offset) projections join them. `why` is reported, unless
+    projections are removed from the fit.
+
+    Some of these projections may have become unusable, because a check flagged them after later projections
+    arrived, or because the scan took them again. The fit then continues without them, with the initial learning
+    rates.
+    """
+    correction, source = state.correction, live.source
+    ids = np.concatenate([batch.view_ids for batch in state.batches])
+    kept = np.flatnonzero(np.isin(ids, usable.frames))
+    frames = ids[kept]
+    gone = ids.size - frames.size
+    shaded = correction.finds_shadow(frames)
+    if not (gone or shaded or wide.size or correction.outdated or source.table.part_starts.size > 1):
+        return state
+    if shaded:
+        why = _SHADED
+    if gone:
+        why = (
+            f"The fit continues without {count(gone, 'projection')} that it had used and that the monitor flagged "
+            "later or the scan took again"
+        )
+    live.enter("correcting", why)
+    state.batches.clear()  # not both in memory
+    correction = correction.renewed(every := np.union1d(frames, wide))
+    again = correction.at_once(every)
+    state.batches.append(again)
+    ordinary = again.measured[~np.isin(again.view_ids, wide)] if wide.size else again.measured
+    state.fit.replace_views(ordinary, kept if gone else None)
+    return replace(state, correction=correction)
+
+
+def joined(state: Feeds) -> Projections:
+    """The line integrals of `batches` in one piece; they become one batch."""
+    if len(state.batches) > 1:
+        state.batches[:] = [merge_and_empty(state.batches)]  # each is freed when it has been copied
+    return state.batches[0]
+
+
+def after_progress(live: LiveScan, state: Feeds, progress: Progress, waiting: int) -> Feeds:
+    """The state with this progress in its history; reports once if the fit does not keep up with the projections.
+
+    Args:
+        waiting: number of projections that the fit has not used yet.
+    """
+    state = replace(state, history=(*state.history, progress))
+    if state.told_behind or progress.n_views <= BATCH_VIEWS or progress.step >= _BEHIND * progress.n_views:
+        return state
+    live.enter(
+        "behind",
+        f"Nothing to do: the live fit is slower than the scan ({count(progress.step, 'fitting step')} for "
+        f"{progress.n_views} projections so far; {count(waiting, 'projection')} waiting). FBP is shown "
+        "whenever it matches held-out projections better. After the scan, the final fit makes up the missing steps",
+    )
+    return replace(state, told_behind=True)

@@ -1,0 +1,90 @@
+"""Error model of a followed scan: how the error of its volume depends on the number of projections."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.core.events import Sink
+from beamline.core.recon_events import LawMeasured
+from beamline.core.sinks import Warnings
+from beamline.reconstruct.followed_views import FollowedViews
+from beamline.reconstruct.live_states import Cursor, Feeds, Following, WaitsForAxis, WaitsForReferences
+from drivers.base.clock import Clock
+from recon.voxels.measured_law import measured_law
+
+_NOISE_FLATS = 8  # at most, which show the noise of a frame
+_NO_GAIN = "The improvement by further projections is not predicted"
+
+
+class PassLaws:
+    """Measures at the end of each pass how the error of the volume depends on the number of projections (the law of the
+    error), once all usable projections until then are corrected.
+
+    If the next pass ends before the law of a pass is measured, this pass is left out, because only the newest law is
+    used.
+    """
+
+    def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
+        self._views, self._sink, self._clock, self._warn = views, sink, clock, warn
+        self._rng = np.random.default_rng(seed)
+        self._end = 0  # rows of the file at the end of the last pass whose law was looked for
+
+    def look(self, state: Following, file: Cursor) -> None:
+        """Measure and report the law at the end of the newest pass, unless this was done already.
+
+        The law is measured on ordinary projections. If there are also laterally offset projections, the density outside
+        the field of view is known, and the offset of the law is 0. If no law can be measured, a warning gives the
+        reason, and an event has the reason instead of the numbers.
+        """
+        ends = self._views.source.table.pass_ends
+        if not ends.size or (end := int(ends[-1])) == self._end:
+            return
+        missing = _missing(state, file)
+        if (file.frames if missing else file.taken) < end:
+            return
+        self._end = end
+        if missing:  # a scan that waits for the law takes no frame that might show it
+            self._no_law(ends.size, 0, f"{missing} yet")
+            return
+        usable = {row for row in self._views.usable().frames.tolist() if row < end}
+        images = {
+            row: image
+            for part in (state.corrected if isinstance(state, Feeds) else ())
+            for row, image in zip(part.view_ids.tolist(), part.data, strict=True)
+            if row in usable
+        }
+        rows = np.array([*images], np.int64)
+        if not rows.size or not isinstance(state, Feeds):
+            self._no_law(ends.size, 0, "none of the projections can be used")
+            return
+        views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
+        try:
+            geometry, _ = self._views.geometry(state.axis_col, rows)
+            open_beam = state.correction.open_beam(_NOISE_FLATS)
+            law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
+        except (ValueError, DataError, MemoryError) as error:
+            self._no_law(ends.size, rows.size, str(error) or "there is not enough memory")
+            return
+        if (self._views.source.table.offset_views < end).any() and law.offset < 1:
+            law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
+        self._warn.withdraw(_NO_GAIN)
+        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))
+
+    def _no_law(self, number: int, n_views: int, why: str) -> None:
+        self._warn(f"{_NO_GAIN}: {why}.")
+        self._sink(
+            LawMeasured(number, n_views, math.nan, math.nan, math.nan, math.nan, reason=why, time=self._clock.now())
+        )
+
+
+def _missing(state: Following, file: Cursor) -> str:
+    """What keeps the projections of the file from being used; empty: nothing."""
+    if isinstance(state, WaitsForReferences) and file.behind:
+        return "darks or flats have not been taken"
+    if isinstance(state, WaitsForAxis) or state.axis_col is None:
+        return "the rotation axis is not known"
+    return ""

@@ -1,0 +1,138 @@
+"""The projections of a streamed fit, and the Gaussians that are placed with them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.base.view_data import Views
+from recon.base.volume import Grid, Volume
+from recon.splatting import optimise as fit
+from recon.splatting.anytime import averaged, is_held_out
+from recon.splatting.initialise import default_count, first_volume, place, sample_gaussians, scale_to_data
+from recon.splatting.problem import FitProblem
+from recon.splatting.settings import FitSettings
+from recon.voxels.beyond_field import sample_radius
+
+# largest number of voxels, so that a placement takes about a second; new projections wait meanwhile
+_PLACED_FROM = 2**22
+
+
+@dataclass(frozen=True)
+class StreamPlan:
+    """How a streamed fit is made. It never changes.
+
+    Attributes:
+        settings: settings of the fitting steps.
+        grid: grid of the snapshots.
+        count: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
+        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
+            π).
+    """
+
+    settings: FitSettings
+    grid: Grid
+    count: int | None
+    first_views: int
+    first_span: float
+
+
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """The projections of a streamed fit in the order of their arrival, without their pixels.
+
+    Attributes:
+        template: geometry of each of them, at the angle 0.
+        angles: [view] radians.
+        held_out: [view] True for a projection that no step uses until the final fit. The value stays if earlier
+            projections are dropped.
+        n_ever: number of projections that ever arrived, including those that were dropped.
+    """
+
+    template: Geometry
+    angles: F64 = field(default_factory=lambda: np.empty(0))
+    held_out: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, bool))
+    n_ever: int = 0
+
+    @property
+    def n(self) -> int:
+        return self.angles.size
+
+    @property
+    def geometry(self) -> Geometry:
+        return self.template.at(self.angles)
+
+    def followed_by(self, angles: F64) -> Arrivals:
+        """These projections and new ones at `angles`."""
+        held_out = [is_held_out(self.n_ever + k) for k in range(angles.size)]
+        return replace(
+            self,
+            angles=np.append(self.angles, angles),
+            held_out=np.append(self.held_out, np.array(held_out, bool)),
+            n_ever=self.n_ever + angles.size,
+        )
+
+    def only(self, which: NDArray[np.intp]) -> Arrivals:
+        """Those with these numbers, in this order."""
+        return replace(self, angles=self.angles[which], held_out=self.held_out[which])
+
+    def about(self, axis_col: float) -> Arrivals:
+        """The same projections with the rotation axis at another column."""
+        return replace(self, template=replace(self.template, axis_col=axis_col))
+
+
+class Placement(NamedTuple):
+    """Gaussians that were placed, and the line integrals of their projections as the fitting steps use them."""
+
+    problem: FitProblem
+    state: fit.FitState
+
+
+def place_gaussians(
+    views: Arrivals,
+    images: Sequence[F32],
+    plan: StreamPlan,
+    rng: np.random.Generator,
+    *,
+    all_views: bool,
+    known: Placement | None = None,
+) -> Placement:
+    """Gaussians placed with an FBP of the projections, or with the volume of `known` ones and an FBP of its residual.
+
+    Held-out projections are not used, unless `all_views` is True.
+
+    Raises:
+        ValueError: the projections show no material.
+    """
+    all_of = Views(np.stack(images), views.geometry).masked()
+    learnt = [view for view in range(views.n) if all_views or not views.held_out[view]]
+    geometry, seen = all_of.geometry.select(learnt), all_of.data[learnt]
+    wider = sample_radius(all_of)
+    box = plan.grid if wider is None else plan.grid.reaching(wider.radius, views.template)
+    fitted = Grid.for_fit(views.template, box, wider=wider is not None)
+    coarser = 2 ** max(0, math.ceil(math.log2(math.prod(fitted.shape) / _PLACED_FROM) / 3))
+    shape = (fitted.shape[0], *(math.ceil(n / coarser) for n in fitted.shape[1:]))
+    rough = replace(fitted, shape=shape, voxel_size=coarser * fitted.voxel_size)
+    rough = Grid.for_fit(views.template, rough, wider=wider is not None)
+    count = plan.count or default_count(views.template, fitted.voxel_size)
+    kernel = plan.settings.kernel
+    if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
+        volume = first_volume(seen, geometry, rough)
+        gaussians = place(volume, seen, geometry, count, rng, kernel=kernel)
+    else:
+        model, problem = averaged(known.state), known.problem
+        rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))
+        left = first_volume(seen - rendered * problem.scale, geometry, rough)
+        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + left.data, rough)
+        radius = geometry.reach if wider is None else math.inf
+        gaussians = sample_gaussians(volume, count, rng, field_radius=radius, kernel=kernel)
+        gaussians = scale_to_data(gaussians, seen, geometry)
+    problem = fit.problem_of(all_of, fitted, gaussians.density_unit, plan.settings)
+    return Placement(problem, fit.init(gaussians, rng))
