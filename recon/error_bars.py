@@ -22,6 +22,7 @@ from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.projector import Projector
+from recon.voxels.view_weights import density_gain
 
 HALO = 8  # smallest number of slices on each side of a slab that its error bars need
 LEAST_VIEWS = 8
@@ -149,7 +150,8 @@ def alternating(geometry: Geometry) -> F32:
 def _alternating(method: Method, problem: ReconProblem) -> F32:
     """Half the difference of the FBPs of both halves of the projections."""
     signed = problem.views.masked().data * alternating(problem.geometry)[:, None, None]
-    return direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
+    bars = direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
+    return bars * np.float32(density_gain(problem.geometry)) if isinstance(method, Fbp) else bars
 
 
 def _refitted(

@@ -22,6 +22,7 @@ from recon.base.method import (
     Reconstruction,
     RunControl,
 )
+from recon.base.method_kinds import Direct
 from recon.base.setting import Natural
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
@@ -29,6 +30,8 @@ from recon.base.volume import Grid
 from recon.methods import DEFAULT, accepting
 from recon.prep.counts import Counts, line_integrals
 from recon.voxels.beyond_field import run_on_extended_grid
+from recon.voxels.field_edges import FieldEdges
+from recon.voxels.view_weights import covers_the_circle, density_errors, unseen_wedges
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -70,8 +73,9 @@ def reconstruct(
         the held-out projections, the device or the checkpoint.
 
     Warns:
-        UserWarning: values with a weight are not finite, angles look like degrees, or the projections look like counts,
-        like transmission or like line integrals of the wrong sign.
+        UserWarning: values with a weight are not finite, angles look like degrees, the projections look like counts,
+        like transmission or like line integrals of the wrong sign, or densities are uncertain because a
+        part of the turn has no projections.
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())
@@ -90,6 +94,8 @@ def reconstruct(
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
+    _warn_of_missing_wedge(chosen, geometry)
+    _warn_of_half_acquisition(data, geometry)
     begin = control.now()
     grid = grid or Grid.matching(geometry)
     problem = ReconProblem(Views(data, geometry, use.weights), grid, use, int(seed), device)
@@ -133,6 +139,36 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
             f"In all projections the rotation axis is tilted along the beam by {math.degrees(lean):.3g} degrees or "
             "more, so no projection measures structure along the axis, such as the faces of a plate, and held-out "
             "projections choose too small a weight",
+            stacklevel=3,
+        )
+
+
+def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
+    """Warn of the densities of a direct method. Iterative methods explain the line integrals, so theirs are right."""
+    if geometry.is_cone or not isinstance(method, Direct) or not (unseen := unseen_wedges(geometry)):
+        return
+    missing = sum(wedge.size for wedge in unseen)
+    low, high = density_errors(min(missing, math.pi * (1 - 1e-3)))
+    warnings.warn(
+        f"for densities use an iterative method such as fista-tv, because in {math.degrees(missing):.3g} of 180 "
+        f"degrees there is no projection. {method.label} multiplies densities by "
+        f"{math.pi / (math.pi - missing):.4g}, which is right for round bodies. A body twice as long as wide is off by "
+        f"{100 * low:+.0f} to {100 * high:+.0f} %",
+        stacklevel=3,
+    )
+
+
+def _warn_of_half_acquisition(data: NDArray[np.float32], geometry: Geometry) -> None:
+    """Warn if a sample reaches beyond the edge near the axis, and no full circle shows what is beyond that edge."""
+    if not geometry.is_off_middle or covers_the_circle(geometry.angles):
+        return
+    left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
+    if ("left" if left < right else "right") in FieldEdges.of(data, geometry).beyond():
+        warnings.warn(
+            "take projections over 360 degrees without a gap, or distrust the densities: the sample reaches beyond the "
+            f"edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only a full "
+            "circle shows all rays that are farther from the axis. Without it, densities were up to a third too low "
+            "with FBP and an eighth with iterative methods (docs/numerics.md)",
             stacklevel=3,
         )
 

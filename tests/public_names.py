@@ -72,6 +72,7 @@ FOR_PACKAGES = {
     "beamline.scan.run": ("record_scan",),
     "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem"),
+    "recon.base.greys": ("html", "middle_slices"),
     "recon.base.method_kinds": ("Direct", "Iterative", "Series"),
     "recon.base.masks": ("masked",),
     "recon.base.setting": ("Count", "NonNegative", "Positive", "Setting", "setting"),

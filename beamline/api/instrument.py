@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from beamline.config.beam import NoMonochromator
 from beamline.config.load import NO_DECISIONS, NO_LIVE, Config, changed, load, override_of
-from beamline.core.errors import ConfigError, refuse_wrong_arguments
+from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, RunDone, ScanDone
 from beamline.core.recon_events import ReconDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals, to_stderr
+from beamline.core.text import count, size
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
 from beamline.scan.queue_plan import PlannedScan, QueuePlan
 from beamline.scan.queue_planning import plan_queue
 from beamline.scan.run import run_scan
+from beamline.storage.readers.open import open_scan
 from drivers.in_beam import Ask
+from recon.base.greys import grey, html
 from recon.base.registry import loaded
 
 Say = Callable[[str], None]
@@ -29,7 +33,27 @@ Say = Callable[[str], None]
 _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets again
 
 
-ScanResult = RunResult  # what scripts get
+class ScanResult(RunResult):
+    """A `RunResult` as scripts and notebooks get it."""
+
+    def _repr_html_(self) -> str:
+        """HTML for a notebook: the middle projection as counts, and what the scan and its monitor say."""
+        flags = [(check, level, n) for check, levels in self.flags.items() for level, n in levels.items()]
+        facts = {
+            "scan": f"{self.status}, {count(self.n_frames, 'frame')}, {size(self.bytes)}, {self.seconds:.1f} s",
+            "missing": str(len(self.missing)),
+            "with an alarm": str(self.alarmed_frames),
+            "flagged": ", ".join(f"{check} {count(n, 'frame')} ({level})" for check, level, n in flags) or "none",
+            "faults": " ".join(self.reference_faults) or "none",
+            "file": str(self.path),
+        }
+        try:
+            with open_scan(self.path) as source:
+                views = source.table.views
+                pixels, (low, high) = grey(source.read([int(views[views.size // 2])])[0])
+        except (DataError, IndexError) as error:  # the file was moved, or has no projection
+            return html(self.sample or "scan", np.zeros((1, 1), np.uint8), {**facts, "picture": str(error)})
+        return html(self.sample or "scan", pixels, {**facts, "grey": f"black {low:.4g}, white {high:.4g} counts"})
 
 
 class Instrument:
@@ -243,4 +267,6 @@ def _result(events: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
     """The result of a scan, taken from its events; None if it ended before its file was made."""
     scan = next((event for event in events if isinstance(event, ScanDone)), None)
     recon = next((event for event in events if isinstance(event, ReconDone)), None)
-    return None if scan is None else replace(scan.result, recon=None if recon is None else recon.values)
+    if scan is None:
+        return None
+    return ScanResult(**{**vars(scan.result), "recon": None if recon is None else recon.values})

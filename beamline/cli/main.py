@@ -169,8 +169,10 @@ def guard_streams() -> None:
 
     If one of them stayed closed (`>&-`), the next file to be opened would get its number, and printed text would go
     into a scan file. Anything that another library prints to stdout, also at the end of the process, goes to stderr.
-    With `--json` it is dropped, because it is not JSON.
+    With `--json` it is dropped, because it is not JSON. numba loads colorama, where it is installed (on Windows, click
+    brings it), and colorama prints a control sequence at the end of the process; this numba does not load it.
     """
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
     os.close(number)

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 
 SAY_EVERY = 0.2  # s between events on the progress of many frames
+NOTEBOOK = "JPY_PARENT_PID"  # variable of the processes that a Jupyter kernel starts, whose cells imitate a terminal
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
 _ITERATIONS = {
     "sweeps of trials": "iterations of test reconstructions (to choose the settings)",
@@ -63,12 +64,17 @@ class Terminal:
 
     Args:
         stream: where to print (stderr, because stdout is for results). A terminal gets a progress bar, any other
-            stream gets plain lines.
+            stream gets plain lines. So does a cell of a notebook, which keeps each state of a bar as a line.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._console = Console(
-            file=getattr(stream, "unfiltered", stream), highlight=False, markup=False, emoji=False, soft_wrap=True
+            file=getattr(stream, "unfiltered", stream),
+            force_terminal=False if NOTEBOOK in os.environ else None,
+            highlight=False,
+            markup=False,
+            emoji=False,
+            soft_wrap=True,
         )
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),

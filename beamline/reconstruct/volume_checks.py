@@ -24,6 +24,7 @@ from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, lost_matter
 from recon.voxels.odd_views import LIMIT, OddView
+from recon.voxels.view_weights import density_gain
 
 _NAMED = 5  # most odd projections that the warning names
 _COMPARED = ("fbp", "fista-tv")  # methods that show cracks well: fbp sharp edges, fista-tv low noise
@@ -230,7 +231,10 @@ def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPath
     grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
     out = scratch_array(target.output.parent, grid.shape) if on_disk else None
     lines, progress = prepared.projections.data, context.phases.progress
-    return Volume(direct(lines, prepared.geometry, grid, context.filter, progress, out), grid)
+    volume = direct(lines, prepared.geometry, grid, context.filter, progress, out)
+    if (gain := density_gain(prepared.geometry)) != 1:
+        volume *= np.float32(gain)
+    return Volume(volume, grid)
 
 
 def _beside_each_other(

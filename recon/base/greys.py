@@ -6,11 +6,12 @@ import base64
 import io
 from collections.abc import Mapping
 from html import escape
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import some_values
+from recon.base.arrays import F64, some_values
 
 _SAMPLE = 200_000  # number of values in the sample
 _SPLIT = (
@@ -132,16 +133,31 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     step = -(-max(data.shape) // _SIDE)
     slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
     parts = [np.asarray(part, np.float64) for part in slices]
-    values = np.concatenate([part[np.isfinite(part)] for part in parts])
-    low, high = matter_window(values)
+    low, high = matter_window(np.concatenate([part[np.isfinite(part)] for part in parts]))
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
     left = 0
     for part in parts:
-        with np.errstate(invalid="ignore"):
-            grey = 255 * np.clip((part - low) / (high - low), 0, 1)
-        sheet[: len(part), left : left + part.shape[1]] = np.nan_to_num(grey).astype(np.uint8)
+        sheet[: len(part), left : left + part.shape[1]] = _within(part, low, high)
         left += part.shape[1] + _GAP
     return sheet, (low, high)
+
+
+def grey(image: NDArray[Any]) -> tuple[U8, tuple[float, float]]:
+    """An image [row, col] thinned out to at most 256 pixels a side, and the values of black and white: all but half a
+    per mille at each end. Values that are not finite are black.
+    """
+    step = -(-max(image.shape) // _SIDE)
+    thin = np.asarray(image[::step, ::step], np.float64)
+    finite = thin[np.isfinite(thin)]
+    low, high = apart(*np.percentile(finite, _ALL).tolist()) if finite.size else (0.0, 1.0)
+    return _within(thin, low, high), (low, high)
+
+
+def _within(values: F64, low: float, high: float) -> U8:
+    """Greys of values between black and white; values that are not finite are black."""
+    with np.errstate(invalid="ignore"):
+        grey = 255 * np.clip((values - low) / (high - low), 0, 1)
+    return np.nan_to_num(grey).astype(np.uint8)
 
 
 def fan(angles: NDArray[np.float64], centre: float) -> U8:

@@ -26,7 +26,6 @@ from recon.voxels.direct import Fbp, has_direct_method
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import volume_lines
-from recon.voxels.view_weights import angular_weights
 from recon.voxels.voxel_problem import density_unit, difference_weights
 
 START_SWEEPS = 10
@@ -143,16 +142,10 @@ def first_volume(
     in every case, slower but without the streaks of few projections. "published": as "fbp" with the plain ramp filter.
     `device`: for the direct method and the iterations.
     """
-    swept = _swept(geometry, start)
     sweeps = OsSirtTv(iterations=START_SWEEPS, still=0.0)
-    quick: Method = sweeps if swept else Fbp("ram-lak" if start == "published" else "hann")
+    quick: Method = sweeps if _swept(geometry, start) else Fbp("ram-lak" if start == "published" else "hann")
     problem = ReconProblem(Views(without_wild_pixels(projections), geometry), grid, device=device)
-    volume = quick.run(problem, RunControl()).volume
-    if swept or geometry.is_cone:
-        return volume
-    # FBP of a limited angular range is too small by the share that is missing; the density unit would be too small,
-    # too.
-    return Volume(volume.data * np.float32(np.pi / angular_weights(geometry.angles).sum()), grid)
+    return quick.run(problem, RunControl()).volume
 
 
 def mean_change(

@@ -25,7 +25,7 @@ from recon.kernels.cpu.joseph import calls
 from recon.voxels.devices import voxel_device
 from recon.voxels.fbp import Filter, continuation, continued, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
-from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
+from recon.voxels.view_weights import cone_weights, density_gain, missing_arc, ray_weights
 
 _f = np.float32
 _SAMPLES = 4  # samples of a projector that take as long as one voxel in one projection
@@ -332,6 +332,8 @@ class Fbp(Direct):
             control.report_progress(done, slices, begin, views, "slices")
 
         data = direct(filled, problem.geometry, problem.grid, self.filter, progress, device=problem.device)
+        if (gain := density_gain(problem.geometry)) != 1:
+            data *= np.float32(gain)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:

@@ -295,6 +295,29 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
     return [Wedge(float(np.mod(theta[at] + typical / 2, np.pi)), float(gaps[at] - typical)) for at in wide]
 
 
+def density_gain(geometry: Geometry) -> float:
+    """180° over the angle that the projections of a parallel beam cover, as float32; 1 for a cone.
+
+    FBP times this has the right mean density of a round body, see `density_errors`.
+    """
+    return 1.0 if geometry.is_cone else float(np.float32(math.pi / angular_weights(geometry.angles).sum()))
+
+
+def density_errors(missing: float, aspect: float = 2.0) -> tuple[float, float]:
+    """Lowest and highest relative error of the density of elliptic bodies in FBP times `density_gain`.
+
+    Each projection adds a b / (a² cos² + b² sin²) to the density inside an ellipse with the semi-axes a and b, and the
+    mean of this over 180° is 1. The extremes are a wedge across the thin direction and one across the long direction.
+
+    Args:
+        missing: radians without projections, of π.
+        aspect: length of the body over its width.
+    """
+    lost = [2 / math.pi * math.atan(factor * math.tan(missing / 2)) for factor in (aspect, 1 / aspect)]
+    most, least = ((1 - share) / (1 - missing / math.pi) - 1 for share in lost)
+    return most, least
+
+
 def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     """Mask of the gaps of a circle in which projections are missing: wider than by chance, and than 8 usual gaps.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from recon.base.greys import html, middle_slices
 from splatline_structure.materials import F32, F64, Labels, Spacing, central, labelled
 from splatline_structure.particles import NECK, Numbers, Particles, cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
@@ -60,6 +61,12 @@ class Structure:
     numbers: dict[str, float]
     along_z: F64
     radial: tuple[F64, F64]
+
+    def _repr_html_(self) -> str:
+        """HTML for a notebook: the particles in the middle slices, and the numbers."""
+        pixels, _ = middle_slices(np.where(self.numbered > 0, 1 + self.numbered % 7, 0).astype(np.float32))
+        texts = {name: f"{number:.4g} {unit_of(name)}" for name, number in self.numbers.items()}
+        return html(f"Structure, particles: {len(self.particles.cut)}", pixels, texts)
 
 
 def unit_of(name: str) -> str:

@@ -154,7 +154,9 @@ def test_quantiles_are_of_volume_and_of_whole_particles() -> None:
 def test_cracks_are_what_particles_lack() -> None:
     ball = (away((20, 20, 20), (41, 41, 41)) <= 15).astype(np.float32)
     ball[20, 12:29, 12:29] = 0
-    numbers = structure_of(ball, np.array([0.5]), (1, 1, 1), Rules(2, 1, radius=2, side=0)).numbers
+    structure = structure_of(ball, np.array([0.5]), (1, 1, 1), Rules(2, 1, radius=2, side=0))
+    numbers, page = structure.numbers, structure._repr_html_()
+    assert f"particles: {len(structure.particles.cut)}" in page and "fraction_1" in page and "data:image/png" in page
     assert numbers["cracks"] == pytest.approx(17 * 17 / (4 / 3 * math.pi * 15**3), rel=0.05)
 
 

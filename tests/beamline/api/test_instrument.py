@@ -72,6 +72,10 @@ def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(
     assert first.folder != again.folder and first.folder.name.endswith("_cathode-1")
     assert first.clean and first.missing == () and first.status == "complete" and first.volume is None
     assert instrument.last == third
+    page = first._repr_html_()
+    assert "cathode-1" in page and f"complete, {FRAMES} frames" in page and "counts" in page
+    first.path.unlink()
+    assert f"complete, {FRAMES} frames" in first._repr_html_() and "does not exist" in first._repr_html_()
 
 
 def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: list[FakeInstrument]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,6 +18,8 @@ from recon.voxels.view_weights import (
     angular_weights,
     circle_weights,
     cone_weights,
+    density_errors,
+    density_gain,
     missing_arc,
     ray_weights,
     unseen_wedges,
@@ -254,7 +258,8 @@ def test_edges_along_the_wedge_are_blurred() -> None:
     views = Geometry.parallel(np.radians(np.arange(10, 130, 1.0)), (1, 96))
     u = np.arange(96) - 47.5
     disc = np.tile(2 * np.sqrt(np.clip(30**2 - u**2, 0, None)), (views.n_views, 1, 1)).astype(np.float32)
-    image = reconstruct(disc, views, "fbp").volume.data[0]
+    with pytest.warns(UserWarning, match="in 60 of 180 degrees there is no projection"):
+        image = reconstruct(disc, views, "fbp").volume.data[0]
     (wedge,) = unseen_wedges(views)
 
     def step(angle: float) -> float:
@@ -265,3 +270,49 @@ def test_edges_along_the_wedge_are_blurred() -> None:
 
     middle = wedge.first + wedge.size / 2  # the direction of columns of the missing views: across their rays
     assert step(middle) < 0.5 * step(middle + np.pi / 2)
+
+
+@given(st.integers(6, 60), st.floats(1, 4), st.floats(0, np.pi))
+def test_the_density_of_an_ellipse_is_within_the_stated_errors(lost: int, aspect: float, turned: float) -> None:
+    """By the value that each projection adds inside an ellipse; a wedge across its thin and long direction reaches
+    both ends."""
+    degrees = np.arange(0, 180 - lost, 0.25)
+    geometry = Geometry.parallel(np.radians(degrees), (1, 8))
+    weights = ray_weights(geometry)[0][:, 4] * density_gain(geometry)
+
+    def density(turned: float) -> float:
+        theta = np.radians(degrees) - turned
+        return float((weights / (aspect * np.cos(theta) ** 2 + np.sin(theta) ** 2 / aspect)).sum() / np.pi)
+
+    low, high = density_errors(np.radians(lost), aspect)
+    assert low - 1e-3 <= density(turned) - 1 <= high + 1e-3
+    middle = np.radians(180 - lost / 2 - 0.125)
+    ends = density(middle - np.pi / 2), density(middle)
+    assert ends == pytest.approx((1 + low, 1 + high), abs=2e-3)
+
+
+@pytest.mark.parametrize("lost", [(0, 0), (72, 90), (120, 180)])
+def test_a_round_body_has_its_density_and_a_missing_wedge_is_told(lost: tuple[int, int]) -> None:
+    degrees = np.array([each for each in np.arange(0, 180, 1.0) if not lost[0] <= each < lost[1]])
+    geometry = Geometry.parallel(np.radians(degrees), (1, 64))
+    views = disc_views(geometry, 12, (9.0, 5.0))
+    told = pytest.warns(UserWarning, match="right for round bodies") if lost[1] else nullcontext()
+    with told:
+        image = reconstruct(views, geometry, "fbp").volume
+    _, y, x = image.grid.coordinates()
+    inside = np.hypot(x - 9, y[:, None] - 5) < 9
+    assert image.data[0][inside].mean() == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(("turn", "radius"), [(300, 26.0), (360, 26.0), (300, 8.0)])
+def test_an_incomplete_circle_of_half_acquisition_is_told(turn: int, radius: float) -> None:
+    """If the sample reaches beyond the edge near the axis; what is within it has all rays in half a turn."""
+    geometry = Geometry.parallel(np.radians(np.arange(0, turn, 3.0)), (1, 48), axis_col=11.5)
+    views = disc_views(geometry, radius, (0.0, 0.0))
+    lacking = turn < 360 and radius > 12
+    told = pytest.warns(UserWarning, match="12 columns from the rotation axis") if lacking else nullcontext()
+    with told:
+        image = reconstruct(views, geometry, "fbp").volume
+    _, y, x = image.grid.coordinates()
+    mean = image.data[0][np.hypot(x, y[:, None]) < radius - 3].mean()
+    assert mean < 0.8 if lacking else mean == pytest.approx(1, abs=0.01)

@@ -227,7 +227,7 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     """
     from recon.features.beam_hardening import NoCurveError, curve_of_paths
     from recon.post import k_means
-    from recon.reconstruction import reconstruct
+    from recon.voxels.direct import direct
     from recon.voxels.projector import project
 
     if geometry.is_cone:
@@ -239,7 +239,7 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
     grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
     for _ in range(_ROUNDS):
-        volume = reconstruct(now, small, "fbp", grid=grid).volume.data
+        volume = direct(now, small, grid, "hann")
         air, matter = k_means(volume, 2)
         paths = project(Volume((volume > (air + matter) / 2).astype(np.float32), grid), small)
         clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
