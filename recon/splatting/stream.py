@@ -224,7 +224,7 @@ class StreamingFit:
         last, share = Finishing.of(model, self.last_steps, self.settings), 0.0
         begin = reported = self._now()
         while share < 1:
-            last.step(self.settings, share)
+            last.step(share)
             now = self._now()
             share = max(last.share, (now - begin) / seconds if seconds > 0 else 1.0)
             if on_progress is not None and now - reported > 0.1:

@@ -278,28 +278,30 @@ class Finishing:
         steps: number of steps of the final fit, unless a time limit ends it.
         begun: number of steps before the final fit.
         first: position of the learning rates in their decay at its begin, 0 to 1.
+        settings: settings of the first half of the steps, with density control.
+        settled: settings of the second half, without it.
     """
 
     model: Growing
     steps: int
     begun: int
     first: float
+    settings: FitSettings
+    settled: FitSettings
 
     @classmethod
     def of(cls, model: Growing, steps: int, settings: FitSettings) -> Finishing:
         """The final fit of a model, before its first step."""
-        return cls(model, steps, model.state.step, model.fraction(settings))
+        settled = replace(settings, policy=None)
+        return cls(model, steps, model.state.step, model.fraction(settings), settings, settled)
 
     @property
     def share(self) -> float:
         """Share of the steps that are done."""
         return (self.model.state.step - self.begun) / self.steps
 
-    def step(self, settings: FitSettings, share: float) -> None:
-        """One step. `share` is the share of the final fit that is over, by steps or by time; density control ends in
-        the middle.
-        """
-        state = self.model.state
-        settings = settings if share < _LAST_GROWTH else replace(settings, policy=None)
+    def step(self, share: float) -> None:
+        """One step. `share` is the share of the final fit that is over, by steps or by time."""
+        state, settings = self.model.state, self.settings if share < _LAST_GROWTH else self.settled
         fit.step(state, self.model.problem, settings, self.first + (1 - self.first) * share)
         average(state, self.begun)

@@ -180,7 +180,7 @@ class TestFinishing:
         counts = []
         for _ in range(4):
             model.state.limit = model.state.n + 1
-            last.step(greedy, last.share)
+            last.step(last.share)
             counts.append(model.state.n)
         assert last.share == 1 and counts == [61, 62, 62, 62]
 
