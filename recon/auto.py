@@ -32,8 +32,8 @@ class Auto(Method):
 
     A method is good if its volume predicts the held-out projections well.
 
-    The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows hold
-    little material, the part is all rows at half the resolution. One of eight projections is held out. Test
+    The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows
+    contain little material, the part is all rows at half the resolution. One of eight projections is held out. Test
     reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md gives the
     reasons.
 
@@ -111,8 +111,8 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With "preview", only the first two candidates are tried. With "best", any gain is enough, and no test of a
-        fit ends early."""
+        """ "preview" tries only the first two candidates. "best" accepts a costlier method even if it is only slightly
+        better, and runs each test of a fit to its end."""
         if quality == "preview":
             return replace(self, candidates=self.candidates[:2])
         return replace(self, least_gain=0.0) if quality == "best" else self

@@ -41,19 +41,20 @@ def axis_by_views(
 ) -> AxisEstimate:
     """The axis column for which a volume of two thirds of the projections predicts the other projections best.
 
-    Within some tenths of the detector's width, the residual has only one minimum. A coarse search halves its step
-    around the best candidate. Then a parabola through three candidates on finer pixels gives the column. If the sample
-    is wider than the field of view, the box of voxels is twice as wide. For a 180° scan of a sample wider than
-    the field of view in a parallel beam, use `find_axis` instead.
+    The residual has only one minimum if the search begins within some tenths of the detector's width of the axis. The
+    search starts with coarse steps and halves the step around the best candidate. At the end, three candidates are
+    computed on finer pixels. The minimum of the parabola through their residuals is the column. If the sample is wider
+    than the field of view, the box of voxels is twice as wide. For a 180° scan of a sample wider than the field of view
+    in a parallel beam, use `find_axis` instead.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
-        geometry: of these projections; the search begins at its `axis_col`.
+        geometry: geometry of these projections; the search begins at its `axis_col`.
         progress: takes the number of candidates tried so far.
         lit: [row, col] or [view, row, col], pixels that measured something; None: all.
 
     Returns:
-        The estimate. It is not confident if the residual of the best candidate is nearly as large as that of the
+        The estimate. `confident` is False if the residual of the best candidate is nearly as large as that of the
         others.
 
     Raises:

@@ -221,13 +221,13 @@ def plan(
 ) -> QueuePlan:  # fmt: skip
     """Plan several scans, as `beamline scan A B --dry-run` does: which can run, how long they take, what they need.
 
-    No device is used. A scan that cannot run does not end the planning of the others. A hundred scans take less than a
-    second, beside the import.
+    No device is used. If a scan cannot run, the other scans are planned nevertheless. A hundred scans take less than a
+    second, not counting the import.
 
     Args:
         scans: each a configuration file; a table of scans (.csv); a row of such a table as a mapping, such as
             {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}; or a plan of bluesky, such as
-            `fly(scan)`, which is followed without running it and cannot be run afterwards.
+            `fly(scan)`, which is read without running it and cannot be run afterwards.
         set: values that replace those of all configurations, such as {"scan.angles.views": 90}.
         output: folder in which the folders of the runs would be created; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.
@@ -235,7 +235,7 @@ def plan(
 
     Returns:
         `scans` in their order, each with `valid`, `faults` (each with message, file and line) and `needs`: `duration`
-        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what is asked of the `operator`. The plan's own
+        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what the `operator` has to do. The plan's own
         `needs` are the sums of those that can run.
 
     Raises:

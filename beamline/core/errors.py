@@ -29,7 +29,7 @@ class ConfigError(BeamlineError):
 
     Args:
         faults: what is wrong, one by one: the place of the value (`my.yaml:12`), and a sentence without its full stop.
-            Empty if the message says it all.
+            Empty if the message is complete without them.
     """
 
     exit_code = 2
@@ -46,19 +46,19 @@ class InstrumentError(BeamlineError):
 
 
 class ScanStopped(BeamlineError):  # noqa: N818 - an outcome, not a defect
-    """Stopped by the operator with fewer data than planned; the file is readable."""
+    """The operator stopped the scan before all frames were taken; the file is readable."""
 
     exit_code = 4
 
 
 class ReferencesError(ScanStopped):
-    """Stopped before the first projection, because the darks or flats cannot be used."""
+    """The scan stopped before its first projection, because the darks or flats cannot be used."""
 
     exit_code = 6
 
 
 class DataError(BeamlineError):
-    """Bad data or disk: unreadable input, lost frames, no free space."""
+    """The data or the disk are at fault: an unreadable file, lost frames, no free space."""
 
     exit_code = 5
 

@@ -38,8 +38,7 @@ class Event:
 
     A field that has its default value is not written to JSON.
 
-    Attributes:
-        event: name of the kind of event, as it is written to JSON.
+    Attributes: event: name of the kind of event, as it is written to JSON.
         time: time in s since the Unix epoch; the announcer of a run sets it.
         source: "recon" if the event comes from the live reconstruction of a scan.
         scan: in a batch, the scan file that the event belongs to.
@@ -70,7 +69,7 @@ class Event:
         return values
 
     def to_json(self) -> str:
-        """One line of JSON, see `json_of`."""
+        """The event as one line of JSON, see `json_of`."""
         return json_of({"event": self.event, "time": round(self.time, 6), **self.data})
 
 

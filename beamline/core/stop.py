@@ -128,7 +128,7 @@ def never_stopped() -> Iterator[Callable[[], bool]]:
 
 
 class ScanAborted(ScanStopped):
-    """Aborted, or interrupted before the first frame; the frames acquired so far are in the file."""
+    """The scan was aborted, or interrupted before its first frame; the frames acquired so far are in the file."""
 
     exit_code = INTERRUPTED
 
@@ -192,8 +192,9 @@ class PauseRequest:
 class StopRequest:
     """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). It cannot be undone.
 
-    Any thread or signal handler can set it. Each flag is set by a single assignment without a lock, because one signal
-    handler may interrupt another.
+    Any thread or signal handler can set it. Signal handlers set the flags. One handler may interrupt another, and would
+    wait for ever for a lock that the other one holds. Therefore each flag is set by a single assignment, without a
+    lock.
 
     Args:
         now: a clock that gives real time in s.
@@ -226,7 +227,7 @@ class StopRequest:
         self.stopping = True
 
     def abort(self, reason: str = "the operator aborted it") -> None:
-        """End at once: the stage stops, the shutter closes, no further frame is acquired."""
+        """End at once: the stage stops, the shutter closes, and no further frame is acquired."""
         self.reason, self.by_person = reason, True
         self._requested_at = self._requested_at or self._now()
         self.aborting = True

@@ -18,14 +18,14 @@ class OperatorRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class ScanNeeds:
-    """What a scan needs, or several scans one after the other.
+    """Time, frames, bytes, dose and manual work of a scan, or of several scans one after the other.
 
     Attributes:
-        parts: s by what they are spent on: `dark`, `flat`, `projection`, `offset_view` (each with the moves of the
+        parts: duration in s of each part: `dark`, `flat`, `projection`, `offset_view` (each with the moves of the
             stage), `warm_up`, `return`. The time for moving shutter and sample is not known.
         n_frames, total_bytes: of the files, without projections that are taken again.
         dose_gy: dose that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated.
-        volume_seconds: s, at most, until the live volume is finished, after the last projection.
+        volume_seconds: time from the last projection until the live volume is finished, in s, at most.
         operator: what the operator is asked to do.
     """
 

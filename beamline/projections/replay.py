@@ -111,7 +111,7 @@ class ScanVerdict:
         retaken: numbers of the projections that were taken again.
         references: what is wrong with darks and flats, a text for each group.
         altered: a sentence on what in the file differs from its stored checksums; "" if nothing differs.
-        aside: for how many projections each check was skipped, or which checks failed with an error.
+        aside: which checks skipped how many projections, and which checks failed with an error.
     """
 
     n_frames: int

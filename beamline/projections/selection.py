@@ -35,9 +35,9 @@ class Selection:
         axis_col: rotation axis in columns of the full detector; None: it is searched for.
         sample_width: width of the sample across the beam, if it is wider than the field of view, in mm (in px if the
             pixel size is unknown); None: the value in the file, or estimated from the projections.
-        pixel_size_mm: at the sample (of a cone: on the detector); None: the file's value.
-        cone: mm from the source to the rotation axis and to the detector; None: the file's values, or a parallel
-            beam.
+        pixel_size_mm: size of a pixel at the sample (for a cone beam: on the detector); None: the value in the file.
+        cone: distances from the source to the rotation axis and to the detector, in mm; None: the values in the file,
+            or a parallel beam if it has none.
         central_row: for a cone beam, detector row at which the ray perpendicular to the rotation axis meets the
             detector; it may lie outside the detector; None: the middle row.
         seed: seed of random selections of projections.

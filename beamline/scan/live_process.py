@@ -322,7 +322,7 @@ class Standby:
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """The data of the `done` event of a reconstruction of a complete scan, as in `LiveReconstruction.finish`."""
+    """Reconstruct a complete scan, and return the data of the event `done`, as `LiveReconstruction.finish` does."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

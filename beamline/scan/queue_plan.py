@@ -19,8 +19,8 @@ from beamline.scan.preflight import DryRun
 
 @dataclass(frozen=True)
 class ScanFault:
-    """Why a scan cannot run: a sentence. file, line: where the value is given; None: it is not in a file, or the
-    sentence is about no single line."""
+    """Why a scan cannot run: a sentence. file, line: where the value is given; None: the value is not in a file, or the
+    sentence concerns several lines."""
 
     message: str
     file: str | None = None
@@ -33,7 +33,7 @@ class ScanFault:
 
 @dataclass(frozen=True, eq=False)
 class PlannedScan:
-    """A scan of a queue, planned without devices.
+    """One scan of a queue, with the plan that was made for it without devices.
 
     Attributes:
         source: the file of its configuration, or the line of its table (day.csv:3).
@@ -42,8 +42,9 @@ class PlannedScan:
         warnings: sentences on values that are unusual, for example because of a wrong unit.
         needs: time, frames, bytes, dose, and what the operator has to do; all 0 if they cannot be computed.
         disk: an existing folder on the disk of the file; None: there is no file.
-        config: None if it cannot be read.
-        worked: timeline and limits; None if they cannot be computed.
+        config: the configuration; None if it cannot be read.
+        worked: timeline and limits; None if they cannot be
+            computed.
     """
 
     source: str
@@ -61,7 +62,7 @@ class PlannedScan:
         return not self.faults
 
     def data(self) -> Mapping[str, Any]:
-        """The values for programs: s, bytes, Gy."""
+        """The values as a mapping for other programs, in s, bytes and Gy."""
         facts = {name: getattr(self, name) for name in ("source", "sample", "valid", "faults", "warnings")}
         return {**(self.worked.data() if self.worked else {}), **self.needs.data(), **facts}
 
@@ -72,9 +73,10 @@ class QueuePlan:
 
     Attributes:
         scans: in their order.
-        faults: why the scans cannot all run, though each alone can: a disk is too small for all of them.
+        faults: reasons why each scan alone can run, but not all of them, such as a disk that is too small for all
+            files.
         needs: of the scans that can run, together.
-        free_bytes: of the fullest disk; 0 without a scan that can run.
+        free_bytes: free space on the fullest of the disks; 0 if no scan can run.
     """
 
     scans: tuple[PlannedScan, ...]
@@ -88,7 +90,7 @@ class QueuePlan:
         return not self.faults and all(scan.valid for scan in self.scans)
 
     def lines(self) -> list[str]:
-        """A line for each scan, the time by parts, and the sums."""
+        """Lines to print: one for each scan, then the time of each part, then the sums."""
         rows = [(scan.sample or "-", scan.source, "yes" if scan.valid else "no", *_cells(scan)) for scan in self.scans]
         head = ("scan", "from", "can run", "frames", "size (MB)", "time (h:min:s)", "requests", "dose (Gy)")
         needs, can_run = self.needs, sum(scan.valid for scan in self.scans)
@@ -104,7 +106,7 @@ class QueuePlan:
         ]  # fmt: skip
 
     def data(self) -> Mapping[str, Any]:
-        """The plan for programs: s, bytes and Gy of each scan and of all."""
+        """The plan as a mapping for other programs: s, bytes and Gy of each scan and of all scans."""
         facts = {"valid": self.valid, "faults": self.faults, "free_bytes": self.free_bytes}
         return {"scans": [scan.data() for scan in self.scans], **facts, **self.needs.data()}
 

@@ -55,10 +55,10 @@ class Geometry:
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: size of a detector pixel in mm. For a parallel beam at the sample (1.0: lengths are in pixels), for
-            a cone on the detector.
-        axis_col, axis_row: position of the rotation axis and of the height z = 0 on the detector (for a cone: of the
-            central ray). In pixels, 0 at the centre of the first column or row.
+        pixel_pitch: size of a detector pixel in mm. For a parallel beam, it is measured at the sample; for a cone, on
+            the detector. 1.0 for a parallel beam: all lengths are in pixels.
+        axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector (for a cone: of
+            the central ray). In pixels, 0 at the centre of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
         roll: float64 [view], radians; rotation of the detector about the beam: its columns run along u cos + v sin.
@@ -203,10 +203,11 @@ class Geometry:
 
     @property
     def climbs(self) -> bool:
-        """Whether the projections move along the rotation axis by half the detector's rows or more, as in a helix.
+        """Whether the sample moves along the rotation axis by half the height of the detector or more, as in a helical
+        scan.
 
-        It is measured on the middle half of the projections, which moves half as far, so that single displaced
-        projections do not count.
+        Single displaced projections do not count, because only the middle half of all displacements is looked at. In a
+        helix this half is half as long as the whole.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
@@ -219,18 +220,19 @@ class Geometry:
 
     @property
     def period(self) -> float:
-        """Angle in radians after which projections repeat the same rays: π for a centred parallel beam, otherwise 2π.
+        """Angle in radians after which projections repeat the same rays: π for a parallel beam with the axis in the
+        middle, otherwise 2π.
 
-        It is 2π for a cone, and if the axis is tilted along the beam by more than half a pixel over the field of view.
-        It is also 2π if the axis is off the detector's middle by more than a twentieth of the detector's width, because
-        opposite projections then see different parts of the sample.
+        It is 2π for a cone. It is 2π if the axis is tilted along the beam so much that the edge of the field of view
+        moves by more than half a pixel. It is also 2π if the axis is off the detector's middle by more than a twentieth
+        of the detector's width, because opposite projections then see different parts of the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
 
     @property
     def unseen_cone(self) -> float:
-        """Half angle in radians of the cone of wave vectors about the rotation axis that no projection measures.
+        """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
         The half angle is the smallest tilt of the axis along the beam. It is 0 if that tilt moves the edge of the field
         of view by at most half a pixel.
@@ -280,7 +282,8 @@ class Geometry:
 
     @property
     def reach(self) -> float:
-        """mm from the rotation axis to the farthest column edge of any projection, measured at the axis.
+        """Distance in mm from the rotation axis to the farthest edge of the detector in any projection, measured at the
+        axis.
 
         Rolled projections count as if they were straight; laterally offset ones do not count. For a wide cone the value
         is limited to 0.7 sod.
@@ -291,7 +294,7 @@ class Geometry:
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest z in mm, at the rotation axis, that any projection sees; tilt is ignored."""
+        """Lowest and highest point of the rotation axis that any projection sees, as z in mm; tilt is ignored."""
         rows, axis = self.detector_shape[0], self.axis_row + self.offsets[:, 1]
         low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
         return float(low * self.sample_pitch), float(high * self.sample_pitch)
@@ -311,7 +314,8 @@ class Geometry:
         )
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) of the origin of the object's frame in one projection, or of its centre if it has one."""
+        """Pixel (col, row) at which one projection shows the origin of the object's frame, or the centre of the
+        projection if it has one (see `centres`)."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:
@@ -343,11 +347,12 @@ class Geometry:
         return replace(self, **some)
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same set-up at other angles (radians), with the shift, roll and tilt that all projections share.
+        """The same set-up at other angles (radians). Shift, roll and tilt must be the same in all projections, and are
+        kept.
 
         Raises:
-            ValueError: the angles are not valid, or shift, roll, tilt or centre differ between projections, so that the
-                values at new angles are unknown.
+            ValueError: the angles are not valid, or shift, roll, tilt or centre differ between projections; their
+                values at new angles are then unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -406,9 +411,8 @@ class Geometry:
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam, v is then measured from the middle of these rows, so that a slab is a scan of its own. The
-        central ray of a cone stays at its position, and so does the point about which projections are rolled and
-        tilted.
+        For a parallel beam, z = 0 moves to the middle of these rows, so that a slab is a scan of its own. The central
+        ray of a cone stays at its position, and so does the point about which projections are rolled and tilted.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
@@ -422,7 +426,7 @@ class Geometry:
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
 
-        As in `rows`, v of a straight parallel beam is then measured from the middle of the remaining rows.
+        As in `rows`, for a straight parallel beam z = 0 moves to the middle of the remaining rows.
         """
         if operator.index(factor) < 1:
             raise ValueError(f"the bin factor must be 1 or more, got {factor}")

@@ -47,7 +47,8 @@ class Progress:
         residual: running mean of |rendered - measured| / |measured| (root mean squares) over the projections just used.
         n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
         held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
-        unit: name of the steps of a direct method or of a part of the work, such as slices. Loss and residual are then
+        unit: what is counted by a direct method, or in a part of the work, such as "slices"; empty: fitting steps or
+        iterations. If it is not empty, loss and residual are
             NaN.
     """
 
@@ -122,13 +123,13 @@ class RunControl(Checked):
 
     Attributes:
         should_stop: function that is called between steps or iterations; True ends the reconstruction with the volume
-            so far. Direct methods do not call `should_stop`. Any function or a `Stop`; methods use the property
-            `stop`, which always exists.
+            so far. Direct methods do not call `should_stop`. It may be any function or a `Stop`. Methods call the
+            property `stop`, which exists also if this is None.
         on_progress: called about ten times a second, after each iteration, or after every sixteen slices of FBP.
         on_checkpoint: called with the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: stores the decisions that the method derives from its data, and may repeat those of another run; None:
-            the run decides alone.
+        decide: keeps the decisions that the method derives from its data, and can make the method repeat the decisions
+            of another run; None: the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
             total variation; True ends only these. None: same as `should_stop`.
     """
@@ -144,12 +145,12 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The `Stop` that methods call between steps: should the run end with the volume so far?"""
+        """The `Stop` that methods call between steps. It returns True if the run must end with the volume so far."""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """The function that test reconstructions call between iterations: should they end?"""
+        """The function that test reconstructions call between iterations. It returns True if they must end."""
         return self.stop_trials or self.stop
 
     def tell(self, progress: Progress) -> None:

@@ -10,7 +10,8 @@ from recon.base.setting import NonNegative
 
 @dataclass(frozen=True)
 class RayWidth(Checked):
-    """Area on the detector over which a pixel averages, and rotation during the exposure; all 0: a single ray.
+    """What makes a ray wide: the area over which a pixel averages, the blur, and the rotation during the exposure. If
+    all are 0, a ray is a line.
 
     Attributes:
         pixel: side, in pixels, of the square over which a pixel averages; 1: its own area.
@@ -32,7 +33,8 @@ class RayWidth(Checked):
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:
-        """The same width in binned pixels of factor x factor; a pixel's own area becomes that of the binned pixel."""
+        """The same width after binning by factor x factor. The area over which a pixel averages then is that of the
+        binned pixel."""
         return replace(self, blur=self.blur / factor)
 
 

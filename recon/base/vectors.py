@@ -29,11 +29,12 @@ _CLEAN = 1e-9  # rad, pixels, or share of the distance to the source; smaller va
 
 
 def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, cone: bool) -> Geometry:
-    """The geometry of projections that are described by vectors: parallel beams in any direction, cones from any
-    source.
+    """The geometry of projections that are given as vectors, as in ASTRA: parallel beams in any direction, or cones
+    from any source.
 
     The detector pixels are squares of one size. For a parallel beam, the detector is perpendicular to the beam. For a
-    cone, its distance from the source is the same in all projections, and it need not face the origin.
+    cone, the distance from the source to the detector is the same in all projections. The centre of the detector need
+    not lie opposite the origin.
 
     Args:
         vectors: float [view, 12], in mm; see the module.

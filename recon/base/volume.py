@@ -55,9 +55,9 @@ class Grid:
         """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis, at their
         height.
 
-        If projections are shifted, it covers every position that is seen by at least half as many projections as the
-        most frequently seen position. So small alignment shifts change nothing, and projections that step up and down
-        give all heights.
+        If projections are shifted, the function counts how many projections see each position along the columns and
+        along the rows. The grid covers the positions that are seen at least half as often as the position that is seen
+        most. Therefore small alignment shifts change nothing, and a scan that steps up and down gives all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
         360° scan, as in `of_field`. The box is this large because material that
@@ -75,8 +75,8 @@ class Grid:
         """A box around the rotation axis that contains everything that any projection sees, for any axis position.
 
         It includes what shifted projections see, also if the axis is outside the detector. Roll and tilt are ignored.
-        As usual, the field of view of a cone is measured at the rotation axis. Material nearer to the source is
-        magnified more, and only few projections see it. The box of a wide cone ends before its source.
+        The field of view of a cone is measured at the rotation axis. Outside it, material is in the beam only while it
+        is far from the source, so few projections see it. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
@@ -89,7 +89,7 @@ class Grid:
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field of view, in voxels of the requested size.
 
-        `wider`: it is as wide as the requested box, which contains a sample wider than the field of view.
+        `wider`: the box is as wide as the requested box, which is wider than the field of view because the sample is.
 
         The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
         start from a volume coarser than four pixels.

@@ -30,7 +30,7 @@ class AxisEstimate:
         value: axis_col in pixels, counted from 0 at the centre of the first column.
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
-        confident: False if the minimum of the curve is shallow, or parts of the data disagree.
+        confident: False if the minimum of the curve is shallow, or if parts of the data give different axes.
         method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn", "views held out".
     """
 

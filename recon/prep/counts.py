@@ -47,15 +47,15 @@ class Counts:
 
     The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
     1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
-    variance / gain². Flat and dark are taken as known: means of many frames.
+    variance / gain². The model assumes that flat and dark have no noise, because they are means of many frames.
 
     Attributes:
         counts: [view, row, col], any real type.
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: camera gain, counts per photon, see `photon_transfer`.
-        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. It comes from readout and from
-            photons that carry no information.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. It comes from the readout and
+            from photons that carry no information about the sample.
     """
 
     counts: ArrayLike
@@ -87,7 +87,7 @@ class Counts:
             )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Images [row, col] of a projection: photons counted, photons without the sample (each plus v), and v itself.
+        """Three images [row, col] of a projection: photons counted plus v, photons without the sample plus v, and v.
 
         Pixels whose flat is not above the dark have 0 photons without the sample. NaN counts stay NaN.
         """

@@ -27,7 +27,8 @@ Kept = TypeVar("Kept", F32, F64)
 class References:
     """Darks (images without beam) and flats (images with beam but without sample).
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean, without the zingers of single frames.
+    A stack of frames [frame, row, col], any real type, is replaced by its mean. Zingers of single frames do not enter
+    the mean.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.

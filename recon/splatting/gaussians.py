@@ -24,7 +24,7 @@ _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_dens
 class Gaussians:
     """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
 
-    With another kernel f they are still called Gaussians, and S still contains standard deviations.
+    If f is another kernel, we still call them Gaussians, and S still contains standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).

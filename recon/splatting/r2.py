@@ -69,11 +69,12 @@ class R2(Fit):
 
     @property
     def planned_steps(self) -> int | None:
-        """Number of steps after which the fit ends; None if only `seconds` ends it."""
+        """Number of steps after which the fit ends; None if only the time limit `seconds` ends it."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
     def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit without voxel refinement, for this share of the rows, with this share of the steps."""
+        """The fit for a test reconstruction: without voxel refinement, with `share` of the Gaussians and of the
+        steps."""
         steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
         return replace(self.for_part(share, 1.0), steps=steps, finish=0)
 
@@ -99,9 +100,9 @@ class R2(Fit):
         return predict(self, trial, so_far, trial.prior if weight is None else trial.prior._replace(weight=weight))
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit that takes projections during a scan and starts with this number of Gaussians.
+        """A fit that takes projections during a scan, and starts with `gaussians` Gaussians.
 
-        Values of `fit` that differ from the defaults replace those of `WHILE_VIEWS_COME`.
+        The fit has the settings `WHILE_VIEWS_COME`, except for the values of `fit` that differ from the defaults.
 
         Raises:
             ValueError: as for `StreamingFit`, or `gaussians` is a model instead of a number.

@@ -201,10 +201,10 @@ class FitSettings:
             size squared and has no effect (its weight there is 0.05). With the right gradient we measure +0.2 dB on the
             walnut (60 projections) and +0.4 dB on the battery (90 projections).
         rates: learning rates at the first step: of means (per half field), log scales, quaternions and raw densities.
-        pace: factor on all rates. The published rates are for 30 000 steps; with them, a fit of 1000 steps is far from
-            convergence. Twenty times the rates, with two projections per step and a low last rate, gain 1 to 4 dB in
-            1000 steps. 26 times the rates with a higher last rate reach in 400 steps plus voxel refinement the same as
-            20 times in 500 steps.
+        pace: factor on all rates. The published rates are for 30 000 steps; a fit of 1000 steps with the published
+            rates is far from convergence. Rates twenty times as high, with two projections per step and a low last
+            rate, gain 1 to 4 dB in 1000 steps. Rates 26 times as high, with a higher last rate, need only 400 steps
+            before the voxel refinement for what rates 20 times as high reach in 500 steps.
         paced_for: number of steps of the longest fit for which `pace` is valid, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
@@ -214,8 +214,8 @@ class FitSettings:
         joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). None: pixels become
             as wide as the Gaussians, which happens only in large volumes, see `initialise.joined_for`.
         rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
-        kernel: radial profile of the Gaussians, or its name. A fit that starts from a model uses the profile of the
-            model.
+        kernel: radial profile of the Gaussians, or its name. A fit that starts from an existing model keeps the kernel
+            of that model.
     """
 
     loss: Loss = "l1"

@@ -28,10 +28,9 @@ def project(
     truncation: Truncation | None = None,
     model: RayModel | None = None,
 ) -> Tensor:
-    """Line integrals [view, row, col] (dimensionless) of the Gaussians. For a parallel beam, exact except truncation.
-
-    For a cone, the footprint is an affine approximation, or integrated along the true ray if `model` says so. The
-    result is differentiable in all four parameter tensors.
+    """Line integrals [view, row, col] (dimensionless) of the Gaussians. For a parallel beam the integrals are exact,
+    except that each Gaussian is cut off. For a cone, `model` chooses between an affine approximation of the footprint
+    and the integral along each true ray. The result is differentiable in all four parameter tensors.
 
     Raises:
         ValueError: the tensors are not float32.

@@ -73,7 +73,7 @@ class FistaTv(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps of the trials that choose the weight."""
+        """Iterations of the test reconstructions that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     @property
@@ -87,11 +87,12 @@ class FistaTv(VoxelMethod):
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The method that ends nearer to the minimum (or, for a preview, farther from it)."""
+        """The same method with another limit at which it ends: nearer to the minimum, or for a preview farther from
+        it."""
         return with_quality(self, quality)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best weight. If `tv_weight` is given, the prediction of its own volume."""
+        """The residuals in the held-out projections with the best weight; with `tv_weight`, if it is given."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
@@ -171,7 +172,7 @@ class OsSirtTv(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Sweeps of the trials that choose the weight."""
+        """Iterations of the test reconstructions that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     @property
@@ -226,7 +227,7 @@ class PnpDct(VoxelMethod):
     Attributes:
         iterations: steps towards the projections, five for each threshold.
         patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
-            `choose_patches`, or the noise sets it.
+            `choose_patches`; if none can be held out, it follows from the noise.
     """
 
     name: ClassVar[str] = "pnp-dct"
@@ -244,7 +245,8 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Iterations for the weight of total variation and a first volume, and steps with four thresholds."""
+        """Iterations of the tests: those for the weight of total variation, those of a first volume, and the steps with
+        four thresholds."""
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
@@ -258,9 +260,10 @@ class PnpDct(VoxelMethod):
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best threshold. If `patch_threshold` is given, the prediction of its own volume.
+        """The residuals in the held-out projections with the best threshold; with `patch_threshold`, if it is given.
 
-        If the sample is wider than the field of view, it is not tried after simpler methods, see `Trial.wide`.
+        If the sample is wider than the field of view and simpler methods were tried before, PnP-DCT is not tried, see
+        `Trial.wide`.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(

@@ -109,15 +109,16 @@ class Projector:
 
     @property
     def plain(self) -> Projector:
-        """The same without sharpening: no entry of its matrix is negative."""
+        """The same projector without sharpening. Its matrix has no negative entries."""
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
-        """An upper estimate of the largest eigenvalue of AᵀWA, divided by that of `plain`; `weight`: W, of each ray.
+        """How much sharpening raises the largest eigenvalue of AᵀWA: the ratio with and without sharpening, at most.
+        `weight` is W, the weight of each ray.
 
         Sharpening by s raises the finest detail by the factor 1 + 2 s. Along rows, this concerns all projections. Along
         columns, it concerns only projections whose columns differ by less than a voxel at the edge of the field of
-        view. The largest eigenvector contributes to all projections, unless a few rays weigh more than the others.
+        view. All projections contribute to the largest eigenvector, unless a few rays weigh more than the others.
         """
         if self.sharpened is None:
             return 1.0

@@ -138,7 +138,8 @@ def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:
 
 
 def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTrial, ...]:
-    """The trials, one setting varied at a time about each method's baseline; baselines first.
+    """The test reconstructions. For each method, the baseline comes first; each further one changes a single setting of
+    the baseline.
 
     Args:
         methods: names in `recon.methods`, in the order wanted.

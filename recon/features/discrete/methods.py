@@ -44,7 +44,7 @@ _TRIALS = 6  # usual number of test reconstructions with levels
 class Discrete(VoxelMethod):
     """Discrete tomography: FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0.
 
-    φ pulls voxels to a few discrete levels, and leaves partial voxels between them; see
+    φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
     `recon.features.discrete.mixture`. Memory: as `FistaTv`, plus 2 volumes.
 
     Held-out projections choose the number of levels, their values, the factor on the FISTA-TV weight μ,
@@ -104,8 +104,8 @@ class Discrete(VoxelMethod):
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
         """[material, z, y, x] probability that a voxel belongs to a material, in ascending order of the levels.
 
-        The probability that is missing to 1 is that of a partial voxel. None: the volume with these settings was not
-        pulled to discrete levels.
+        The probabilities of a voxel add up to less than 1. The rest is the probability that it is a partial-volume
+        voxel. None: the volume with these settings was not pulled to discrete levels.
         """
         given: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
         if not len(given[0]):
@@ -122,7 +122,8 @@ class Discrete(VoxelMethod):
         return replace(self, iterations=1, levels=(0.0, 1.0))
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """How well the best discrete levels predict held-out projections, or otherwise total variation."""
+        """How well the best discrete levels predict held-out projections. If there are no such levels: how well total
+        variation predicts them."""
         if trial.weight is None:
             return Prediction(
                 self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"

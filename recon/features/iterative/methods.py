@@ -68,10 +68,10 @@ class Sart(VoxelMethod):
 
 @dataclass(frozen=True)
 class Cgls(VoxelMethod):
-    """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); stopping early is its regularisation.
+    """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952). The only regularisation is to stop early.
 
-    Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about
-    eight iterations. After that the residual is only as small as exact arithmetic makes it one iteration earlier.
+    Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about eight
+    iterations. From then on, the method needs one iteration more than exact arithmetic for the same residual.
     Memory: 3 volumes and 3 times the projections.
     """
 
@@ -120,16 +120,16 @@ class Cgls(VoxelMethod):
 class AsdPocs(VoxelMethod):
     """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
-    Each iteration is one of SART, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times as long as
-    the change of the first SART iteration. The steps are multiplied by `alpha_decay` if they undo more than `ratio` of
-    the SART iteration and the residual is still above `goal`.
+    Each iteration makes one SART iteration, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times
+    as long as the change of the first SART iteration. The steps are multiplied by `alpha_decay` if they undo more than
+    `ratio` of the SART iteration and the residual is still above `goal`.
     Memory: 5 volumes and 3 times the projections.
 
     Attributes:
         goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 times the residual of filtered back-projection
             (FBP or FDK). FDK cannot reconstruct a short cone scan; the goal is then 0.15 times the residual after one
-            iteration of ordered-subset SIRT. This residual is about the same: 0.085 to 0.12, and that of FDK is 0.075
-            to 0.11 (a box in a box, 20 to 180 projections, 0 and 2 % noise).
+            iteration of ordered-subset SIRT. Both residuals are similar: 0.085 to 0.12 for SIRT, and 0.075 to 0.11
+            for FDK (a box in a box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"

@@ -46,7 +46,8 @@ def refuse_alike(cross_sections: F64) -> None:
 class EnergyViews:
     """Projections of one sample at several energies; each sees the materials with their attenuation at its energy.
 
-    A series in time has the same form: each moment is an energy, each volume a material.
+    A series in time has the same mathematical form: the moments take the place of the energies, and the volumes that of
+    the materials.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
@@ -91,8 +92,8 @@ class EnergyViews:
         return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
 
     def parted(self, n: int) -> NDArray[np.intp]:
-        """Divide the projections into n parts with all energies and directions: the part, 0 to n - 1, of each
-        projection.
+        """Divide the projections into n parts, each with all energies and directions. Return the part, 0 to n - 1, of
+        each projection.
 
         If there are more energies than projections in a part, neighbouring energies count as one.
         """

@@ -188,8 +188,8 @@ def register_energies(
     between two energies does no harm.
 
     Returns:
-        The projections (interpolated if their magnification differs), and the displacement at each energy. Nothing is
-        displaced if that does not predict held-out projections better.
+        The projections (interpolated if their magnification differs), and the displacement at each energy. The
+        displacement is 0 if a displacement does not predict held-out projections better.
 
     Raises:
         ValueError: the beam is a cone, in which a shift of the sample changes the directions of its rays.

@@ -194,7 +194,8 @@ def fit_share(
     go_on: Callable[[int], bool] = lambda left: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
-    """Refit the densities of two states of one material: the sum stays, the fraction of each becomes smooth.
+    """Fit the densities of two states of one material again. The sum of both densities does not change; the fraction of
+    each state becomes smooth in space.
 
     Held-out projections (one in eight, some rows) choose how smooth it is. Memory: ten volumes, six times the
     projections.

@@ -89,9 +89,9 @@ class TimedVolumes:
             applied. `at` gives the displaced volume.
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
-        motion: displacement from which each voxel takes its value; None: nothing moves.
-        unseen_residuals: residuals in held-out projections of coarse volumes without and with motion; None if held-out
-            projections did not decide about motion.
+        motion: for each voxel, the displacement to the place from which it takes its value; None: nothing moves.
+        unseen_residuals: residuals in held-out projections, first without motion, then with motion, both from coarse
+            volumes; None if held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
             factors. None: each volume is fitted separately.
     """
@@ -141,20 +141,20 @@ def fit_series(
     components of all volumes x_k; the first one is their common part. If nothing moves, and if it predicts held-out
     projections better, the volumes become the mean volume times smooth factors. Smooth factors suit a sample of
     particles, if each particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in
-    `fit_materials`. Four tests each count down to 0: of the weights, of whether the sample moves, of the motion, and of
-    the factors. After the iterations, `go_on` gets a countdown of the steps that fit the factors. If you end these
-    steps early, the result is the volumes without factors.
+    `fit_materials`. There are four tests: of the weights, of whether the sample moves, of the motion, and of the
+    factors. In each of them, `go_on` gets a countdown that ends at 0. After the iterations, `go_on` gets a countdown of
+    the steps that fit the factors. If you end these steps early, the result is the volumes without factors.
 
     Args:
         knots: number of volumes, 2 or more.
         motion: True: also estimate the motion. None: only if it predicts held-out projections better. It helps for a
-            sample that settles. For a sample that only changes its densities, it finds motions that do not exist.
-        tv_weight: μ of all components, scaled so that for an unchanging sample it is the weight of one volume from all
-            projections. None: the weight that predicts held-out projections best.
+            sample that settles. If only the densities of the sample change, motion that does not exist is found.
+        tv_weight: μ of all components. It is scaled so that, if the sample does not change, it equals the weight for
+            one volume from all projections. None: the weight that predicts held-out projections best.
 
     Raises:
-        ValueError: a volume has fewer than twelve projections, or fewer than six that are nearer to it than to any
-            other.
+        ValueError: a volume has fewer than twelve projections, or fewer than six projections are nearer in time to this
+            volume than to any other.
     """
     check_arguments(fit_series, locals())
     refuse_few(knots, views.geometry.n_views)

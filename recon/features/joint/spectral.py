@@ -50,8 +50,8 @@ class Materials:
     residual: float
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
-        """The fraction [z, y, x], 0 to 1, of a material in the summed density of itself and others (e.g. state of
-        charge).
+        """The density of a material divided by the sum of its density and those of the others, [z, y, x], 0 to 1; for
+        example the state of charge.
 
         Args:
             least: voxels with a lower summed density get NaN.
@@ -77,10 +77,10 @@ def fit_materials(
         min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0
 
     U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
-    projections). The densities are V S⁻¹ z. The columns of U are orthonormal. Therefore the noise is the same in all
-    components z_k, and the fit is as well conditioned as a fit to projections at a single energy. An iteration takes as
-    long as one with the same number of projections at a single energy. Steps are those of `ordered_fista`; after each
-    step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to
+    projections). The densities are V S⁻¹ z. U has orthonormal columns. Therefore all components z_k have the same
+    noise, and the fit is as well conditioned as a fit to projections at a single energy. An iteration takes as long as
+    one with the same number of projections at a single energy. Steps are those of `ordered_fista`; after each step,
+    densities below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to
     spectra in one step.)
     Memory: seven volumes per material, three times the projections.
 
