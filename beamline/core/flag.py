@@ -1,5 +1,5 @@
-"""Flag: what a check of the monitor says of a frame, which the event `flag` carries; finding: what a rule says of a
-scan."""
+"""`Flag`: what a check of the monitor reports about a frame (in the event `flag`). `Finding`: what a rule reports about
+a scan or a file."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ PixelBox = tuple[int, int, int, int]
 
 class Level(StrEnum):
     INFO = "info"  # a fact about the scan; the frame is not marked in the file
-    WARN = "warn"  # look at it when you have time
-    ALARM = "alarm"  # the data are suffering now
+    WARN = "warn"  # check it when you have time
+    ALARM = "alarm"  # data are being damaged or lost now
 
 
 @dataclass(frozen=True)
 class Flag:
-    """The finding of a check about one frame or several.
+    """What a check of the monitor reports about one frame, or about several.
 
     Attributes:
         check: name of the check.
-        level: how bad.
-        frame: its number in the file, from 0; darks and flats count.
-        score: the measured figure, in the check's unit.
-        limit: the figure that it exceeds.
-        advice: what it means and what to do.
-        region: where in the frame; None: everywhere, or nowhere in particular.
-        first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
-            of its kind, without another between. Where a finding takes still more views, `frame` itself is earlier
-            than the one at which it is found.
-        from_region: where in the frame `first`; what it is of moved straight to `region`. None: `region` in `frame`
-            alone is known.
+        level: how serious it is, see `Level`.
+        frame: number of the frame in the file, counted from 0 over all frames, also darks and flats.
+        score: the measured value, in the check's unit.
+        limit: the limit that the value exceeds.
+        advice: what the finding means and what to do.
+        region: part of the frame that shows it; None: the whole frame, or no particular part.
+        first: first frame that the finding applies to, if it applies to several frames; `frame` is the last one. All
+            frames between them are of the same kind. `frame` may be earlier than the frame at which the check noticed
+            the fault, because some checks need later projections, too.
+        from_region: part of the frame `first` that shows the object, which moved in a straight line from there to
+            `region`. None: only `region` in `frame` is known.
     """
 
     check: str
@@ -51,11 +51,11 @@ class Flag:
 
     @property
     def frames(self) -> range:
-        """Frames of the file that it applies to."""
+        """Frames of the file that the finding applies to."""
         return range(self.frame if self.first is None else self.first, self.frame + 1)
 
     def regions(self) -> dict[int, PixelBox]:
-        """Regions of its frames that show it, where they are known."""
+        """For each frame with a known region, the part of the frame that shows the fault."""
         if self.region is None:
             return {}
         if self.from_region is None:
@@ -73,14 +73,14 @@ Severity = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What a rule finds in a scan or a file.
+    """What a rule reports about a scan or a file.
 
     Attributes:
-        severity: "error": not fit for reconstruction, or not a valid file.
-        rule: its name.
-        message: in words, with what to do.
-        frames: their rows in the file; empty: of all, or of none in particular.
-        score, limit: the figure, and the limit that it violates; NaN without a figure.
+        severity: "error": the scan cannot be reconstructed, or the file is not valid.
+        rule: name of the rule.
+        message: what was found and what to do.
+        frames: rows of the frames in the file; empty: all frames, or no particular frame.
+        score, limit: the measured value, and the limit that it violates; NaN if nothing was measured.
     """
 
     severity: Severity

@@ -1,9 +1,11 @@
-"""FrameDigest: statistics of a frame for the monitor, the operator and the file, computed in one pass.
+"""Statistics of a frame (`FrameDigest`) for the monitor, the operator and the file, computed in one pass.
 
-Counts (uint16) are read once, line by line: each line is in the processor's cache while its range, sums and histogram
-are taken. Their sums are integers, so that mean and variance are exact. Other types need the range before the
-histogram, so they are read twice. Pixels that are not finite, hold the no-data value, or lie beyond what any detector
-counts (LARGEST), are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
+Counts (uint16) are read once, line by line. Each line is in the processor's cache while its range, sums and histogram
+are computed. The sums are integers, so mean and variance are exact. Other types are read twice, because the histogram
+needs the range first.
+
+A pixel is invalid if it is not finite, if it has the no-data value, or if it is beyond what any detector counts
+(LARGEST). Invalid pixels are counted and otherwise ignored: no mean and no block of the preview contains their values.
 """
 
 from __future__ import annotations
@@ -19,28 +21,31 @@ from zlib_ng import zlib_ng
 from recon.base.jit import njit
 
 ENTROPY_BINS = 256
-ENOUGH = 128  # blocks per side that suffice for a check; a large preview is subsampled to about so many
-LARGEST = 1e15  # of a pixel, either sign: float32 holds the squares of such numbers, and sums of them over a frame
-SMALL, LARGE = 4, 8  # pixels a side of the blocks that the checks see; large ones where ENOUGH of them remain
-ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
+ENOUGH = 128  # blocks per side that are enough for a check; a large preview is subsampled to about this number
+LARGEST = 1e15  # largest absolute value of a valid pixel: float32 holds the sum of the squares over a frame
+SMALL, LARGE = 4, 8  # sides in pixels of the blocks that the checks use; large blocks if at least ENOUGH of them remain
+ENTROPY_PIXELS = 2**20  # pixels, about; for larger frames of counts, every k-th row is enough for the entropy
 
 
 @dataclass(frozen=True, eq=False)
 class FrameDigest:
-    """Statistics of the valid pixels of one frame. Where no pixel is valid, the numbers are NaN.
+    """Statistics of the valid pixels of one frame. They are NaN if no pixel is valid.
 
     Attributes:
         minimum, maximum, mean: in the frame's own unit (counts for a raw frame).
         variance: population variance (divisor n), unit squared.
         sum_abs: sum of absolute values.
-        invalid_fraction: pixels that are not finite, beyond LARGEST or hold the no-data value, over all pixels.
-        saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
+        invalid_fraction: number of invalid pixels, divided by the number of all pixels.
+        saturated_fraction: number of pixels at or above the saturation value, divided by the number of all pixels; 0 if
+            no saturation value was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
-            (0 for a constant frame, at most 8). For counts, of every k-th row where there are more than 2**20 pixels.
-        checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
-        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
-            none). Blocks at the lower and right edge are smaller where bin does not divide the shape.
-        peaks: float32, largest valid pixel of each of these blocks (NaN where there is none).
+            (0 for a constant frame, at most 8). For counts in frames of more than 2**20 pixels, only every k-th row
+            is used.
+        checksum: CRC-32 (IEEE 802.3) of the pixels in memory order. Two equal checksums show that a frame was
+        delivered twice.
+        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of the valid pixels of each block (NaN if it has
+            none). Blocks at the lower and right edge are smaller if bin does not divide the shape.
+        peaks: float32, largest valid pixel of each of these blocks (NaN if it has none).
     """
 
     minimum: float
@@ -57,7 +62,8 @@ class FrameDigest:
 
 
 def check_block(shape: tuple[int, ...]) -> int:
-    """Side in pixels of the blocks in which checks see a frame of `shape`, whatever preview its file holds."""
+    """Side in pixels of the blocks that the checks use for a frame of `shape`. It does not depend on the file's
+    preview."""
     return LARGE if shape[1] >= ENOUGH * LARGE else SMALL
 
 
@@ -67,12 +73,12 @@ def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
 
 
 def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
-    """Side in pixels of the blocks of a preview of a frame of `shape`, which may be smaller than a block."""
+    """Side in pixels of the blocks of a preview of a frame of `shape`. The frame may be smaller than a block."""
     return max(round(n / blocks) for n, blocks in zip(shape, preview, strict=True))
 
 
 def subsampled(preview: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Every k-th block along both axes, so that a large frame costs no more than a small one."""
+    """Every k-th block along both axes, so that a large frame takes no more time than a small one."""
     step_rows, step_cols = (max(1, n // ENOUGH) for n in preview.shape)
     return preview[::step_rows, ::step_cols]
 
@@ -94,7 +100,8 @@ def digest(
     if preview_bin < 1:
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()
-    image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
+    # numba compiles writable and read-only arrays separately: this way one kernel is enough
+    image.flags.writeable = False
     checksum = checksum_of(image)  # of the pixels as they are written
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     peaks = np.empty_like(preview)
@@ -112,17 +119,18 @@ def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: in
     """Two digests of a frame: one for the checks, with blocks of `check_block`, and one for the file, with blocks of
     `preview_bin`. Each is bit-identical to the result of `digest`.
 
-    What the checks find therefore depends only on the frames, and their file gives the same findings later. If the two
-    block sizes differ, the pixels are read twice.
+    Therefore the findings of the checks depend only on the frames. If the checks run again later on the file, they
+    give the same findings. If the two block sizes differ, the pixels are read twice.
     """
     seen = digest(image, saturation, check_block(image.shape))
     return seen, seen if preview_bin == check_block(image.shape) else digest(image, saturation, preview_bin)
 
 
 def block_means(image: NDArray[Any], side: int) -> NDArray[np.float32]:
-    """The preview of a digest, without its kernel: for a few frames numba would take longer to load.
+    """The preview of a digest, computed without the compiled kernel: for a few frames, loading numba would take longer.
 
-    To the bit for counts; sums of reals are rounded in another order.
+    For counts it is bit-identical to the preview of the kernel. For floats it is not, because they are summed in
+    another order.
     """
     rows, cols = (np.arange(0, n, side) for n in image.shape)
 
@@ -166,7 +174,8 @@ def _of_greys(
     every = max(1, image.size // ENTROPY_PIXELS)
     least, high, total, squares, saturated, histograms = _count_greys(image, full, every, preview_bin, preview, peaks)
     low, histogram = int(least.min()), histograms.sum(0, np.int64)
-    size, total, squares = image.size, int(total), int(squares)  # of any length: no square overflows
+    # integers of any length: no square overflows
+    size, total, squares = image.size, int(total), int(squares)
     greys = np.flatnonzero(histogram)
     bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
     folded = np.bincount(bins, weights=histogram[greys], minlength=ENTROPY_BINS)
@@ -199,8 +208,8 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 @njit(nogil=True, cache=True)
 def _folded(sums, tops, side):
-    """Sums and largest values of `side` neighbours each, from those of `side` rows. They are pairs of pairs while
-    `side` is even (and their sums fit into 32 bits); the compiler makes vector instructions of them."""
+    """Sums and largest values of `side` neighbours each, from those of `side` rows. As long as `side` is even and the
+    sums fit into 32 bits, neighbours are added in pairs, because the compiler turns this into vector instructions."""
     width = 1
     while side % (2 * width) == 0 and 2 * width * side <= 65536:
         n = sums.size // 2
@@ -223,11 +232,11 @@ def _folded(sums, tops, side):
 def _count_greys(image, full, every, preview_bin, preview, peaks):
     """(minima of columns, maximum, sum, sum of squares, pixels from `full` on, two histograms of every k-th row).
 
-    Fills preview and peaks. Short loops over one line each: the compiler makes vector instructions of all but the
-    histogram's; a check for a division by zero would forbid them.
+    Fills preview and peaks. Each short loop handles one line, so that the compiler turns all of them except the
+    histogram's into vector instructions. A check for a division by zero would prevent this.
     """
     rows, cols = image.shape
-    # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
+    # Two histograms take turns: neighbours are often equal, and an increment must not wait for the one before it.
     histogram = np.zeros((2, 65536), np.uint32)
     across = preview.shape[1]
     sums, tops = np.zeros(across * preview_bin, np.uint32), np.zeros(across * preview_bin, np.uint16)  # whole blocks
@@ -260,7 +269,8 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):
             preview[block, at] = np.float64(parts[at]) / np.float64(pixels)
         preview[block, across - 1] = np.float64(parts[across - 1]) / np.float64(at_edge)
         top = np.uint16(0)
-        for at in range(across):  # numba's own max, sum along an axis and assignment of rows compile for seconds
+        # loops, because numba needs seconds to compile its own max, sum along an axis and assignment of rows
+        for at in range(across):
             peaks[block, at], top = most[at], max(top, most[at])
         high = max(high, top)
         if top >= full:

@@ -1,12 +1,14 @@
-"""View: a projection as the checks use it, as line integrals on a coarse grid, the same for large and small frames.
+"""A projection as the checks use it (`CellView`): line integrals on a coarse grid of square cells.
 
-Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
-takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
-of the field.
+It is computed once a frame, for all checks. The grid has 128 to 255 columns; the size of a cell in pixels follows from
+this number. A check therefore takes no more time for 2304 x 4096 pixels than for 128 x 512. Limits in cells mean the
+same fraction of the field of view for large and small frames.
 
-Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel of
-a preview block if it is far brighter than the means of all blocks around it, beyond noise. It must also exceed that
-place in the previous frame, because hot pixels and bright gaps in the sample stay.
+Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel
+of a
+preview block counts as a spot if it is much brighter than the means of all blocks around it, by more than noise
+explains. It must also be brighter than the same place in the previous frame, because hot pixels and bright gaps in the
+sample stay.
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ from beamline.monitor.digest import FrameDigest, block_side
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
 
-COLS = 128  # cells at least, where the preview has as many blocks
+COLS = 128  # least number of columns of cells, if the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
-UNLIT = 0.05  # share of the flats' bright part: a cell with less counts as unlit
+UNLIT = 0.05  # fraction of the bright part of the flats; a cell with less intensity counts as a cell without beam
 HOT = 0.1  # a cell is not used if its dark is higher than others by this fraction of the bright part of the flats
 EDGE = 2  # cells at each edge that show whether the sample ends within the field of view
 SEEN = 0.02  # least transmission of a place at which the beam is visible
@@ -109,7 +111,7 @@ def grid_of(
 
 
 def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
-    """A projection on the grid. more_light: its exposure divided by that of the flats."""
+    """A projection on the grid. `more_light` is its exposure divided by that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
     through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / more_light), darkest)
@@ -194,10 +196,11 @@ def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, Cell
     return cells, preview.mean(axis=1), preview.mean(axis=0)
 
 
-NOISES = 4.0  # times the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
-RELATIVE = 0.25  # share of the light around it: least excess of a spot; less leaves only a faint streak
-SAMPLES = 4096  # blocks that give the usual excess
-MOST = 4096  # most spots whose places are kept
+# factor on the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
+NOISES = 4.0
+RELATIVE = 0.25  # least excess of a spot, as a fraction of the intensity around it; weaker spots hardly show
+SAMPLES = 4096  # number of blocks from which the usual excess is computed
+MOST = 4096  # largest number of spots whose positions are kept
 
 
 class Spots(NamedTuple):

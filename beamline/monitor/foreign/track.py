@@ -1,15 +1,18 @@
-"""Track: the path of a small absorber through the field of view, found by the sum over all projections that show it.
+"""Find the path (`Track`) of a small absorber through the field of view, from the sum over all projections that show
+it.
 
-Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
-along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
-of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is
-largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave*
-each.
+The mean of the two neighbours is subtracted from each projection. The difference shows noise, and objects that move by
+their own size or more from one projection to the next. The differences are summed along lines in (projection, column)
+and divided by the standard deviation of the sum. This score grows as the square root of the number of projections if
+an absorber moves along the line, and does not grow in noise (track before detect; Barniv 1985, IEEE Trans. AES 21:144).
+A line ends at its largest score, which may be inside the field of view. Slower objects show in the means of 2, 4,
+8 ... projections; each of these numbers is an *octave*.
 
-A track does not belong to the sample if no point that turns with the stage within its radius explains it: the
-difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
+A track does not belong to the sample if it fits no point that rotates with the stage within the radius of the sample.
+To decide, the squares of two scores are compared: their difference is twice the logarithm of the ratio of the
+likelihoods (Wilks 1938).
 
-Lengths are cells, times are views.
+Lengths are in cells, times in projections.
 """
 
 from __future__ import annotations
@@ -25,39 +28,40 @@ from beamline.monitor.view import CellValues
 from recon.base.arrays import median_deviation
 from recon.base.jit import njit
 
-SEED = 4  # steps of an octave whose sum shows where a track may go on
-SLOWEST, SLOW = 1.5, 4.0  # cells a step: what moves less is mostly taken off with the neighbours; more, in views of one
-APART = 0.5  # cells a step between the speeds tried: the end of a seed is off by less than a cell
-MEMORY = 48  # steps: SLOWEST crosses 120 cells in them
-PROMISING = 4.0  # standard deviations of a seed: of noise a few in a view
-MOST_SEEDS = 8  # of a step, the highest: more take time, and are noise, or a sample that jumped
-CLIP = 5.0  # standard deviations that one step may add
+SEED = 4  # number of steps of an octave whose sum shows how a track may continue
+# cells per step: slower objects are mostly subtracted with the neighbours; faster ones are found in single projections
+SLOWEST, SLOW = 1.5, 4.0
+APART = 0.5  # cells per step between the speeds tried, so that the end of a seed is wrong by less than a cell
+MEMORY = 48  # steps; at the speed SLOWEST an object crosses 120 cells in them
+PROMISING = 4.0  # standard deviations of a seed; noise gives a few such seeds in a projection
+MOST_SEEDS = 8  # largest number of seeds of a step; more take time, and come from noise or from a sample that jumped
+CLIP = 5.0  # largest number of standard deviations that one step may add to a score
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
 KERNEL = np.exp(-0.5 * (np.arange(-2, 3) / SIZE) ** 2).astype(np.float32)
 KERNEL /= np.sqrt((KERNEL**2).sum())  # white noise keeps its variance
 KERNEL_ROWS = KERNEL[1:4] / np.sqrt((KERNEL[1:4] ** 2).sum())
-SAMPLED = 3  # cells, of which one is enough for the noise
-SPIKE = 6.0  # standard deviations between the neighbours: the brighter one has a zinger, or an edge passes
-COMMON = 8  # cells of a row or column that give its common change
-OUTLIER = 3.0  # standard deviations that a cell may add to the common change of its row, and to its usual deviation
+SAMPLED = 3  # one of this many cells is enough to measure the noise
+SPIKE = 6.0  # standard deviations: if the neighbours differ more, the brighter one has a zinger, or an edge passes
+COMMON = 8  # number of cells of a row or column from which its common change is computed
+OUTLIER = 3.0  # most standard deviations that a cell adds to the common change of its row and to its usual deviation
 FORGET = 0.1  # weight of the newest step in the usual square
-LEAST_NOISE = 2e-3  # line integral: flats and the steps of the stage are not better known
-LIT = 1e-3  # weight of a cell that has as good as no light
-FINE = 0.5  # cells between the places tried for either end of a track
-REACH = 6.0  # cells that a rival may be beside the newest place
-UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
-LONGER = 1.5  # times as many steps in each round of a fit
+LEAST_NOISE = 2e-3  # line integral: error of the flats and of the steps of the stage
+LIT = 1e-3  # weight of a cell with almost no intensity
+FINE = 0.5  # cells between the positions tried for each end of a track
+REACH = 6.0  # largest distance in cells of a rival from the newest position
+UNEVEN = 0.3  # fraction of its depth by which a track may vary: part of a particle may be outside the field of view
+LONGER = 1.5  # factor on the number of steps in each round of a fit
 
 
 @dataclass(frozen=True, eq=False)
 class OctaveStep:
-    """One step of an octave: the mean of some views, against its neighbours.
+    """One step of an octave: the mean of some projections, compared with its two neighbours.
 
     Attributes:
-        rows: of its first and last view in the file.
-        time: of its middle, in views.
-        change: float32 [row, col], deviation from the mean of the neighbours, smoothed to SIZE.
-        noise: float32 [row, col], its usual standard deviation there.
+        rows: rows of its first and last projection in the file.
+        time: time of its middle, in projections.
+        change: float32 [row, col], difference from the mean of the neighbours, smoothed to SIZE.
+        noise: float32 [row, col], usual standard deviation of `change` in each cell.
     """
 
     rows: tuple[int, int]
@@ -67,7 +71,7 @@ class OctaveStep:
 
 
 class Mean(NamedTuple):
-    """Mean of the views of a step: their rows in the file, their middle in views, line integrals, weights."""
+    """Mean of the projections of a step: their rows in the file, the time of their middle, line integrals, weights."""
 
     rows: tuple[int, int]
     time: float
@@ -77,13 +81,13 @@ class Mean(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Octave:
-    """Steps of `views` views each.
+    """The steps of an octave; each is the mean of `views` projections.
 
     Attributes:
-        waiting: views of the step that is not complete.
-        means: of the last two steps, older first.
-        steps: the last MEMORY ones with both neighbours, newest first.
-        n: steps so far.
+        waiting: projections of the step that is not complete yet.
+        means: means of the last two steps, the older one first.
+        steps: the last MEMORY steps that have both neighbours, the newest one first.
+        n: number of steps so far.
         usual: float32 [row, col], usual square of the change; None before the first step.
     """
 
@@ -96,7 +100,8 @@ class Octave:
 
 
 class SampleMotion(NamedTuple):
-    """The sample's motion: rad a view, columns where the axis may be, its largest radius in cells."""
+    """Motion of the sample: rotation in radians per projection, possible columns of the axis, largest radius in
+    cells."""
 
     turn: float
     axes: tuple[float, ...]
@@ -104,15 +109,15 @@ class SampleMotion(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A path through the field that ends in one of an octave's newest steps.
+    """A path through the field of view that ends in one of the newest steps of an octave.
 
     Attributes:
-        score: sum of the changes along it, in standard deviations of that sum.
-        rival: the largest score of a point of the sample in the same views.
-        uneven: mean square deviation of the changes from their mean, in units of noise and a share of the mean.
-        row: cell.
-        cols: column of each step, newest first.
-        steps: of the track, newest first.
+        score: sum of the changes along the path, in standard deviations of that sum.
+        rival: the largest score that a point of the sample reaches in the same projections.
+        uneven: mean square deviation of the changes from their mean, in units of noise plus a fraction of the mean.
+        row: row of cells.
+        cols: column in each step, the newest step first.
+        steps: steps of the track, the newest one first.
     """
 
     score: float
@@ -124,12 +129,12 @@ class Track(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """Mean speed, cells per view."""
+        """Mean speed in cells per projection."""
         return float((self.cols[0] - self.cols[-1]) / (self.steps[0].time - self.steps[-1].time))
 
 
 def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: CellValues) -> Octave:
-    """The octave after the next view, which is in this row of the file."""
+    """The octave with the next projection added, which is in this row of the file."""
     waiting = (*octave.waiting, Mean((row, row), time, depth, weight))
     if len(waiting) < octave.views:
         return replace(octave, waiting=waiting)
@@ -152,14 +157,14 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
 
 
 def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, float]:
-    """The change that neighbouring views do not explain, less what rows and columns have in common, smoothed; and the
-    standard deviation of its noise in a cell of weight 1.
+    """The difference between a step and its neighbours, and the standard deviation of its noise in a cell of weight 1.
+    What whole rows and columns have in common is subtracted from the difference, which is then smoothed.
     """
     lit, root, apart = weight > LIT, np.sqrt(weight), before - after
     change = (own - 0.5 * (before + after)) * lit
     sample = (change * root).ravel()[::SAMPLED][lit.ravel()[::SAMPLED]]
     noise = max(median_deviation(sample) if sample.size else 1.0, LEAST_NOISE)
-    # The darker neighbour alone, where the other is far brighter.
+    # If one neighbour is much brighter than the other, only the darker one is used.
     change -= 0.5 * np.abs(apart) * (apart * apart * weight > (SPIKE * noise) ** 2) * lit
     for axis in (0, 1):
         if change.shape[axis] >= COMMON:
@@ -174,8 +179,8 @@ def _change(before: CellValues, own: CellValues, after: CellValues, weight: Cell
 def _noise(
     change: CellValues, weight: CellValues, noise: float, usual: CellValues | None, newest: float
 ) -> tuple[CellValues, CellValues]:
-    """Standard deviation of the change at each cell, and its usual square after this view; both are larger at and
-    beside edges of the sample.
+    """Standard deviation of the change in each cell, and the usual square of the change after this projection. Both are
+    larger at edges of the sample and next to them.
     """
     least = np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
     if usual is None:
@@ -217,7 +222,8 @@ def _seeds(best: CellValues) -> list[tuple[int, int]]:
 
 
 def _fastest(steps: CellValues, offsets: NDArray[np.int64], col: int) -> int:
-    """Which line [speed, step] that ends in this column has the largest sum of steps [step, col]."""
+    """Speed of the line that ends in this column and has the largest sum; lines are [speed, step], steps [step,
+    col]."""
     at = col - offsets
     inside = (at[:, -1] >= 0) & (at[:, -1] < steps.shape[1])
     sums = steps[np.arange(SEED), at.clip(0, steps.shape[1] - 1)].sum(axis=1)
@@ -225,13 +231,13 @@ def _fastest(steps: CellValues, offsets: NDArray[np.int64], col: int) -> int:
 
 
 def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMotion, least: float) -> Track | None:
-    """The best track through a seed; None where its score is not above `least`."""
+    """The best track through a seed; None if its score is not above `least`."""
     times = np.array([octave.steps[0].time - step.time for step in octave.steps])
     change = np.stack([step.change[row] for step in octave.steps])
     noise = np.stack([step.noise[row] for step in octave.steps])
     middle = sum(sample.axes) / len(sample.axes)
     fits = []
-    for turn in (0.0, sample.turn):  # a straight line, or a point that turns with the stage far from the axis
+    for turn in (0.0, sample.turn):  # a straight line, or a point that rotates with the stage far from the axis
         fit = np.zeros(4)
         _grow(change, noise, times, (col, speed), (turn, middle), fit)
         fits.append((*fit.tolist(), turn))
@@ -246,7 +252,9 @@ def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMot
 
 
 def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> int:
-    """Number of newest steps to leave out for the largest score, as the crumb has gone; more than SEED remain."""
+    """Number of newest steps to leave out for the largest score, because the particle has left the field of view.
+    More than
+    SEED steps remain."""
     at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
     weight = noise[at].astype(float) ** -2
     evidence = np.minimum(change[at] / noise[at], CLIP) * np.sqrt(weight)
@@ -255,7 +263,8 @@ def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> 
 
 
 def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
-    """Mean square deviation of the changes along a track from their mean, over that of noise and of UNEVEN."""
+    """Mean square deviation of the changes along a track from their mean, divided by that expected from noise and
+    UNEVEN."""
     at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
     depth, weight = change[at].astype(float), noise[at].astype(float) ** -2
     mean = float((depth * weight).sum() / weight.sum())
@@ -280,7 +289,9 @@ def _highest(steps, offsets, best):
 
 @njit(nogil=True, cache=True)
 def _place(x, v, time, turn, axis):
-    """Column `time` views before it was at x and moved v a view; on a straight line where `turn` is 0."""
+    """Column of a point, `time` projections before it was at x and moved by v per projection. If `turn` is 0, it
+    moves on
+    a straight line."""
     if turn == 0.0:
         return x - v * time
     return axis + (x - axis) * np.cos(turn * time) - v / turn * np.sin(turn * time)
@@ -288,7 +299,7 @@ def _place(x, v, time, turn, axis):
 
 @njit(nogil=True, cache=True)
 def _longest(change, noise, times, x, v, motion, most):
-    """Score and number of steps of the part of a track, from its newest step on, that has the largest score."""
+    """Score and number of steps of the best part of a track, of all parts that begin with its newest step."""
     total, weight, best, steps = 0.0, 0.0, 0.0, 0
     cols = change.shape[1]
     for k in range(most):
@@ -327,7 +338,7 @@ def _grow(change, noise, times, seed, motion, fit):
 
 @njit(nogil=True, cache=True)
 def _rival(change, noise, times, newest, turn, axis, radius):
-    """The largest score, over all these steps, of a point that turns within the radius and is near `newest` at last."""
+    """The largest score in these steps of a point that rotates within the radius and is near `newest` at the end."""
     cols, best = change.shape[1], 0.0
     span = times[-1] - times[0]
     for i in range(int(2 * REACH / FINE) + 1):
@@ -345,7 +356,7 @@ def _rival(change, noise, times, newest, turn, axis, radius):
                     s = noise[k, c]
                     total += min(change[k, c] / s, CLIP) / s
                     weight += 1 / (s * s)
-            # Where it is beside the field it says nothing of the light.
+            # While the point is outside the field of view, it does not affect the intensity.
             if weight > 0 and total > 0:
                 best = max(best, total / np.sqrt(weight))
     return best
