@@ -136,9 +136,9 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
             "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp edges. "
-            f"In all projections the rotation axis is tilted along the beam by {math.degrees(lean):.3g} degrees or "
-            "more, so no projection measures structure along the axis, such as the faces of a plate, and held-out "
-            "projections choose too small a weight",
+            f"In all projections the rotation axis is tilted along the beam, by {math.degrees(lean):.3g} degrees or "
+            "more. Structure along the axis, such as the faces of a plate, is then in no projection. Held-out "
+            "projections do not show it either, and choose too small a weight",
             stacklevel=3,
         )
 
@@ -225,8 +225,8 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     some = some[np.isfinite(some)]
     if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
         raise ValueError(
-            "divide the line integrals by a constant (the volume is then divided by the same constant): one in ten "
-            f"is above {most:.3g}, and the largest possible value is {_LARGEST:g}, because sums of squares would "
-            "exceed the range of float32"
+            "divide the line integrals by a constant; the volume is then divided by the same constant. One in ten of "
+            f"them is above {most:.3g}. At most {_LARGEST:g} is possible, because the sums of squares of larger "
+            "values exceed the range of float32"
         )
     return data

@@ -87,10 +87,10 @@ class _Messages:
 
 
 def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
-    """The scans that a plan of bluesky starts, in order; and after them, as one scan, what its other messages need.
+    """The scans that a plan of bluesky starts, in order. The last one stands for all other messages of the plan.
 
-    The plan gets no measured value: one that reads a device and decides by the value cannot be followed, and has that
-    fault. Moves count one after the other. The plan is used up.
+    The plan gets no measured values. If it decides by a value that it reads from a device, it cannot be followed, and
+    the result has this fault. Moves count one after the other. The plan is used up.
     """
     source, scans, others = f"plan {getattr(plan, '__name__', '')}".rstrip(), list[PlannedScan](), _Messages()
     reply = None

@@ -103,7 +103,7 @@ def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
         return "add --method with one of these methods."
-    return f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. Give only one of the two options."
+    return f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. No method has both: leave one of them out."
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:

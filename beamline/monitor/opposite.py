@@ -100,7 +100,8 @@ class OppositeCheck(Logged):
     warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
     changed: float = setting(
         1.0,
-        "change of parts of the sample, stated as the shift of the whole sample (pixels) that changes as much",
+        "change of parts of the sample, in pixels: the shift of the whole sample that would change the projection as "
+        "much",
         ge=0,
     )
     axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)

@@ -54,8 +54,8 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
         if others and (found := _nearest_view(image, others, seen)) is not None:
             off, like, nearest = found
             odd.append(BadFrames(frames, off, like / LIKER, (
-                f"the sample was in the beam: they differ from the {beside} by {off:.3g} in line integral, but from "
-                f"the projection in frame {views[nearest].row} only by {like:.2g}."
+                f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {beside}, but only "
+                f"by {like:.2g} from the projection in frame {views[nearest].row}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
         yield from odd
@@ -123,9 +123,9 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     for group, top, mismatch in zip(groups, above.brightest.tolist(), above.mismatch.tolist(), strict=True):
         if min(top, top - least, mismatch) > above.limit:
             yield BadFrames(group, top, above.limit, (
-                "the sample, or something else, was in the beam: projections are locally brighter than these flats by "
-                f"{top:.3g} in line integral (limit {above.limit:.2g}), but brighter than the other flats only by "
-                f"{max(least, 0.0):.2g}, and a sample can only absorb."
+                "the sample, or something else, was in the beam. A sample can only absorb, but projections are "
+                f"locally brighter than these flats, by {top:.3g} in line integral (limit {above.limit:.2g}). They "
+                f"are brighter than the other flats by only {max(least, 0.0):.2g}."
             ))  # fmt: skip
 
 
@@ -158,9 +158,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
         yield BadFrames(flats, brighter, limit, (
-            "the sample was in the beam, or the beam changed its shape between flats and projections: the "
-            f"projections are locally brighter than the flats by {brighter:.2g} in line integral (limit {limit:.2g}) "
-            "and nowhere else darker than them, but a sample can only absorb."
+            "the sample was in the beam, or the beam changed its shape between flats and projections. A sample can "
+            f"only absorb, but the projections are locally brighter than the flats, by {brighter:.2g} in line "
+            f"integral (limit {limit:.2g}). In the rest of the frame they are hardly darker than the flats."
         ))  # fmt: skip
         return
     turning = depth - mean
@@ -169,9 +169,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     seen = float(masses.mean())
     if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
         yield BadFrames(flats, seen, LIGHTER * least, (
-            f"the sample was in the beam: the rotating part of the sample absorbs at least {least:.2g} (line integral, "
-            f"mean over the frame), but relative to these flats only {seen:.2g} is absorbed (limit "
-            f"{LIGHTER * least:.2g})."
+            "the sample was in the beam. The differences between projections show that the sample absorbs at least "
+            f"{least:.2g} (line integral, mean over the frame). But the projections divided by these flats show only "
+            f"{seen:.2g} (limit {LIGHTER * least:.2g})."
         ))  # fmt: skip
 
 

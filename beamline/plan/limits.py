@@ -189,9 +189,9 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     period = facts.views.period
     if facts.flight and abs(period - plan.period) > 1e-3 * plan.period:
         yield (
-            f"period_s {plan.period:g} would be {facts.flight.interval / plan.period:.6g} counts/s of the stage. The "
-            f"stage turns at {facts.flight.interval / period:.6g} counts/s, so there is a projection every "
-            f"{period:.6g} s"
+            f"period_s becomes {period:.6g} instead of {plan.period:g}, because the stage can turn at "
+            f"{facts.flight.interval / period:.6g} counts/s, but not at {facts.flight.interval / plan.period:.6g} "
+            "counts/s"
         )
     if plan.mode is Mode.FLY and camera.min_period <= period < MARGIN * camera.min_period:
         yield (

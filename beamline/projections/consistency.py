@@ -333,9 +333,9 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
         else "If the beam is a cone, give --cone SOD:SDD in mm. Without it, densities and shapes are wrong."
     )
     sentence = (
-        f"{check} The projections contradict the stated geometry: rays that were measured from both sides agree "
-        f"if the rays to the detector span {shown:.3g} degrees{away}, but with the stated distances they span "
-        f"{told:.3g} degrees."
+        f"{check} The projections contradict the stated geometry. A 360° scan measures each ray twice, from opposite "
+        f"sides. The two values agree best if the fan angle is {shown:.3g} degrees{away}, but it is {told:.3g} "
+        "degrees with the stated distances."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
     is_by_axis = abs(math.atan(best * across) - math.atan(by_axis * across)) <= _SAME_FAN
@@ -412,8 +412,8 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     what = "directions one step apart" if closed else "the same rays"
     return (
         f"The first and the last projection show {what}, but the stated angles "
-        f"{'include' if closed else 'do not include'} both ends of {math.degrees(turn):.4g} degrees. The "
-        f"angular step is {'too large' if closed else 'too small'}, by 1 in {order.size}."
+        f"{'include' if closed else 'do not include'} both ends of {math.degrees(turn):.4g} degrees. The angular "
+        f"step is {'too large' if closed else 'too small'}, by one part in {order.size}."
     )
 
 

@@ -305,8 +305,8 @@ def _of_wedges(unseen: Sequence[Wedge]) -> str:
     directions = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
     size = math.degrees(sum(wedge.size for wedge in unseen))
     return (
-        f"No projection has rays in {size:.0f}° of directions: {directions} from x towards y (orange). Edges along "
-        "these directions are blurred, and small objects are elongated across them."
+        f"Orange: directions in which no projection has rays, {directions}, counted from x towards y ({size:.0f}° in "
+        "all). Edges along these directions are blurred. Small objects are elongated across these directions."
     )
 
 

@@ -44,8 +44,9 @@ _NO_SCORE = (
     "compared with the same projections."
 )
 _OTHER_VIEWS = (
-    "Look at the pictures first. This option also changes the projections that are used for scoring, so each slice is "
-    "compared with the projections as every value corrects them. That favours values in the middle of the range."
+    "Look at the pictures first. Each value of this option corrects the projections differently, and the score of a "
+    "slice needs projections to compare with. Therefore each slice is compared with the projections of all values, "
+    "and its score is the mean. This favours values in the middle of the range."
 )
 
 

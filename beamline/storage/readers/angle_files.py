@@ -133,7 +133,8 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
     match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
     if match is None:
         raise DataError(
-            f"--angle-rows {shlex.quote(rows)} is wrong; expected A:B, counted from 0 and without B, such as 10:101."
+            f"--angle-rows {shlex.quote(rows)} is wrong; expected A:B, such as 10:101: lines A to B - 1, counted "
+            "from 0."
         )
     first = int(match[1] or 0)
     last = int(match[2] or angles.size)
@@ -198,7 +199,7 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f"{name} has {angles.size} angles, but {source.path} is one image of {source.shape[0]} x "
             f"{source.shape[1]} pixels. If the image is a sinogram, its rows or its columns are the "
             "projections: give that many angles, or use --angle-rows A:B to choose those that belong to "
-            "it (from 0, without B)."
+            "it (lines A to B - 1, counted from 0)."
         )
     if angles.size < n:
         message = f"{name} has {angles.size} angles for {n} projections, so {n - angles.size} projections have no angle"
@@ -241,7 +242,8 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
                 "others with --darks and --flats. If not, use"
             )
     message += (
-        f". {sinograms or 'Use'} --angle-rows A:B to choose the {n} angles of the projections (from 0, without B)"
+        f". {sinograms or 'Use'} --angle-rows A:B to choose the {n} angles of the projections (lines A to B - 1, "
+        "counted from 0)"
     )
     if window is None:
         return f"{message}."

@@ -154,8 +154,8 @@ UPRIGHT = "the detector is assumed to be perpendicular to the beam"
 _ENERGY = "energy, if the beams above state none"
 _WAVELENGTH = "energy, if no beam states one"
 _DONE = (
-    "frames are corrected as if they were raw; if they are corrected already, give --quantity line-integrals, or the "
-    "raw frames"
+    "frames are corrected as if they were raw. If they were corrected before, give --quantity line-integrals, or use "
+    "the raw frames"
 )
 
 NXTOMO: tuple[Entry, ...] = (
@@ -191,8 +191,9 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "instrument/source/distance",
-        "distance from source to sample, of either sign, also of an NXsource with another name. It means a cone beam, "
-        "unless the magnification is below 1 % and every ray is parallel within half a pixel in the field of view",
+        "distance from source to sample; its sign and the name of the NXsource do not matter. It makes the beam a "
+        "cone, unless the magnification is below 1 % and all rays of the field of view are parallel to within half a "
+        "pixel",
         units=datasets.LENGTH_UNITS,
     ),
     Entry("detector/x_flipped", "frames are mirrored left to right when they are read"),

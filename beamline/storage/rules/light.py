@@ -87,10 +87,10 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         "light",
-        "Use the images as the camera wrote them, or all scaled by one factor. These seem to be scaled one by one, "
-        "as programs do that save pictures, so that one grey value means a different attenuation in each projection: "
-        f"in each of {VIEWS} projections checked, the darkest pixel is {low:g} and the brightest {high:g}, but in "
-        "each projection these are different pixels.",
+        "Use the images as the camera wrote them, or scale all of them by one factor. Here each image seems to be "
+        "scaled by a factor of its own, as some programs do when they save pictures. The same grey value then means "
+        f"a different attenuation in each projection. The sign of this: in each of {VIEWS} projections checked, the "
+        f"darkest pixel is {low:g} and the brightest {high:g}, but in each projection these are different pixels.",
     )
 
 

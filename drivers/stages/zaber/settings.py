@@ -52,7 +52,8 @@ class ZaberSettings(Wiring, StageFigures):
     )
     speed_unit: float = setting(
         SPEED_UNIT,
-        "Native speed per microstep/s; the vendor's convention (stated from memory, not from the manual).",
+        "Native units of speed for one microstep/s. The default is the vendor's convention, from memory and not from "
+        "the manual.",
         gt=0,
     )
     measured: bool = setting(False, "true: pulses follow the encoder, not the commanded position.")

@@ -346,7 +346,7 @@ class RiddenFrames:
         has_angles = self._plan.told_by == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
             off = "" if has_angles else f", and {off}"
-            off = f"frames next to those of another kind have the wrong kind{off}. Set ride.kinds"
+            off = f"the first and last frames of each kind have the wrong kind{off}. Set ride.kinds"
         elif has_angles:
             return ""
         else:

@@ -510,7 +510,8 @@ class Sorter:
             lost += (seen.number - known.number) // views.step - 1
         trigger = views.trigger(views.last) + 1 + lost
         self._note = (
-            f"Other frames came within the projections, which continue with projection {trigger} at number "
+            f"Darks or flats came between the projections. The projections continue with projection {trigger} at "
+            "number "
             f"{seen.number}" + (f", because {lost} were lost before and after the other frames." if lost else ".")
         )
         views.first, views.count_restarts = seen.number - trigger * views.step, seen.count_restarts

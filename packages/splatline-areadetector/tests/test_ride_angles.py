@@ -148,7 +148,7 @@ def test_a_first_dark_that_was_lost_shifts_kinds_by_order_which_is_said(tmp_path
         in (said := str(told.error))
     )
     assert (
-        "frames next to those of another kind have the wrong kind, and all angles are 9° larger than stated. Set "
+        "the first and last frames of each kind have the wrong kind, and all angles are 9° larger than stated. Set "
         "ride.kinds" in said
     )
 
@@ -220,4 +220,4 @@ def test_flats_within_the_projections_by_their_kind(tmp_path: Path, restarts: bo
     told, (file,) = _ridden(tmp_path, rows, **{**KINDS, "darks": {"count": 0}})
     assert told.error is None and not _wrong(file) and _views(file) == [*range(20)]
     assert file.kinds.tolist() == [1] * 5 + [0] * 10 + [1] * 5 + [0] * 10 + [1] * 5
-    assert "Other frames came within the projections, which continue with projection 10" in told.warnings
+    assert "Darks or flats came between the projections. The projections continue with projection 10" in told.warnings

@@ -65,8 +65,8 @@ def read_spectra(path: Path) -> Spectra:
         raise DataError(f"{path} cannot be read as a table of spectra ({error}). Expected {_TABLE}.") from error
     if head[0].strip() != "energy_kev" or not names or len({name.casefold() for name in names}) < len(names):
         raise DataError(
-            f"{path} begins with {','.join(head)[:80]!r}. Expected {_TABLE}. Each NAME may occur only once, "
-            "and capitals do not make a name different."
+            f"{path} begins with {','.join(head)[:80]!r}. Expected {_TABLE}. Each NAME may occur only once; capital "
+            "and small letters count as equal."
         )
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
         raise DataError(f"{path}: energies must differ, and all values must be finite and 0 or more.")
@@ -87,8 +87,8 @@ def read_spectra(path: Path) -> Spectra:
 @click.option("--register", is_flag=True,
               help="Find and correct how the sample moved, and the magnification of each scan.")  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="These two materials are states of one material, such as charged and discharged. Their sum stays; "
-              "the fraction of each is made smooth.")  # fmt: skip
+              help="These two materials are states of one material, such as charged and discharged. Their sum does "
+              "not change; the fraction of each state becomes smooth in space.")  # fmt: skip
 @click.option(
     "--axis", type=float, metavar="COL", help="Column of the rotation axis. Default: found in the first scan."
 )

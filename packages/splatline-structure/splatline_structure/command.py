@@ -62,7 +62,7 @@ class Seen:
 
 @click.command(cls=Repeatable)
 @click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
-@click.option("--compare", is_flag=True, help="Say what changed between two volumes, such as charged and discharged.")
+@click.option("--compare", is_flag=True, help="Print what changed between two volumes, such as charged and discharged.")
 @click.option(
     "--dataset",
     metavar="PATH",
@@ -252,9 +252,9 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     particles = values["particles"] or n_materials
     if labels.size not in (0, n_materials):
         raise ValueError(
-            f"leave out --materials {n_materials}, because the volume contains {labels.size} different values "
-            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values, and each label "
-            "is a material"
+            f"leave out --materials {n_materials}: the volume contains only {labels.size} different values "
+            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values. Each label is a "
+            "material"
         )
     if labels.size:
         materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))

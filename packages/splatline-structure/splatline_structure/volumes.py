@@ -128,9 +128,10 @@ def read_volume(
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
         limit_sentence = (
-            f"Only {most} of {end - first} slices fit into {size(memory)} of memory. Numbers are measured in the "
-            f"slices {fitting.start}:{fitting.stop}, in the middle; those whose names end in _all in {first}:{end}, "
-            "with intervals as wide as in the middle. To measure more slices, free memory or give more --memory."
+            f"Only {most} of {end - first} slices fit into {size(memory)} of memory, so the numbers are measured in "
+            f"the middle, in the slices {fitting.start}:{fitting.stop}. Numbers whose names end in _all are measured "
+            f"in {first}:{end}, but their intervals are those of the middle. To measure more slices, free memory or "
+            "give more --memory."
             if excess
             else ""
         )

@@ -324,8 +324,7 @@ REMARKS = {
     ),
     "whole counts a second": (
         {"angles": angles.fixed(36_000), "period": 0.6},
-        "period_s 0.6 would be 8.33333 counts/s of the stage. The stage turns at 8 counts/s, so there is a projection "
-        "every 0.625 s",
+        "period_s becomes 0.625 instead of 0.6, because the stage can turn at 8 counts/s, but not at 8.33333 counts/s",
     ),
     "margin": ({"period": 0.0512}, "less than 1 % above the camera's minimum of 0.051 s"),
     "few views": ({"angles": angles.fixed(180)}, "180 projections are fewer than pi/2 x 252 columns = 396"),
