@@ -14,7 +14,7 @@ from beamline.core.flag import PixelBox
 from beamline.storage.volumes.files import whole_volume
 
 if TYPE_CHECKING:
-    from simulators.effects.chain import Label
+    from simulators.effects.chain import AnomalyLabel
     from simulators.samples.sample import ReadVolume
 
 
@@ -36,9 +36,9 @@ class LabelledRun:
 class LabelLog:
     """Collects the labels of consecutive frames."""
 
-    _frames: list[tuple[int, Label]] = field(default_factory=list)
+    _frames: list[tuple[int, AnomalyLabel]] = field(default_factory=list)
 
-    def add(self, frame: int, labels: Sequence[Label]) -> None:
+    def add(self, frame: int, labels: Sequence[AnomalyLabel]) -> None:
         self._frames.extend((frame, label) for label in labels)
 
     def runs(self, n_frames: float = math.inf) -> tuple[LabelledRun, ...]:

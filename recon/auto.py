@@ -127,9 +127,9 @@ class Auto(Method):
 def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates: tuple[Method, ...]) -> Trial | None:
     """The test reconstructions of a problem; None: no projections of it can be held out."""
     # In a slab, progress counts only slices.
-    told = replace(control, on_progress=control.on_progress if control.decide is None else None)
+    silent = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(_sweeps(each) for each in candidates)
-    watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
+    watch = Watch(on_trial=TrialWatch(silent, problem.geometry.n_views, sweeps))
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
     scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide, problem.wide)
     return Trial.of(scan, TrialSettings(all_rows, control.now))

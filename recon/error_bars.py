@@ -168,7 +168,7 @@ def _refitted(
     given = problem.views.masked()
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
-    def told(iteration: int, residual: float) -> bool:
+    def progress(iteration: int, residual: float) -> bool:
         nonlocal done, stopped
         done += 1
         control.report_progress(done, 2 * sweeps, begin, problem.geometry.n_views, "sweeps of error bars")
@@ -180,7 +180,7 @@ def _refitted(
         trusted = given.weighed(1 + np.float32(sign * _EXTRA) * signs)
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
-            refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(told),
+            refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(progress),
             decide=decide, wide=problem.wide,
         )  # fmt: skip
         if stopped:

@@ -58,7 +58,7 @@ class Forecast(NamedTuple):
         return self.choice_seconds + max(self.volumes.values())
 
 
-class Pace(NamedTuple):
+class RunTiming(NamedTuple):
     """Timing of a run: seconds outside its iterations, seconds of each iteration, and the planned number."""
 
     fixed: float
@@ -69,8 +69,8 @@ class Pace(NamedTuple):
     def total(self) -> float:
         return self.fixed + self.planned * self.each
 
-    def scaled(self, fixed: float, each: float) -> Pace:
-        return Pace(fixed * self.fixed, each * self.each, self.planned)
+    def scaled(self, fixed: float, each: float) -> RunTiming:
+        return RunTiming(fixed * self.fixed, each * self.each, self.planned)
 
 
 def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Forecast | None:
@@ -96,7 +96,7 @@ class Timing:
         self._scale = _work(geometry, grid) / _work(self._part.geometry, self._part.grid)
         self._trial_share = choice_sweeps(geometry) / CHOICE_SWEEPS
         self._trial = part_of(geometry, grid, voxels, TRIAL_ROWS)
-        self._paces, self._known = dict[str, Pace](), dict[str, Forecast]()
+        self._paces, self._known = dict[str, RunTiming](), dict[str, Forecast]()
 
     def of(self, method: Method) -> Forecast:
         """The expected duration of a method, see `forecast`."""
@@ -123,7 +123,7 @@ class Timing:
         method.run(part, RunControl(now=self._now))
         return (self._now() - begin) * _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
 
-    def pace(self, method: Method, of_trial: bool = False) -> Pace:
+    def pace(self, method: Method, of_trial: bool = False) -> RunTiming:
         """Expected timing of an iterative method in all voxels, from a part of them or from the rows of a test."""
         key = f"{of_trial} {method!r}"
         if key not in self._paces:
@@ -140,7 +140,7 @@ class Timing:
         return self._paces[key]
 
     @property
-    def _smooth(self) -> Pace:
+    def _smooth(self) -> RunTiming:
         return self.pace(FistaTv())
 
     def trial_seconds(self, method: Method) -> float:
@@ -154,7 +154,7 @@ class Timing:
             return self._trial_share * ((CHOICE_SWEEPS + TRIAL_SWEEPS) * smooth + patches)
         return self._trial_share * sweeps * smooth
 
-    def fit_pace(self, method: Fit) -> Pace:
+    def fit_pace(self, method: Fit) -> RunTiming:
         """Expected timing of a fit without its voxel refinement."""
         field = Grid.for_fit(self._geometry, self._grid)
         given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
@@ -239,7 +239,7 @@ def _covered(voxels: float, gaussians: float) -> float:
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
-def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> Pace:
+def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> RunTiming:
     """The timing of the iterations from `after` to `last`, without test reconstructions."""
     reached: list[tuple[int, float]] = []
     planned = last
@@ -256,7 +256,7 @@ def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int
     seconds = now() - begin
     some = [mark for mark in reached if mark[0] >= (after + STEPS if after else 1)]
     if len(some) < 2:
-        return Pace(0.0, seconds / planned, planned) if planned else Pace(seconds, 0.0, 0)
+        return RunTiming(0.0, seconds / planned, planned) if planned else RunTiming(seconds, 0.0, 0)
     (step, at), (end, until) = some[0], some[-1]
     each = (until - at) / (end - step)
-    return Pace(seconds - (end - after) * each, each, planned - after)
+    return RunTiming(seconds - (end - after) * each, each, planned - after)

@@ -267,8 +267,8 @@ class CameraDetector(StandardDetector):
 
             def ended_by() -> str:
                 engine.unsubscribe(token)
-                told = stops[-1]["exit_status"] if stops else "success"
-                return str(told if engine.state == "running" else engine.state)
+                status = stops[-1]["exit_status"] if stops else "success"
+                return str(status if engine.state == "running" else engine.state)
 
             self._frames.ended_by = ended_by
         return super().stage()

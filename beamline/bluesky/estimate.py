@@ -42,16 +42,16 @@ class _Messages:
 
     def take(self, message: Msg) -> Any:
         """Add a message, and return what a plan expects in reply."""
-        told: Any = message.args[0] if message.args else None
+        argument: Any = message.args[0] if message.args else None
         match message.command, message.obj:
             case "set", Rotation() as stage:
-                self._move(stage, math.radians(float(told)))
+                self._move(stage, math.radians(float(argument)))
             case "set" | "prepare", device:
-                self.values[id(device)] = told
+                self.values[id(device)] = argument
             case "trigger" | "kickoff", CameraDetector() as camera:
                 self._expose(camera)
             case "sleep", _:
-                self.needs.append(ScanNeeds({"wait": float(told)}))
+                self.needs.append(ScanNeeds({"wait": float(argument)}))
             case "input" | "pause", _:
                 self.needs.append(ScanNeeds(operator=(OperatorRequest("answer the plan, or resume it", 1),)))
             case "locate", Rotation() as stage:

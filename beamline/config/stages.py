@@ -38,11 +38,13 @@ STAGES: Registry[StageDriver] = Registry(
 _IDENTITY = ("model", "serial", "device", "axis", "channel")
 
 
-def settings_file(said: Mapping[str, object], folder: Path) -> Path:
+def settings_file(description: Mapping[str, object], folder: Path) -> Path:
     """File for the settings of the stage with this description: named by its serial number, or by its port if it
     reports none.
     """
-    which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
+    which = [str(description[key]) for key in _IDENTITY if key in description]
+    if "serial" not in description:
+        which.append(str(description.get("port")))
     name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
     return folder / f"{name}-{crc32(json.dumps(which, allow_nan=False).encode()):08x}.json"
 

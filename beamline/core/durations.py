@@ -50,20 +50,20 @@ class Phases:
 
     def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
         self._sink, self._clock = sink, clock or SystemClock()
-        self._name, self._counted, self._begun, self._said = "", "", self._clock.now(), -math.inf
+        self._name, self._counted, self._begun, self._reported = "", "", self._clock.now(), -math.inf
         self.seconds: dict[str, float] = {}
 
     def enter(self, name: str, counted: str = "views") -> None:
         """End the last phase and begin this one; its progress counts up to `counted`."""
         self.end()
-        self._name, self._counted, self._said = name, counted, -math.inf
+        self._name, self._counted, self._reported = name, counted, -math.inf
         self._say(0, 0, None, None)
 
     def progress(self, n: int, total: int) -> None:
         """Report that n of `total` are done; n = 0 is not reported."""
         now = self._clock.now()
-        if n and (now - self._said >= _SAY_EVERY or n == total):
-            self._said = now
+        if n and (now - self._reported >= _SAY_EVERY or n == total):
+            self._reported = now
             spent = max(now - self._begun, 1e-9)
             self._say(n, total, n / spent, seconds_left(n, total, spent))
 

@@ -81,8 +81,8 @@ def installation_problem(error: BaseException) -> str:
         )
     else:
         advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
-    said = " ".join(f"{type(cause).__name__}: {cause}".split())
-    return f"the library {name!r} cannot be loaded ({said}). {advice}.{_WITHOUT.get(name, '')}"
+    reason = " ".join(f"{type(cause).__name__}: {cause}".split())
+    return f"the library {name!r} cannot be loaded ({reason}). {advice}.{_WITHOUT.get(name, '')}"
 
 
 def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

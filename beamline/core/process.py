@@ -245,7 +245,7 @@ def run_to_end(
     return ending, process.code, last_line(log)
 
 
-def at_end_of(pipe: int, act: Callable[[], object], told: Callable[[bytes], object] = lambda text: None) -> None:
+def at_end_of(pipe: int, act: Callable[[], object], on_text: Callable[[bytes], object] = lambda text: None) -> None:
     """Call `act` in a separate thread when the file descriptor `pipe` reaches its end: the process at its other end is
     dead. Until then `told` gets what that one writes.
 
@@ -255,7 +255,7 @@ def at_end_of(pipe: int, act: Callable[[], object], told: Callable[[bytes], obje
     def wait() -> None:
         with suppress(OSError):
             while text := os.read(pipe, 65536):
-                told(text)
+                on_text(text)
         act()
 
     threading.Thread(target=wait, name="parent", daemon=True).start()

@@ -124,13 +124,13 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
     """
     click.echo(f"Waiting until the sensor is cold, at most {seconds:g} s; Ctrl-C ends the wait.", err=True)
-    told = -math.inf
+    reported = -math.inf
 
     def progress(celsius: float, status: str) -> None:
-        nonlocal told
+        nonlocal reported
         check_stop()
-        if clock.now() - told >= TELL_EVERY:
-            told = clock.now()
+        if clock.now() - reported >= TELL_EVERY:
+            reported = clock.now()
             click.echo(f"The sensor is at {celsius:.1f} °C; its cooler reports {status}.", err=True)
 
     camera.wait_until_cold(seconds, progress)

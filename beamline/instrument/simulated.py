@@ -43,7 +43,7 @@ from simulators.devices.in_beam import (
     SimulatedShutter,
 )
 from simulators.devices.trigger_line import TriggerLine
-from simulators.effects.chain import Label
+from simulators.effects.chain import AnomalyLabel
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.scene import Scene, load_scene
@@ -80,7 +80,7 @@ class SimulatedScene:
     # cone: mm from the source to the rotation axis and to the detector; None for a parallel beam
     cone: tuple[float, float] | None
     # labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
-    labels: Callable[[float], Sequence[Label]]
+    labels: Callable[[float], Sequence[AnomalyLabel]]
     # rehearse: makes a frame with the camera's present settings; ConfigError if the scene cannot be exposed so
     rehearse: Callable[[], None]
 

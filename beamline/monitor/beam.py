@@ -38,7 +38,7 @@ SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 @dataclass(frozen=True)
 class BeamState:
     drifting: int = 0  # views in a row that would change the report
-    told: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
+    flagged_drift: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
     covered: bool = False  # the missing air was reported
     level: float = 0.0  # logarithm of the light over that of the first view, from its confirmed changes
     usual: float = 0.0  # the normal level
@@ -120,17 +120,17 @@ class BeamCheck(Logged):
                 "weaker than in the flats."
             )
             return CheckResult(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
-        gone = state.told != 0 and abs(score) < GONE * self.drift
-        if not gone and abs(score) <= max(GROWN * abs(state.told), self.drift):
+        gone = state.flagged_drift != 0 and abs(score) < GONE * self.drift
+        if not gone and abs(score) <= max(GROWN * abs(state.flagged_drift), self.drift):
             return CheckResult(replace(state, drifting=0))
         if state.drifting + 1 < LASTS:
             return CheckResult(replace(state, drifting=state.drifting + 1))
         if gone:
-            return CheckResult(replace(state, drifting=0, told=0.0))
-        level = Level.INFO if state.told else Level.WARN  # a view is no worse for a drift that goes on
+            return CheckResult(replace(state, drifting=0, flagged_drift=0.0))
+        level = Level.INFO if state.flagged_drift else Level.WARN  # a view is no worse for a drift that goes on
         advice = f"Usually nothing to do: air is {_size(score)} than in the flats. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
-        return CheckResult(replace(state, drifting=0, told=score), flag)
+        return CheckResult(replace(state, drifting=0, flagged_drift=score), flag)
 
 
 def in_air(context: ScanContext) -> float:

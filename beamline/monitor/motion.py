@@ -111,7 +111,7 @@ class MotionState:
     down: FrameScatter = field(default_factory=FrameScatter)
     turn: FrameScatter = field(default_factory=FrameScatter)
     quiet: int = 0
-    told: float = 0.0
+    flagged_shake: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class MotionCheck(Logged):
             state.down.with_figure(change.down),
             state.turn.with_figure(change.turn),
             max(state.quiet - 1, 0),
-            state.told,
+            state.flagged_shake,
         )
         if not state.across.ready or state.quiet:
             return CheckResult(after)
@@ -162,16 +162,16 @@ class MotionCheck(Logged):
         assert context.grid is not None
         across, down = context.shake
         size, limit = math.hypot(across, down), max(self.shake, LEAST_SHAKE * context.grid.cell)
-        if state.told and size < GONE * limit:
-            return CheckResult(replace(state, told=0.0))
-        if size <= max(limit, GROWN * state.told):
+        if state.flagged_shake and size < GONE * limit:
+            return CheckResult(replace(state, flagged_shake=0.0))
+        if size <= max(limit, GROWN * state.flagged_shake):
             return CheckResult(state)
         advice = (
             f"Check for vibration and for runout of the stage: the sample shakes by {across:.2f} px horizontally and "
             f"{down:.2f} px vertically (standard deviation over at most the last 100 projections). The projections can "
             "still be used: `beamline recon --calibrate shifts` measures and corrects the shift of each one."
         )
-        return CheckResult(replace(state, told=size), Flag(self.name, Level.WARN, row, size, limit, advice))
+        return CheckResult(replace(state, flagged_shake=size), Flag(self.name, Level.WARN, row, size, limit, advice))
 
     def _jump(
         self, state: MotionState, after: MotionState, row: int, change: SampleChange

@@ -277,22 +277,22 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
         if basis.shape[1] < LEAST_OVERLAP * now.size:
             return None
         w = weight[inside].ravel()
-        left = (now - fitted)[inside].ravel()
+        residual = (now - fitted)[inside].ravel()
         normal = (basis * w) @ basis.T
-        told = np.diag(normal)[1:] > NOISY * noise * len(w)  # a sample with equal rows shows no shift down
-        if not told[0]:
+        determined = np.diag(normal)[1:] > NOISY * noise * len(w)  # a sample with equal rows shows no shift down
+        if not determined[0]:
             return None
-        if not told[1]:
+        if not determined[1]:
             basis[2], normal[2], normal[:, 2] = 0.0, 0.0, 0.0
         normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
-        gain, more_across, more_down = (float(x) for x in np.linalg.solve(normal, (basis * w) @ left))
+        gain, more_across, more_down = (float(x) for x in np.linalg.solve(normal, (basis * w) @ residual))
         across, down = across + more_across, down + more_down
-    left = left - basis.T @ np.array([gain, more_across, more_down])
-    squares = float((w * left**2).mean())
+    residual = residual - basis.T @ np.array([gain, more_across, more_down])
+    squares = float((w * residual**2).mean())
     structure = float((w * (basis[1] ** 2 + basis[2] ** 2)).mean()) / 2
     own = noise * (1 + (1 - steps) ** 2 + steps**2)
     remainder = math.sqrt(max(squares - own, 0.0) / structure) if squares > NOISY * own else 0.0
-    sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][told].min()))
+    sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][determined].min()))
     # Both views begin at `first`: mirrored about the frame's middle their columns are elsewhere.
     off = first + last - grid.shape[1] if mirrored else 0
     places = 1 + (1 - steps) ** 2 + steps**2

@@ -129,14 +129,14 @@ class ShownScan:
             DataError: the projections cannot be corrected, or have no angles.
         """
         self._read(row, 0.0)
-        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the middle of the detector", self._cone is not None
+        axis, origin, is_cone = (self._source.shape[1] - 1) / 2, "the middle of the detector", self._cone is not None
         if self._source.axis_col is not None:
-            axis, said = self._source.axis_col, "from the file"
+            axis, origin = self._source.axis_col, "from the file"
         elif not is_cone:
             with suppress(ValueError):
                 found = find_axis(self._lines, self._source.table.angles[self._ids])
-                axis, said = found.value, f"found from row {row}{'' if found.confident else ', not a clear optimum'}"
-        return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
+                axis, origin = found.value, f"found from row {row}{'' if found.confident else ', not a clear optimum'}"
+        return {"axis": round(axis, 2), "said": origin, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
         """A part of the FBP slice of one row with this axis; `fast`: from fewer projections, with larger voxels.

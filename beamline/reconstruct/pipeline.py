@@ -33,7 +33,7 @@ from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
 from beamline.reconstruct.record import partly_seen_warning, write_result
 from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.run import fit_within, refuse_views, warnings_told
+from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
 from beamline.reconstruct.scan_facts import ReportContext, ScanFacts, facts_of
 from beamline.reconstruct.slab_run import keeping
 from beamline.reconstruct.truth import fit_truth
@@ -297,11 +297,11 @@ def reconstruct_file(
         if truth_given is not None:  # checked before the work starts
             fit_truth(truth_given, Grid.matching(job.prepared.geometry), options.selection.binning)
         decided = Decisions(options.seed)
-        with job.stopping() as stopped, warnings_told(channels.warn):
+        with job.stopping() as stopped, warnings_shown(channels.warn):
             made, prepared = volume_of(replace(job, stop=Stop(stopped)), decided)
         if options.uncertainty:
             job.channels.phases.enter("error bars")
-            with stop_scope() as stopped, warnings_told(channels.warn):
+            with stop_scope() as stopped, warnings_shown(channels.warn):
                 made = with_error_bars(replace(job, stop=Stop(stopped)), made, decided)
         joined = round(prepared.geometry.pixel_pitch / job.prepared.geometry.pixel_pitch)
         selection = replace(job.options.selection, binning=options.selection.binning * joined)

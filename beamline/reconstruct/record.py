@@ -92,9 +92,9 @@ def write_result(
         try:
             state_time = _report(made, ordinary, truth, checked, volumes, target, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
-            said = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
-            sink(Warned(said, time=clock.now()))
-            record = replace(record, report=None, warnings=(*record.warnings, said))
+            sentence = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
+            sink(Warned(sentence, time=clock.now()))
+            record = replace(record, report=None, warnings=(*record.warnings, sentence))
     phases.end()
     elapsed = clock.now() - context.started
     if state_time is not None:

@@ -211,14 +211,14 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
         )
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
     least = _least(smooth)
-    matter = np.asarray(smooth > least)  # [view, row, col]
-    there = np.flatnonzero(matter.any(axis=2).mean(axis=0) >= _SEEN)
+    material = np.asarray(smooth > least)  # [view, row, col]
+    there = np.flatnonzero(material.any(axis=2).mean(axis=0) >= _SEEN)
     if not there.size:
         raise DataError(
             f"{source.path}: --roi auto finds no sample above the noise in {len(data)} projections. Give the box as "
             "numbers, or leave out --roi. Nothing was written."
         )
-    hull = _hull(matter[:, there], geometry, grid, coarse)
+    hull = _hull(material[:, there], geometry, grid, coarse)
     if not hull.any():
         return _uncut(height, across, "the projections do not agree about the position of the sample")
     z = _widened(_extent(there, coarse), height, coarse)
@@ -246,14 +246,14 @@ def _least(data: F32) -> float:
     return float(air + max(_NOISE * noise, _SHARE * float(np.percentile(data, _DEEPEST))))
 
 
-def _hull(matter: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
+def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
     """[y, x] coarse voxels of the grid that are in the shadow of most views, in some band of rows."""
-    cols = np.arange(matter.shape[2])
+    cols = np.arange(material.shape[2])
     n = -(-grid.shape[2] // coarse)
     at = (grid.coordinates()[2][0] / grid.voxel_size + (coarse - 1) / 2 + coarse * np.arange(n)) / coarse
     found = np.zeros((n, n), np.bool_)
-    for band in np.array_split(np.arange(matter.shape[1]), min(_BANDS, matter.shape[1])):
-        shadow = matter[:, band].any(axis=1)
+    for band in np.array_split(np.arange(material.shape[1]), min(_BANDS, material.shape[1])):
+        shadow = material[:, band].any(axis=1)
         first = np.where(shadow, cols, cols.size).min(axis=1)
         last = np.where(shadow, cols, -1).max(axis=1)
         # A shadow at the edge may go on beyond it; a view without any does not say where the sample is.

@@ -125,7 +125,7 @@ def fit_within(
 
 
 @contextmanager
-def warnings_told(warn: Warn) -> Iterator[None]:
+def warnings_shown(warn: Warn) -> Iterator[None]:
     """A context in which Python's warnings are forwarded as sentences, without file and line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)

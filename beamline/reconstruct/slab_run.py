@@ -275,8 +275,8 @@ def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Sla
     """Numbers of the slabs, beginning with the slab whose rows show the most material."""
     data = prepared.projections.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
-    matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
-    best = int(np.argmax(matter))
+    absorption = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
+    best = int(np.argmax(absorption))
     return [best, *(n for n in range(len(slabs)) if n != best)]
 
 

@@ -104,7 +104,7 @@ def check_volume(
     for name, figures in _beside_each_other(made, volumes, judgement, truth, context.seed).items():
         metrics[name] |= figures
     if fitted and BASELINE in volumes:
-        tell(_lost_matter(made, prepared, volumes[BASELINE]))
+        tell(_lost_material(made, prepared, volumes[BASELINE]))
     if skipped:
         why = "the reconstruction was stopped" if made.ending.early else "the time limit was nearly reached"
         text = f"These checks were left out, because {why}: {', '.join(skipped)}."
@@ -257,7 +257,7 @@ def _beside_each_other(
     return figures
 
 
-def _lost_matter(made: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
+def _lost_material(made: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
     """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
     lit, seen = prepared.measured, None  # seen [z]: the detector row of the slice was in the beam
     if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamline.report.figures import GreyWindow, bright_centre, grey_window, round_length
 from recon.base.arrays import F32
-from recon.base.greys import matter_window
+from recon.base.greys import material_window
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 from recon.voxels.view_weights import Wedge
@@ -102,7 +102,7 @@ def slice_panels(
     images: Sequence[F32], at: Sequence[float], pixel: float, unit: str, unseen: Wedge | None = None
 ) -> list[_Panel]:
     """Slices across z, y and x at these places, in the same greys."""
-    window = matter_window(*images)
+    window = material_window(*images)
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
     notes = (grey, "the same greys and scale", "the same greys and scale")

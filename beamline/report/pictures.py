@@ -35,7 +35,7 @@ from beamline.report.figures import (
     show_image,
 )
 from recon.base.geometry import Geometry
-from recon.base.greys import matter_window
+from recon.base.greys import material_window
 from recon.base.volume import Grid, Volume
 from recon.voxels.view_weights import Wedge
 
@@ -101,7 +101,7 @@ def orthogonal_slices(
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
-    greys = matter_window(*(image for volume in volumes.values() for image in _orthogonal_cuts(volume, at)))
+    greys = material_window(*(image for volume in volumes.values() for image in _orthogonal_cuts(volume, at)))
     height = max(ny / nx, nz / nx, nz / ny, THIN)
     column = min((WIDTH - _BESIDE - BAR - 2 * _BESIDE) / 3, 12 / (height * len(volumes)))
     down = [column * height] * len(volumes)
@@ -206,7 +206,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = one_panel(5.4, 6.4)
     image, title = volume.data[at], f"Rays that no projection has, slice {at}"
-    draw_slice(axes, image, planes(grid, unit)[0], title, matter_window(image))
+    draw_slice(axes, image, planes(grid, unit)[0], title, material_window(image))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
         first, last = wedge.rays
@@ -223,7 +223,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
     figure = new_figure((WIDTH, 4.4), dpi_for(grid.shape[2], WIDTH / 2.4))
     length = round_length(grid.shape[2] * grid.voxel_size / 5)
     panels = (
-        (volume.data[at], kind.value, "gray", matter_window(volume.data[at])),
+        (volume.data[at], kind.value, "gray", material_window(volume.data[at])),
         (deviation.data[at], "standard deviation", "magma", grey_window([deviation.data[at]], 0.5, 99.5)),
     )
     for axes, (image, label, colours, window) in zip(figure.subplots(1, 2), panels, strict=True):

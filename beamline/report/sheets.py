@@ -23,7 +23,7 @@ from beamline.report.figures import (
     show_image,
 )
 from recon.base.arrays import F32
-from recon.base.greys import matter_window
+from recon.base.greys import material_window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,7 +57,7 @@ class SliceSheet:
         if family and (family, method) in self._drawn:
             return
         if not self._shown:
-            self._at, self._window = bright_centre(volume)[0], matter_window(volume)
+            self._at, self._window = bright_centre(volume)[0], material_window(volume)
         self._drawn.add((family, method))
         self._shown[label] = volume[len(volume) // 2 if self._closer else self._at].copy()
 
@@ -76,7 +76,7 @@ class SliceSheet:
         images, window = [self._shown[label] for label in labels], self._window
         if self._closer:
             images = [image[_differ_most(images)] for image in images]
-            window = matter_window(*images)
+            window = material_window(*images)
         rows, cols = np.max([image.shape for image in images], axis=0).tolist()
         gap, down, lines = round(0.04 * cols), -(-len(labels) // self._across), 3 if marks else 2
         head = round(0.06 * lines * cols)

@@ -33,7 +33,7 @@ class Braking:
     """A stage that was stopped during a train of triggers and is now at rest."""
 
     stop_sent: float  # time at which it was told to stop, in s
-    stood: float  # where it stands, in intervals beyond trigger 0
+    position: float  # where it stands, in intervals beyond trigger 0
     deceleration: float  # intervals/s²
 
 
@@ -45,7 +45,7 @@ Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
     """How to assign frames that arrived during braking: by the stage's motion, by their number, or not at all."""
     steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
-    fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
+    fewest, most = (min(math.floor(braking.position + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last
     if _matched(moved) - _matched(steady) >= MOST * due:
         return by_motion
@@ -71,7 +71,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
     else:
         return unassigned(ledger, braking, frame)
     seconds = 1 / (period * braking.deceleration)
-    began = phase + (braking.stood - last) * period - seconds / 2
+    began = phase + (braking.position - last) * period - seconds / 2
     if not -EARLY <= began - braking.stop_sent <= LATE:
         return unassigned(ledger, braking, frame)
     if frame.time <= began:

@@ -218,9 +218,9 @@ class Exposures:
         flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
         stand(self._stage, self._clock, self._stop)
         if not flight.paused:
-            stood = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
+            position = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
-            flight.braking = Braking(flight.stop_sent, stood, counts / abs(train.interval))
+            flight.braking = Braking(flight.stop_sent, position, counts / abs(train.interval))
 
     def _one_by_one(self, taken: BlockTally) -> Iterator[Exposed]:
         """Take frames with software triggers: at each angle of a step scan, or at rest for darks and flats.

@@ -130,35 +130,35 @@ def is_blank(unpacked: int, stored: int, piece: int) -> bool:
     return piece > _LARGE and unpacked > _BLANK * stored
 
 
-def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
+def shape_of(value: Any, what: str = "shape") -> tuple[int, int, int]:
     """Three integers of at least 1, the shape [z, y, x] of a volume or of a chunk."""
-    sides = tuple(said) if isinstance(said, list | tuple) else ()
+    sides = tuple(value) if isinstance(value, list | tuple) else ()
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
-        raise ValueError(f"its {what} is {_brief(said)}; expected three integers")
+        raise ValueError(f"its {what} is {_brief(value)}; expected three integers")
     if not all(1 <= n < _LONGEST for n in sides) or math.prod(map(int, sides)) > _MOST:
         raise ValueError(
-            f"its {what} is {_brief(said)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
+            f"its {what} is {_brief(value)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
         )
     z, y, x = map(int, sides)
     return z, y, x
 
 
-def numbers_of(said: Any, n: int, what: str) -> tuple[float, ...]:
+def numbers_of(value: Any, n: int, what: str) -> tuple[float, ...]:
     """A tuple of `n` finite numbers."""
-    if not isinstance(said, list) or len(said) != n or not all(_is_number(each) for each in said):
-        raise ValueError(f"its {what} is {_brief(said)}; expected {n} numbers")
-    return tuple(map(float, said))
+    if not isinstance(value, list) or len(value) != n or not all(_is_number(each) for each in value):
+        raise ValueError(f"its {what} is {_brief(value)}; expected {n} numbers")
+    return tuple(map(float, value))
 
 
-def _is_number(said: Any) -> bool:
-    return isinstance(said, int | float) and not isinstance(said, bool) and abs(said) <= sys.float_info.max
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def dtype_of(said: Any) -> np.dtype[Any]:
+def dtype_of(value: Any) -> np.dtype[Any]:
     """A type of real numbers of 1 to 8 bytes, little-endian."""
-    if not isinstance(said, str) or _REAL.fullmatch(said) is None:
-        raise ValueError(f"its voxels are {_brief(said)}; expected real numbers")
-    return np.dtype(said).newbyteorder("<")
+    if not isinstance(value, str) or _REAL.fullmatch(value) is None:
+        raise ValueError(f"its voxels are {_brief(value)}; expected real numbers")
+    return np.dtype(value).newbyteorder("<")
 
 
 def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, stored: int) -> None:
@@ -184,6 +184,6 @@ def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _brief(said: Any) -> str:
-    text = repr(said) if not isinstance(said, int) else str(said) if abs(said) < 10**30 else "a huge number"
+def _brief(value: Any) -> str:
+    text = repr(value) if not isinstance(value, int) else str(value) if abs(value) < 10**30 else "a huge number"
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -86,9 +86,9 @@ def no_locks(folder: Path) -> str:
 
 def no_locks_sentence(place: Path, number: int | None = None) -> str:
     """A sentence with the cause and the remedy."""
-    told = "" if number is None else f" (errno {number})"
+    number_text = "" if number is None else f" (errno {number})"
     return (
-        f"the file system of {place} has no file locks{told}, which is common with NFS, so HDF5 cannot create a "
+        f"the file system of {place} has no file locks{number_text}, which is common with NFS, so HDF5 cannot create a "
         "file there. Choose a storage.folder on a local disk, mount the file system with locks, or set "
         f"{WITHOUT} in the environment"
     )

@@ -40,8 +40,8 @@ _LOADERS = (
 
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
     """Why a library cannot be loaded, and what to do; both are empty if the library does not exist."""
-    for said, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
-        if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
+    for pattern, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
+        if match := re.search(pattern, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
     return "", ""
 

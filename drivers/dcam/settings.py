@@ -46,10 +46,10 @@ def description(
     }
     dcam, camera = session.dcam, session.camera
     row_period = properties.get(Property.TIMING_READOUTTIME) / properties.get(Property.IMAGE_HEIGHT)
-    texts = {which: _if_told(partial(dcam.dev_getstring, camera, which), "") for which in Text}
+    texts = {which: _answer_or(partial(dcam.dev_getstring, camera, which), "") for which in Text}
     return {
         **{which.name.lower(): text for which, text in texts.items() if text},
-        "capabilities": _if_told(lambda: str(dcam.dev_getcapability(camera).name or "none").lower(), "not reported"),
+        "capabilities": _answer_or(lambda: str(dcam.dev_getcapability(camera).name or "none").lower(), "not reported"),
         "exposure": properties.get(Property.EXPOSURETIME),
         "trigger": str(settings.trigger),
         "trigger_active": str(options.trigger_active),
@@ -69,7 +69,7 @@ def description(
     }
 
 
-def _if_told(ask: Callable[[], str], otherwise: str) -> str:
+def _answer_or(ask: Callable[[], str], otherwise: str) -> str:
     """The camera's answer, or `otherwise` if it does not answer."""
     try:
         return ask()

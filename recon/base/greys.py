@@ -90,7 +90,7 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
     return windows | {"all": apart(low, high)}
 
 
-def matter_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
+def material_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
     """The window "matter" of all these values together, see `grey_windows`."""
     return grey_windows(np.concatenate([np.ravel(array) for array in arrays]))["matter"]
 
@@ -133,7 +133,7 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     step = -(-max(data.shape) // _SIDE)
     slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
     parts = [np.asarray(part, np.float64) for part in slices]
-    low, high = matter_window(np.concatenate([part[np.isfinite(part)] for part in parts]))
+    low, high = material_window(np.concatenate([part[np.isfinite(part)] for part in parts]))
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
     left = 0
     for part in parts:

@@ -97,8 +97,8 @@ def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not _told:
-            _told.append(cache.cache_path)
+        if not _reported:
+            _reported.append(cache.cache_path)
             warnings.warn(
                 f"set NUMBA_CACHE_DIR to a writable folder: compiled kernels cannot be stored ({cache.cache_path}: "
                 f"{error.strerror or error}), so they are compiled again in each process",
@@ -106,7 +106,7 @@ def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
             )
 
 
-_told = list[str]()
+_reported = list[str]()
 os.environ.pop("NUMBA_CACHE_LOCATOR_CLASSES", None)  # programs started from here may import numba without this module
 caching.IndexDataCacheFile = KernelCacheFile
 caching.Cache._guard_against_spurious_io_errors = _in_memory_where_refused

@@ -20,7 +20,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.devices.in_beam import CameraView, Exposed
 from simulators.devices.trigger_line import TriggerLine
-from simulators.effects.chain import Label
+from simulators.effects.chain import AnomalyLabel
 from simulators.frame.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError, Detector
 from simulators.scenes.expose import expose
@@ -96,7 +96,7 @@ class SimulatedOrcaQuest:
         # time of the last trigger that was examined, and of the last accepted trigger
         self._seen, self._accepted = 0.0, -np.inf
         self._gone = ""
-        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame; only frames with labels
+        self._labels: dict[float, tuple[AnomalyLabel, ...]] = {}  # by the time of the frame; only frames with labels
         self._lock = threading.Lock()
 
     @property
@@ -120,7 +120,7 @@ class SimulatedOrcaQuest:
         with self._lock:
             self._scene = replace(self._scene, sample=scene.sample, beam=scene.beam)
 
-    def labels_at(self, time: float) -> tuple[Label, ...]:
+    def labels_at(self, time: float) -> tuple[AnomalyLabel, ...]:
         """The anomalies in the frame exposed at `time` (s since the Unix epoch); the frame must have been read."""
         return self._labels.get(time, ())
 

@@ -59,7 +59,7 @@ class ImageEffect(Effect, Protocol):
 
 @runtime_checkable
 class Anomaly(Effect, Protocol):
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         """Regions in which the anomaly changes this frame, regardless of other effects; empty if it does not change."""
 
 
@@ -131,9 +131,9 @@ class Chain:
                 image = effect.apply(image, shot)
         return image
 
-    def labels(self, shot: Shot) -> tuple[Label, ...]:
+    def labels(self, shot: Shot) -> tuple[AnomalyLabel, ...]:
         """The anomalies of a frame. The region of an anomaly that turns with the sample covers the whole exposure."""
-        labels: dict[tuple[str, int], Label] = {}
+        labels: dict[tuple[str, int], AnomalyLabel] = {}
         for effect in self.effects:
             if isinstance(effect, Anomaly):
                 depth = effect.domain == Domain.OPTICAL_DEPTH and self.moves and shot.beam and shot.sample
@@ -154,12 +154,12 @@ def _in_order(views: tuple[int, int]) -> tuple[int, int]:
     return views
 
 
-Views = Annotated[tuple[int, int], AfterValidator(_in_order)]
+ViewRange = Annotated[tuple[int, int], AfterValidator(_in_order)]
 """First view and the one after the last. A flat belongs to the projection that is exposed next."""
 
 
 @dataclass(frozen=True)
-class Label:
+class AnomalyLabel:
     """An anomaly that a monitor should find in a frame.
 
     Attributes:
@@ -172,19 +172,19 @@ class Label:
     region: tuple[int, int, int, int]
     which: int = 0
 
-    def joined(self, other: Label) -> Label:
+    def joined(self, other: AnomalyLabel) -> AnomalyLabel:
         """This label with a region that includes the other's."""
         (top, below, left, right), region = self.region, other.region
         joined = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
-        return Label(self.kind, joined, self.which)
+        return AnomalyLabel(self.kind, joined, self.which)
 
 
-def within(views: Views | None, shot: Shot) -> bool:
+def within(views: ViewRange | None, shot: Shot) -> bool:
     """True if the shot lies in the range; True without a range."""
     return views is None or views[0] <= shot.view < views[1]
 
 
-def lit_share(inside: NDArray[np.float64], penumbra: float) -> NDArray[np.float64]:
+def exposed_share(inside: NDArray[np.float64], penumbra: float) -> NDArray[np.float64]:
     """Share of the light at `inside` mm within the edge of a slit (negative: behind it), with a penumbra in mm.
 
     The edge covers more and more of an evenly bright source: a ramp, half of the light at the edge itself.

@@ -20,7 +20,7 @@ from beamline.monitor.digest import FrameDigest, digest
 from drivers.base.frame import Frame, FrameKind
 from simulators.effects.beam.open_beam import Ghost, LostBeam
 from simulators.effects.catalogue import Domain
-from simulators.effects.chain import AnyEffect, Chain, Label
+from simulators.effects.chain import AnomalyLabel, AnyEffect, Chain
 from simulators.effects.detector.pixels import Zingers
 from simulators.effects.scattering.deflected import Floaters
 from simulators.effects.stage.errors import Jump
@@ -164,7 +164,7 @@ class Several:
             image = part.apply(image, shot)
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         return [replace(label, which=i) for i, part in enumerate(self.parts) for label in part.labels(shot)]
 
 
@@ -184,9 +184,9 @@ class Steps:
             image *= 1 + self.share
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
-        return [Label("gain", (0, rows, 0, cols))] if shot.sample and shot.view == self.view else []
+        return [AnomalyLabel("gain", (0, rows, 0, cols))] if shot.sample and shot.view == self.view else []
 
 
 @dataclass(frozen=True)
@@ -205,10 +205,10 @@ class Blurred:
             image[:] = gaussian_filter(image, self.sigma, mode="nearest")
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
         shown = shot.sample and self.views[0] <= shot.view < self.views[1]
-        return [Label("blur", (0, rows, 0, cols))] if shown else []
+        return [AnomalyLabel("blur", (0, rows, 0, cols))] if shown else []
 
 
 @dataclass(frozen=True)
@@ -229,12 +229,12 @@ class DarkLines:
             image[self.lines if self.axis == 0 else (slice(None), self.lines)] *= self.share
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         if not (shot.sample and self.views[0] <= shot.view < self.views[1]):
             return []
         rows, cols = shot.detector.shape
         ends = self.lines.start, self.lines.stop
-        return [Label("band", (*ends, 0, cols) if self.axis == 0 else (0, rows, *ends))]
+        return [AnomalyLabel("band", (*ends, 0, cols) if self.axis == 0 else (0, rows, *ends))]
 
 
 @dataclass(frozen=True)
@@ -251,10 +251,10 @@ class Storm:
     def apply(self, image: Image, shot: Shot) -> Image:
         return self.zingers.apply(image, shot) if self.labels(shot) else image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
         shown = shot.sample and self.views[0] <= shot.view < self.views[1]
-        return [Label("zingers", (0, rows, 0, cols))] if shown else []
+        return [AnomalyLabel("zingers", (0, rows, 0, cols))] if shown else []
 
 
 Make = Callable[[np.random.Generator, int], Any]
@@ -361,7 +361,7 @@ class Seen:
 
     frame: Frame
     digest: FrameDigest
-    labels: Sequence[Label]
+    labels: Sequence[AnomalyLabel]
 
 
 def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Label
+from simulators.effects.chain import AnomalyLabel
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose
 from tests.simulators import shots
@@ -22,7 +22,7 @@ def change(effect: dict[str, Any], shot: Shot) -> NDArray[np.float64]:
     return changed / np.maximum(plain, 1) - 1
 
 
-def labels(effect: dict[str, Any], shot: Shot) -> tuple[Label, ...]:
+def labels(effect: dict[str, Any], shot: Shot) -> tuple[AnomalyLabel, ...]:
     return shots.scene(effect).chain.labels(shot)
 
 

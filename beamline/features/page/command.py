@@ -170,7 +170,7 @@ def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> 
             at_end_of(
                 sys.stdin.fileno(),
                 lambda: _end(server),
-                lambda told: own.extend(map(Path, told.decode().splitlines())),
+                lambda text: own.extend(map(Path, text.decode().splitlines())),
             )
         serve_shown(server, browse)
 

@@ -28,7 +28,7 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from recon.base.arrays import F32
 from simulators.effects.catalogue import CATALOGUE, Domain
-from simulators.effects.chain import Anomaly, Label
+from simulators.effects.chain import Anomaly, AnomalyLabel
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.expose import PlannedFrame, Scan, expose
 from simulators.scenes.scene import Scene
@@ -103,7 +103,7 @@ def write_scan(
     return SimulatedScan(out, labels, n, runs, time.monotonic() - start, n < len(scan))
 
 
-def _write(scan: Scan, planned: PlannedFrame, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
+def _write(scan: Scan, planned: PlannedFrame, row: int, writer: NXtomoWriter) -> tuple[AnomalyLabel, ...]:
     shot = planned.shot
     counts = expose(scan.scene, shot)
     angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan

@@ -211,10 +211,10 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
                     f"--{min(twice)} is given twice: once as an option and once with values to sweep. Leave out the "
                     "option."
                 )
-    told = [
+    settings = [
         (repr((each.source, each.selection, each.method)), each.quality, each.seed, each.device) for _, each in trials
     ]
-    if all(each == told[0] for each in told[1:]):
+    if all(each == settings[0] for each in settings[1:]):
         names = " and ".join(option.name for option in options)
         raise click.UsageError(f"{names} changes nothing in a slice made with {trials[0][1].method.name}.")
     return trials

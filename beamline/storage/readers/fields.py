@@ -70,8 +70,8 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
             varying, share = _varying(field, item, source)
             why = _unit_problem(field, value, item, source) or varying
         if why:
-            said = _text(value, datasets.attribute(item, "units"))
-            unused.append(NotUsed(field.where, said, why, doubt, share > _WRONG))
+            text = _text(value, datasets.attribute(item, "units"))
+            unused.append(NotUsed(field.where, text, why, doubt, share > _WRONG))
     return tuple(unused)
 
 

@@ -267,9 +267,9 @@ def _format(definition: str, program: str) -> str:
     return "nxtomo" if definition == layout.NXTOMO else "nexus"
 
 
-def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
-    if said == "line_integrals":
+def _quantity(stated: str, dtype: np.dtype[Any]) -> Quantity:
+    if stated == "line_integrals":
         return "line_integrals"
     return (
-        "counts" if said == "counts" or (not said and dtype.kind in "iu") else "unknown"
+        "counts" if stated == "counts" or (not stated and dtype.kind in "iu") else "unknown"
     )  # NXtomo: data are integers, as detected

@@ -187,8 +187,8 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
     """A sentence on the exposures that the file states of some flats and projections."""
     exposed = [scan.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
-        said = [f"{np.median(each):g} s" for each in exposed]
-        return f"Stated exposures: flats {said[0]}, projections {said[1]}."
+        words = [f"{np.median(each):g} s" for each in exposed]
+        return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return "The exposures are not both stated; a different exposure of the flats would cause such a difference."
 
 

@@ -36,7 +36,7 @@ from beamline.storage.rules.pixels import (
     pixels_measured,
     quantity_stated,
 )
-from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
+from beamline.storage.rules.stored_order import axis_vertical, sinogram_assumed, views_first
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from projection to projection
@@ -75,8 +75,8 @@ def altered_sentence(source: ScanSource) -> str:
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
     if "beside" in scan.source.attributes:
-        said = f"The darks and flats next to the projections are used: {scan.source.attributes['beside']}."
-        yield Finding("info", "references", said)
+        sentence = f"The darks and flats next to the projections are used: {scan.source.attributes['beside']}."
+        yield Finding("info", "references", sentence)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if scan.in_counts and not scan.table.of_kind(kind).size:
             yield Finding(
@@ -205,7 +205,7 @@ RULES: tuple[Rule, ...] = (
     views_scaled,
     axis_vertical,
     views_first,
-    sinogram_told,
+    sinogram_assumed,
     Row("warning", "missing-frames", lambda scan: (n := scan.source.attributes.get("missing_triggers")) and (
         f"{n} triggers gave no frame; the file lists them."
     )),

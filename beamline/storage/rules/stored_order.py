@@ -118,7 +118,7 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
 SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
 
 
-def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
+def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
     """States which dimension of an array [view, col] is used as that of the projections, and how to state another
     order."""
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")

@@ -45,7 +45,7 @@ class Rows:
         self._preview: h5py.Dataset = file[layout.PREVIEW]
         self._columns: dict[str, h5py.Dataset] = {path: file[path] for path in layout.growing(file)}
         self._types = {path: column.dtype for path, column in self._columns.items()}
-        self._first, self._said = 0, list[dict[str, Any]]()
+        self._first, self._pending = 0, list[dict[str, Any]]()
 
     def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
         """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
@@ -53,7 +53,7 @@ class Rows:
         A projection that it replaces becomes an invalid frame, so that no program takes both.
         """
         row = frame.index
-        if row != self._first + len(self._said):
+        if row != self._first + len(self._pending):
             self.flush()
             self._first = row
         values = {
@@ -74,7 +74,7 @@ class Rows:
         for dataset, pixels in ((self._data, frame.counts), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
-        self._said.append({path: values[path] for path in self._columns})
+        self._pending.append({path: values[path] for path in self._columns})
         if frame.replaces >= 0:
             self.flush()
             for path, code in codes_of(FrameKind.INVALID).items():
@@ -82,21 +82,21 @@ class Rows:
 
     def flush(self) -> None:
         """Write the metadata of the rows since the last call. The caller then flushes the file."""
-        if not self._said:
+        if not self._pending:
             return
-        n, record = len(self._said), dict[str, NDArray[Any]]()
+        n, record = len(self._pending), dict[str, NDArray[Any]]()
         for path, column in self._columns.items():  # the checksum of the others is the last
             if path == layout.RECORD_CHECKSUM:
                 values = record_checksums(record)
             else:
-                values = np.array([said[path] for said in self._said], self._types[path])
+                values = np.array([row[path] for row in self._pending], self._types[path])
             if path in layout.RECORDED:
                 record[path] = values
             self._grow(column, self._first + n)
             place = column.id.get_space()  # a quarter of the time of h5py's own way, for twenty columns
             place.select_hyperslab((self._first, *(0,) * (values.ndim - 1)), values.shape)
             column.id.write(h5py.h5s.create_simple(values.shape), place, values)
-        self._first, self._said = self._first + n, []
+        self._first, self._pending = self._first + n, []
 
     def add_flags(self, rows: range, bits: int) -> None:
         """Flag existing rows: a check that has seen later frames found a fault in them."""

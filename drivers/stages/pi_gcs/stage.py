@@ -37,7 +37,7 @@ class PiGcsStage(LineStage):
         self._settings = settings
         self._per_radian = Fraction(settings.counts_per_turn) / Fraction(2 * math.pi)
         self._train: TriggerTrain | None = None
-        self._told = 0  # the code of the error register that an error has already reported
+        self._reported = 0  # the code of the error register that an error has already reported
         self._line = GcsLine(url, settings.axis, settings, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
         self._found = self._axis.found
@@ -61,13 +61,13 @@ class PiGcsStage(LineStage):
             raise self._travel.no_such_speed(speed, f"{SLOWEST:g} deg/s or more")
         with self._stops.none_while("the move"):
             self._axis.standing("a move")
-            self._refuse_untold()
+            self._refuse_unreported()
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
                 self.disarm()
             # Clear the earlier move, because it is not the reason if this one fails.
             self._target, self._searching = None, False
             self._axis.start(target, Fraction(speed) * self._per_radian)
-            self._told = 0
+            self._reported = 0
             self._target = target
 
     def start_home(self) -> None:
@@ -146,12 +146,12 @@ class PiGcsStage(LineStage):
         with closing(self._line):
             self._axis.restore()
 
-    def _refuse_untold(self) -> None:
+    def _refuse_unreported(self) -> None:
         """Raise DeviceError, once, if something disturbed the axis since its last move."""
         code = self._line.fault
-        if code not in MOTION or code == self._told:
+        if code not in MOTION or code == self._reported:
             return
-        self._told = code
+        self._reported = code
         raise DeviceError(
             self.name,
             f"the axis was disturbed since its last move: {meaning(code)}",
@@ -190,7 +190,7 @@ class PiGcsStage(LineStage):
 
     def _stopped_short(self, problem: str, status: PiAxisStatus, expected: str) -> DeviceError:
         code, why = self._line.fault, self._fault(status) or "no reason given"
-        self._told = code
+        self._reported = code
         return DeviceError(
             self.name,
             f"{problem} ({why})",

@@ -45,7 +45,7 @@ class ZaberStage(LineStage):
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
         super().__init__(url, settings, clock, name)
         self._settings, (self._fastest, steepest) = settings, settings.native_limits
-        self._told = frozenset[str]()  # flags that an error or the description has already reported
+        self._reported = frozenset[str]()  # flags that an error or the description has already reported
         self._train: TriggerTrain | None = None
         self._touched = True  # the armed triggers; None after they were disabled
         self._axis = ZaberAxis(url, settings, clock, name)
@@ -53,7 +53,7 @@ class ZaberStage(LineStage):
         with self._closed_on_failure():
             self._identity = self._axis.open()
             refuse_another(name, settings.serial, self._identity["serial"])
-            self._told = frozenset(self._axis.flags_at_opening)
+            self._reported = frozenset(self._axis.flags_at_opening)
             self._check_turn_and_travel()
             self._axis.ask_axis(f"set accel {steepest}")
             version = [int(part) for part in self._identity["firmware"].split(".")]
@@ -86,7 +86,7 @@ class ZaberStage(LineStage):
                     advice="Search the reference (home) first",
                     state="Nothing has moved",
                 )
-            self._refuse_untold(status)
+            self._refuse_unreported(status)
             self._before_move(status.counts, target)
             self._forget_flags(status)
             self._axis.ask_axis(f"set maxspeed {native}")
@@ -116,7 +116,7 @@ class ZaberStage(LineStage):
         else:
             arrived = self._target is None or status.counts == self._target
         if not arrived or (aim and status.grave):
-            self._told = frozenset(status.flags)
+            self._reported = frozenset(status.flags)
             raise DeviceError(
                 self.name,
                 f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
@@ -184,11 +184,11 @@ class ZaberStage(LineStage):
             self.disarm()
         self._axis.close()
 
-    def _refuse_untold(self, status: ZaberAxisStatus) -> None:
+    def _refuse_unreported(self, status: ZaberAxisStatus) -> None:
         """Raise DeviceError, once, if something disturbed the stage since its last move."""
-        if not (status.grave & (SLIPPED | LOST)) - self._told:
+        if not (status.grave & (SLIPPED | LOST)) - self._reported:
             return
-        self._told = frozenset(status.flags)
+        self._reported = frozenset(status.flags)
         fault = meaning_of(status.flags)
         assert fault is not None, status.flags
         raise DeviceError(
@@ -203,7 +203,7 @@ class ZaberStage(LineStage):
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
         if status.flags:
             self._axis.ask_axis("warnings clear")
-        self._told = frozenset()
+        self._reported = frozenset()
 
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop("estop" if hard else "stop")

@@ -164,13 +164,13 @@ def _raise_worst(
         ended: why the last scan ended; "": no scan was running.
     """
     n = n_whole + len(lacking)
-    told = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")
-    told = f"Recorded: {told}; in {len(lacking)} of them frames are missing."
+    recorded = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")
+    recorded = f"Recorded: {recorded}; in {len(lacking)} of them frames are missing."
     if lacking:
-        raise LedgerError(" ".join(filter(None, (str(ended), told, "The last of these:", str(lacking[-1])))), [])
+        raise LedgerError(" ".join(filter(None, (str(ended), recorded, "The last of these:", str(lacking[-1])))), [])
     if isinstance(ended, BeamlineError):
-        raise type(ended)(f"{ended} {told}") from ended
-    say(told)
+        raise type(ended)(f"{ended} {recorded}") from ended
+    say(recorded)
 
 
 def _lines(result: RunResult) -> str:

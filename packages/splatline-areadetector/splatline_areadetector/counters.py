@@ -97,7 +97,7 @@ class Counters:
         return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
 
 
-def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Counters) -> list[str]:
+def loss_sentences(gaps: Sequence[Gap], overflowed: Collection[int], counters: Counters) -> list[str]:
     """A sentence for each cause of lost frames.
 
     Args:
@@ -153,10 +153,10 @@ class Silence:
         silent = f"o frame for {self._seconds:g} s"
         if not self._stream.answers():
             raise InstrumentError(f"{self._stream.name}: n{silent}, and its server does not answer. {self._outcome()}")
-        self._say(f"N{silent}, although the server answers: {silence_told(self._counters)}.")
+        self._say(f"N{silent}, although the server answers: {silence_sentence(self._counters)}.")
 
 
-def silence_told(counters: Counters) -> str:
+def silence_sentence(counters: Counters) -> str:
     """The likely reason why no frames come, as far as the IOC shows it; the end of a sentence."""
     plugin, camera = counters.plugin, counters.camera
     if plugin.text("EnableCallbacks_RBV") == "Disable":

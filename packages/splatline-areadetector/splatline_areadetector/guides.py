@@ -27,7 +27,7 @@ from splatline_areadetector.config import (
     TomoscanAngles,
 )
 from splatline_areadetector.plan import PlannedBlock, RidePlan
-from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Phase
+from splatline_areadetector.sorter import BY_ORDER, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.variables import History, Variables
 
 LOCATIONS = {"data_dark": FrameKind.DARK, "data_white": FrameKind.FLAT, "data": FrameKind.PROJECTION}
@@ -55,7 +55,7 @@ class Guide(Protocol):
     def plan(self) -> RidePlan:
         """The present plan. ConfigError: there is no possible plan."""
 
-    def phase(self, frame: ArrayFrame) -> Phase:
+    def phase(self, frame: ArrayFrame) -> BlockKey:
         """What the scan did while the frame was taken."""
 
     unknown_angle: str
@@ -78,18 +78,18 @@ class _Kinds:
     """The kinds of frames from an attribute; without an attribute, from the planned order."""
 
     def __init__(self, name: str | None) -> None:
-        self._name, self._is_told = name, False
+        self._name, self._is_reported = name, False
 
-    def __call__(self, frame: ArrayFrame) -> Phase:
+    def __call__(self, frame: ArrayFrame) -> BlockKey:
         if self._name is None:
             return BY_ORDER
-        if self._name not in frame.attributes and not self._is_told:
+        if self._name not in frame.attributes and not self._is_reported:
             raise ConfigError(_lacking("kinds", self._name, frame))
         word = frame.attributes.get(self._name)
         if word is None or not str(word).strip():  # while its variable is not connected
-            return NOT_TOLD
-        self._is_told = True
-        return Phase(0, kind_of(word))
+            return UNKNOWN_KIND
+        self._is_reported = True
+        return BlockKey(0, kind_of(word))
 
 
 def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
@@ -99,9 +99,9 @@ def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
     )
 
 
-def seconds_of(told: Any) -> float | None:
+def seconds_of(value: Any) -> float | None:
     """The time in s that an attribute or a variable holds; None if it holds no time."""
-    return float(told) if isinstance(told, int | float) and 0 < told <= MOST else None
+    return float(value) if isinstance(value, int | float) and 0 < value <= MOST else None
 
 
 def kind_of(word: Any) -> FrameKind | None:
@@ -112,7 +112,7 @@ def kind_of(word: Any) -> FrameKind | None:
 class _ByNumbers:
     """A scan whose plan is in the configuration."""
 
-    status, told_by, unknown_angle = "", "plan", "the angle is not known"
+    status, angle_source, unknown_angle = "", "plan", "the angle is not known"
 
     def __init__(self, ride: RideSection, angles: NDArray[np.float64]) -> None:
         self._ride, self._angles = ride, angles
@@ -129,9 +129,9 @@ class _ByNumbers:
             FrameKind.FLAT: self._ride.flats.exposure_s,
         }
         known = {kind: each for kind, each in seconds.items() if each is not None}
-        return RidePlan(self._blocks, self._angles, known, self._ride.period_s, self.told_by)
+        return RidePlan(self._blocks, self._angles, known, self._ride.period_s, self.angle_source)
 
-    def phase(self, frame: ArrayFrame) -> Phase:
+    def phase(self, frame: ArrayFrame) -> BlockKey:
         return self._kinds(frame)
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
@@ -155,14 +155,14 @@ class PlanGuide(_ByNumbers):
 class AttributeGuide(_ByNumbers):
     """A step scan whose frames have an attribute with the angle."""
 
-    told_by = "attribute"
+    angle_source = "attribute"
 
     def __init__(self, ride: RideSection, angles: AttributeAngles) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._name, self._seen = angles.name, False
         self.unknown_angle = f"the attribute {angles.name} with the angle is missing, or is not an angle in degrees"
 
-    def phase(self, frame: ArrayFrame) -> Phase:
+    def phase(self, frame: ArrayFrame) -> BlockKey:
         self._seen = self._seen or self._name in frame.attributes
         return super().phase(frame)
 
@@ -191,7 +191,7 @@ class PandaGuide(_ByNumbers):
         ConfigError: the file exists, but its rows are not angles in degrees, at most one for each projection.
     """
 
-    told_by = "panda"
+    angle_source = "panda"
 
     def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 2.0) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
@@ -367,15 +367,15 @@ class TomoscanGuide:
             "tomoscan",
         )
 
-    def phase(self, frame: ArrayFrame) -> Phase:
+    def phase(self, frame: ArrayFrame) -> BlockKey:
         if not frame.is_current:
             delay = frame.received - frame.time
             self._delay, self._longest = min(self._delay, delay), max(self._longest, delay)
         serial, kind = self._collecting(frame.time)
         if kind is None or self._kinds is None:
-            return Phase(serial, kind)
+            return BlockKey(serial, kind)
         told = self._kinds(frame)
-        return Phase(serial, kind if told == NOT_TOLD else told.kind)
+        return BlockKey(serial, kind if told == UNKNOWN_KIND else told.kind)
 
     def _collecting(self, seconds: float) -> tuple[int, FrameKind | None]:
         """The number of the status message that was valid at this time of the camera's IOC, and the kind it names."""

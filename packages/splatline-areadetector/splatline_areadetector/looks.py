@@ -8,7 +8,7 @@ from beamline.core.text import size, spans
 from drivers.base.clock import SystemClock
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
-from splatline_areadetector.counters import Counters, silence_told
+from splatline_areadetector.counters import Counters, silence_sentence
 from splatline_areadetector.ride import opened
 from splatline_areadetector.stream import FrameStream, Refused
 
@@ -27,7 +27,7 @@ def check(config: RideConfig) -> list[str]:
             "port": counters.plugin.text("NDArrayPort_RBV")
             or "not known, because the variables of the plugin do not answer",
             "queue": f"{stream.queue} frames in the server",
-            "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_told(counters)}",
+            "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_sentence(counters)}",
             "refused": refused,
             "dropped": _dropped(counters),
             "attributes": ", ".join(frames[-1].attributes) if frames else "",

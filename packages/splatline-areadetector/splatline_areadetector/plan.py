@@ -52,7 +52,7 @@ class RidePlan:
     angles: NDArray[np.float64]
     exposures: Mapping[FrameKind, float]
     period: float | None
-    told_by: str
+    angle_source: str
 
     def exposure(self, kind: FrameKind) -> float:
         """s; NaN: not known."""
@@ -96,7 +96,7 @@ def _plan_of(plan: RidePlan) -> ScanPlan:
 
     return ScanPlan(
         plan.angles, Mode.STEP, plan.exposure(FrameKind.PROJECTION), plan.period or 0.0, 0.0,
-        field(FrameKind.DARK), field(FrameKind.FLAT), plan.told_by,
+        field(FrameKind.DARK), field(FrameKind.FLAT), plan.angle_source,
     )  # fmt: skip
 
 
@@ -109,7 +109,7 @@ def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) 
     timeline = timeline_of(plan, shape, config.storage.preview_bin, _free(runs))
     optics, known = config.optics, not np.isnan(plan.angles).any()
     asked = {
-        "scheme": plan.told_by,
+        "scheme": plan.angle_source,
         "exposure_s": plan.exposure(FrameKind.PROJECTION),
         **({"angles_deg": np.degrees(plan.angles).tolist()} if known else {}),
     }

@@ -74,7 +74,7 @@ class PublishedFrame:
         }
 
 
-class Pace:
+class SendRate:
     """Spreads frames that came into the file together, because the queue of a client usually holds only four."""
 
     def __init__(self) -> None:
@@ -119,7 +119,7 @@ class RunFrames:
         self._file: Any = None
         self._columns: list[Any] = []  # stay open: HDF5 refreshes a dataset wrongly if it is open twice
         self._counter: Any = None
-        self._pace, self._looked = Pace(), -math.inf
+        self._pace, self._looked = SendRate(), -math.inf
         self._next = self._committed = 0
         self._look()
         if self._file is not None:

@@ -25,10 +25,10 @@ from beamline.scan.measurement import Measurement
 from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
-from splatline_areadetector.counters import Counters, Gap, Silence, losses_told
+from splatline_areadetector.counters import Counters, Gap, Silence, loss_sentences
 from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
 from splatline_areadetector.plan import RidePlan
-from splatline_areadetector.sorter import Basis, Decision, NewEpoch, Outside, Place, Seen, Sorter, Unknown
+from splatline_areadetector.sorter import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Sorter, Unknown
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: longest wait for a frame before the stop request is checked again
@@ -90,12 +90,12 @@ class RiddenFrames:
         self._unplaced: dict[str, list[int]] = {}
         self._unused: dict[str, list[int]] = {}  # numbers of frames that arrived and cannot be used, by reason
         self._block, self._block_kind, self._in_block = -1, "", 0
-        self._gone = self._told_of_outside = False
-        self._told_pause = self._epoch = ""
+        self._gone = self._reported_outside = False
+        self._reported_pause = self._epoch = ""
         self._row = self._views = 0
         self._silence = Silence(
             ride.stream, ride.counters, ride.config.ride.silence_s, self._warn,
-            lambda: f"Frames that came before are in the file.{self._told(ended=False)}",
+            lambda: f"Frames that came before are in the file.{self._loss_sentences(ended=False)}",
         )  # fmt: skip
 
     @property
@@ -199,8 +199,8 @@ class RiddenFrames:
                 self._add_gap(place.lost, before, frame)
             if not place.repeated:
                 self._end_block()
-            if not (place.repeated or self._told_of_outside):
-                self._told_of_outside = True
+            if not (place.repeated or self._reported_outside):
+                self._reported_outside = True
                 self._sink(StateEntered(self._measurement.states.state, outside_sentence(self._guide)))
             return None
         if place.note:
@@ -245,7 +245,7 @@ class RiddenFrames:
         )  # fmt: skip
 
     def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
-        still = self._stream.stood_still(before.time, after.time)
+        still = self._stream.stalled_seconds(before.time, after.time)
         self._gaps.append(Gap(ids, before.time, after.time, still))
 
     def _other_size(self, frame: ArrayFrame) -> str:
@@ -258,7 +258,7 @@ class RiddenFrames:
             + ("" if (before.shape, dtype) != (after.shape, other) else ", and show another part of the sensor")
         )
 
-    def _frame(self, frame: ArrayFrame, counts: NDArray[np.uint16], place: Place) -> Frame:
+    def _frame(self, frame: ArrayFrame, counts: NDArray[np.uint16], place: FramePosition) -> Frame:
         kind, angle = place.kind, math.nan
         if kind is FrameKind.PROJECTION:
             angle = self._guide.angle(frame, place.trigger)
@@ -272,7 +272,7 @@ class RiddenFrames:
         self._in_block += 1
         return Frame(counts, kind, self._row, place.trigger, frame.unique_id, angle, frame.time, seconds)
 
-    def _begin_block(self, place: Place) -> None:
+    def _begin_block(self, place: FramePosition) -> None:
         self._end_block()
         self._block, kind = place.block, place.kind
         n = self._plan.blocks[place.block].n if place.block < len(self._plan.blocks) else 0
@@ -294,12 +294,12 @@ class RiddenFrames:
 
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
-        if reason and reason != self._told_pause:
+        if reason and reason != self._reported_pause:
             self._warn(f"The scan should pause ({reason}), but another program runs it, and it continues.")
-        self._told_pause = reason
+        self._reported_pause = reason
         self._measurement.pause.resume()
 
-    def _told(self, *, ended: bool) -> str:
+    def _loss_sentences(self, *, ended: bool) -> str:
         """Sentences on the missing frames and on who lost them, each after a space.
 
         Args:
@@ -320,7 +320,7 @@ class RiddenFrames:
             words.append(f"{count(len(ids), 'frame')} arrived ({spans(ids)}) but could not be used: {why}.")
         if self._unused and self._guide.status:
             words.append(f"Now: {self._guide.status}.")
-        words += losses_told(self._gaps, self._overflowed, self._ride.counters)
+        words += loss_sentences(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(
                 f"{count(self._sorter.repeats, 'frame')} arrived twice and "
@@ -343,7 +343,7 @@ class RiddenFrames:
         off = f"all angles are those of projections {n} later"
         if n < angles.size and not np.isnan(angles).any():
             off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
-        has_angles = self._plan.told_by == "attribute"
+        has_angles = self._plan.angle_source == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
             off = "" if has_angles else f", and {off}"
             off = f"the first and last frames of each kind have the wrong kind{off}. Set ride.kinds"
@@ -361,20 +361,20 @@ class RiddenFrames:
         ended = not (
             self._epoch or (self._stop.stopping and since < SECOND)
         )  # a stop after the last frame changed nothing
-        told, planned = self._told(ended=ended), self._plan.angles.size
+        sentences, planned = self._loss_sentences(ended=ended), self._plan.angles.size
         if self._stop.aborting:
-            raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")
+            raise ScanAborted(f"Aborted: {self._stop.reason}.{sentences}")
         if self._stop.stopping and not self._sorter.complete:
             raise ScanStopped(
                 f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The file can be used as "
-                f"it is.{told}"
+                f"it is.{sentences}"
             )
         if self._epoch:
             raise EpochEndedError(
-                f"{told.strip()} The file was closed there, because {self._epoch}.{self._others}", self.missing
+                f"{sentences.strip()} The file was closed there, because {self._epoch}.{self._others}", self.missing
             )
         if self.missing:
-            raise LedgerError(f"{told.strip()}{self._others}", self.missing)
+            raise LedgerError(f"{sentences.strip()}{self._others}", self.missing)
 
     @property
     def _others(self) -> str:

@@ -32,7 +32,7 @@ from splatline_areadetector.ridden import (
     outside_sentence,
     seen_of,
 )
-from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Seen, n_before_views, not_set
+from splatline_areadetector.sorter import BY_ORDER, UNKNOWN_KIND, Seen, n_before_views, not_set
 from splatline_areadetector.stream import FrameStream, Refused
 
 
@@ -85,7 +85,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) 
     """
     stream, guide = ride.stream, ride.guide
     silence = Silence(stream, ride.counters, ride.config.ride.silence_s, ride.say, lambda: "Nothing was recorded.")
-    told, known = False, stream.first
+    reported, known = False, stream.first
     before = None if known is None else Seen(known.unique_id, BY_ORDER, known.time)
     if began_within_scan and known is not None:
         before = seen_of(known, guide)
@@ -107,9 +107,9 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) 
                 stream.put_back(item)
                 return item, before
             continue
-        before = before if seen.phase == NOT_TOLD else seen
-        if not told:
-            told = True
+        before = before if seen.phase == UNKNOWN_KIND else seen
+        if not reported:
+            reported = True
             ride.say(outside_sentence(guide))
     raise NoScanError(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
 

@@ -38,7 +38,7 @@ _RUNNING = 3  # longest time between two frames of the same acquisition, in peri
 
 
 @dataclass(frozen=True)
-class Phase:
+class BlockKey:
     """What the scan does while a frame is taken.
 
     Attributes:
@@ -50,7 +50,7 @@ class Phase:
     kind: FrameKind | None
 
 
-NO_SCAN, BY_ORDER, NOT_TOLD = (Phase(serial, None) for serial in (0, -1, -2))
+NO_SCAN, BY_ORDER, UNKNOWN_KIND = (BlockKey(serial, None) for serial in (0, -1, -2))
 """A frame outside of a scan; a frame whose kind follows from the order of the blocks; a frame of unknown kind."""
 UNPLANNED = 2**31
 """Largest length of a block that is not planned: darks and flats that come nevertheless."""
@@ -71,7 +71,7 @@ class Seen:
     """
 
     number: int
-    phase: Phase
+    phase: BlockKey
     time: float = math.nan
     size: Any = None
     pixels: Any = None
@@ -114,7 +114,7 @@ class Witness(Protocol):
 
 
 @dataclass(frozen=True)
-class Place:
+class FramePosition:
     """Where a frame belongs in the plan.
 
     Attributes:
@@ -162,7 +162,7 @@ class NewEpoch:
     why: str
 
 
-Decision = Place | Outside | Unknown | NewEpoch
+Decision = FramePosition | Outside | Unknown | NewEpoch
 
 
 @dataclass
@@ -266,7 +266,7 @@ class Sorter:
         """The restarts of a frame whose number is not beyond that of the newest one: it is exchanged with a neighbour,
         or the numbers restarted. Frames of different phases are only exchanged with their direct neighbours."""
         last, step = self._last, self._step or 1
-        is_other = seen.phase != newest.phase and NOT_TOLD not in (seen.phase, newest.phase)
+        is_other = seen.phase != newest.phase and UNKNOWN_KIND not in (seen.phase, newest.phase)
         one_before = [each.number for each in self.held[:-1] if each.count_restarts == newest.count_restarts]
         if seen.reconnected:
             return newest.count_restarts + 1
@@ -319,10 +319,10 @@ class Sorter:
         self._recent.append(seen)
         if isinstance(place, Unknown):
             return place
-        self._known, views = self._known if seen.phase == NOT_TOLD else seen, self._views
-        if views is not None and not (isinstance(place, Place) and self._taken[place.block] is views):
+        self._known, views = self._known if seen.phase == UNKNOWN_KIND else seen, self._views
+        if views is not None and not (isinstance(place, FramePosition) and self._taken[place.block] is views):
             views.first_frame_of_other_kind = views.first_frame_of_other_kind or seen
-        if isinstance(place, Place):
+        if isinstance(place, FramePosition):
             place, self._note = replace(place, note=self._note), ""
         return place
 
@@ -339,7 +339,7 @@ class Sorter:
         """Why the file ends if numbers have restarted; "": the file does not end."""
         if (seen.number, seen.phase) == (last.number, last.phase) and not (seen.reconnected or block.is_over):
             raise DataError(f"{not_set(seen.number)}. Frames that came before are in the file.")
-        is_same = seen.phase in (BY_ORDER, NOT_TOLD) or (
+        is_same = seen.phase in (BY_ORDER, UNKNOWN_KIND) or (
             seen.phase.kind is block.kind and (block.kind is VIEW or seen.phase.serial == self._serial)
         )
         if not seen.reconnected and (block.is_over or not is_same):
@@ -386,7 +386,7 @@ class Sorter:
     def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
         """Where a frame belongs, if the file does not end."""
         kind, views = seen.phase.kind, self._views
-        if seen.phase == NOT_TOLD:
+        if seen.phase == UNKNOWN_KIND:
             if block is None or is_anew or block.closed or seen.number >= block.end:
                 return Unknown("it is not known whether it is a dark, a flat or a projection")
         elif seen.phase == BY_ORDER:
@@ -413,7 +413,7 @@ class Sorter:
                 f"The connection to the server was lost before frame {seen.number}. The frame is assigned as if the "
                 "count had continued."
             )
-        return Place(self._now, block.kind, trigger, skipped, block.basis)
+        return FramePosition(self._now, block.kind, trigger, skipped, block.basis)
 
     def _outside(self, seen: Seen, block: _Taken | None) -> Outside:
         """A frame that is not stored. Its number may show that the present block is over, whatever is missing at its
@@ -485,10 +485,10 @@ class Sorter:
                     f"Before the first {noun} that arrived, the camera had counted {words}." if lost else self._note
                 )
                 return lost, Basis.COUNTER
-        is_said = seen.phase == BY_ORDER and bool(
+        is_known = seen.phase == BY_ORDER and bool(
             self._taken
         )  # the message is given for the file's first block; the other blocks follow from it
-        is_late = (self._began_within_scan and not is_said) or seen.reconnected
+        is_late = (self._began_within_scan and not is_known) or seen.reconnected
         is_late = is_late or gap < n or (is_anew and seen.number > 1)
         if not (is_late or is_anew or is_other) and known is not None and second is not None:
             is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
@@ -546,7 +546,7 @@ class Sorter:
         self._last = None if self._last is None else replace(self._last, number=number)
         return lost
 
-    def lose(self, place: Place) -> None:
+    def lose(self, place: FramePosition) -> None:
         """The frame that was assigned here cannot be used."""
         self._taken[place.block].triggers.discard(place.trigger)
 

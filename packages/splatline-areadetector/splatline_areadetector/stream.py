@@ -176,7 +176,7 @@ class FrameStream:
             return False
         return True
 
-    def stood_still(self, begin: float, end: float) -> float:
+    def stalled_seconds(self, begin: float, end: float) -> float:
         """s during this interval of Unix time, and the second after it, in which no frame could be received."""
         return sum(max(0.0, min(end + 1.0, b) - max(begin, a)) for a, b in [*self.still])
 

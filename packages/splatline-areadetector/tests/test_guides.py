@@ -20,7 +20,7 @@ from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame, array_frame
 from splatline_areadetector.guides import TomoscanGuide, guide_of, kind_of
-from splatline_areadetector.sorter import BY_ORDER, NO_SCAN, NOT_TOLD, Phase
+from splatline_areadetector.sorter import BY_ORDER, NO_SCAN, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.variables import History, Variables, url_problem
 
 CLIENT = """
@@ -132,8 +132,8 @@ def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
         lacking.phase(_frame(9)), lacking.angle(_frame(9), 0)
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
     told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "x", ""))]
-    assert told == [Phase(0, FrameKind.FLAT), Phase(0, FrameKind.PROJECTION), NO_SCAN, NOT_TOLD]
-    assert guide.phase(_frame(9, SampleRotary=1.0)) == NOT_TOLD  # once it was told
+    assert told == [BlockKey(0, FrameKind.FLAT), BlockKey(0, FrameKind.PROJECTION), NO_SCAN, UNKNOWN_KIND]
+    assert guide.phase(_frame(9, SampleRotary=1.0)) == UNKNOWN_KIND  # once it was told
 
 
 def test_a_pandaboxs_file_is_followed(tmp_path: Path) -> None:

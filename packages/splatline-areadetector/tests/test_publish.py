@@ -20,7 +20,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.publish_detector import PublishedDetector, Sides, Value, records
 from splatline_areadetector.publish_file import FrameFile
-from splatline_areadetector.publish_frames import Pace, PublishedFrame, RunFrames
+from splatline_areadetector.publish_frames import PublishedFrame, RunFrames, SendRate
 from splatline_areadetector.publish_servers import ImageServer, RecordServer
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of
@@ -65,7 +65,7 @@ def _come(frames: RunFrames, clock: Clock, within: float = 20.0) -> list[Publish
 
 def test_frames_that_came_together_are_spread_but_keep_up() -> None:
     """A client's queue holds four by default: nine at once, ten a second, are sent no closer than 0.07 s."""
-    pace, now, sent, waiting = Pace(), 0.0, list[float](), 0
+    pace, now, sent, waiting = SendRate(), 0.0, list[float](), 0
     for step in range(3000):
         now = step * 0.01
         if step % 90 == 0:
@@ -80,7 +80,7 @@ def test_frames_that_came_together_are_spread_but_keep_up() -> None:
 
 
 def test_the_first_frame_after_a_pause_is_sent_at_once() -> None:
-    pace = Pace()
+    pace = SendRate()
     pace.came(1, 0.0)
     pace.sent(0.0)
     pace.came(1, 30.0)

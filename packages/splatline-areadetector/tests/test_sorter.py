@@ -17,13 +17,13 @@ from splatline_areadetector.plan import PlannedBlock
 from splatline_areadetector.sorter import (
     BY_ORDER,
     NO_SCAN,
-    NOT_TOLD,
+    UNKNOWN_KIND,
     Basis,
+    BlockKey,
     Decision,
+    FramePosition,
     NewEpoch,
     Outside,
-    Phase,
-    Place,
     Seen,
     Sorter,
     Unknown,
@@ -31,7 +31,7 @@ from splatline_areadetector.sorter import (
 
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
 BLOCKS = (PlannedBlock(DARK, 2), PlannedBlock(VIEW, 5), PlannedBlock(FLAT, 3))
-DARKS, VIEWS, FLATS = (Phase(0, kind) for kind in (DARK, VIEW, FLAT))
+DARKS, VIEWS, FLATS = (BlockKey(0, kind) for kind in (DARK, VIEW, FLAT))
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Counts:
         return self.lost
 
 
-def seen(numbers: Iterable[int], phase: Phase, **facts: Any) -> list[Seen]:
+def seen(numbers: Iterable[int], phase: BlockKey, **facts: Any) -> list[Seen]:
     return [Seen(number, phase, **facts) for number in numbers]
 
 
@@ -70,12 +70,12 @@ def sort(sorter: Sorter, frames: Iterable[Seen]) -> list[tuple[int, Decision]]:
 
 def triggers(decided: Sequence[tuple[int, Decision]], kind: FrameKind = VIEW) -> dict[int, int]:
     """Of the frames of a kind that have a place: trigger by number."""
-    places = [(number, each) for number, each in decided if isinstance(each, Place)]
+    places = [(number, each) for number, each in decided if isinstance(each, FramePosition)]
     return {number: each.trigger for number, each in places if each.kind is kind}
 
 
 def notes(decided: Sequence[tuple[int, Decision]]) -> str:
-    return " ".join(each.note for _, each in decided if isinstance(each, Place) and each.note)
+    return " ".join(each.note for _, each in decided if isinstance(each, FramePosition) and each.note)
 
 
 @given(st.sets(st.integers(0, 39), min_size=1), st.integers(0, 2**30))
@@ -83,7 +83,7 @@ def test_a_frame_has_the_trigger_of_its_number_whatever_is_lost(came: set[int], 
     sorter = Sorter([PlannedBlock(VIEW, 40)], first, Counts(lost=True))
     decided = sort(sorter, seen((first + i for i in sorted(came)), VIEWS))
     assert triggers(decided) == {first + i: i for i in came}
-    skipped = {i for _, place in decided if isinstance(place, Place) for i in place.skipped}
+    skipped = {i for _, place in decided if isinstance(place, FramePosition) for i in place.skipped}
     assert skipped == {*range(max(came))} - came
     assert sorter.missing(0) == sorted({*range(40)} - came) and sorter.complete is (max(came) == 39)
 
@@ -95,14 +95,14 @@ def test_blocks_and_what_belongs_to_none() -> None:
     anew = seen((1, 3), FLATS)  # numbered anew in each block
     decided = sort(sorter, [*free, *views, *anew])
     assert [(number, type(each)) for number, each in decided[:5]] == [
-        (4, Outside), (3, Outside), (4, Place), (5, Place), (6, Outside),
+        (4, Outside), (3, Outside), (4, FramePosition), (5, FramePosition), (6, Outside),
     ]  # fmt: skip
     assert decided[0][1] == Outside(repeated=True) and sorter.repeats == 1
     assert triggers(decided, DARK) == {4: 0, 5: 1} and triggers(decided) == {8: 0, 11: 3, 12: 4}
     assert triggers(decided, FLAT) == {1: 0, 3: 2} and sorter.complete
     assert (sorter.missing(0), sorter.missing(1), sorter.missing(2)) == ([], [1, 2], [1])
-    (again,) = sort(sorter, [Seen(9, Phase(4, DARK))])
-    assert isinstance(again[1], Place) and (again[1].block, again[1].trigger) == (3, 0)  # darks taken again
+    (again,) = sort(sorter, [Seen(9, BlockKey(4, DARK))])
+    assert isinstance(again[1], FramePosition) and (again[1].block, again[1].trigger) == (3, 0)  # darks taken again
 
 
 def test_a_number_that_falls_within_a_block_is_another_epoch() -> None:
@@ -119,7 +119,7 @@ def test_a_server_that_had_gone_and_the_time_tell_whether_its_count_went_on() ->
     for number, seconds, goes_on in ((20, 1.2, True), (20, 5.0, False), (40, 1.2, False)):
         after = Seen(number, VIEWS, time=0.8 + seconds, reconnected=True)
         *_, (_, last) = sort(Sorter(blocks), [*before, after])
-        assert isinstance(last, Place if goes_on else NewEpoch)
+        assert isinstance(last, FramePosition if goes_on else NewEpoch)
         assert not goes_on or "assigned as if the count had continued" in getattr(last, "note", "")
 
 
@@ -158,7 +158,7 @@ def test_frames_that_will_not_come() -> None:
     sort(sorter, [Seen(1, VIEWS)])
     assert sorter.pass_over(3) == range(2, 4) and sorter.pass_over(9) == range(0)
     assert triggers(sort(sorter, [Seen(4, VIEWS)])) == {4: 3}
-    sorter.lose(Place(0, VIEW, 3))
+    sorter.lose(FramePosition(0, VIEW, 3))
     assert sorter.pass_over(5) == range(5, 6) and sorter.complete and sorter.missing(0) == [1, 2, 3, 4]
 
 
@@ -229,14 +229,14 @@ def test_a_frame_that_comes_twice_is_taken_once_also_after_others() -> None:
 
 
 @pytest.mark.parametrize("phase", [BY_ORDER, None])
-def test_numbers_that_begin_anew_with_each_acquisition(phase: Phase | None) -> None:
+def test_numbers_that_begin_anew_with_each_acquisition(phase: BlockKey | None) -> None:
     frames = [
         *seen((1, 2), phase or DARKS), *seen(range(1, 6), phase or VIEWS), *seen(range(1, 4), phase or FLATS)
     ]  # fmt: skip
     sorter = Sorter(BLOCKS)
     decided = sort(sorter, frames)
     assert triggers(decided[2:7]) == {i: i - 1 for i in range(1, 6)} and sorter.complete and not notes(decided)
-    assert [each.kind for _, each in decided if isinstance(each, Place)] == [DARK] * 2 + [VIEW] * 5 + [FLAT] * 3
+    assert [each.kind for _, each in decided if isinstance(each, FramePosition)] == [DARK] * 2 + [VIEW] * 5 + [FLAT] * 3
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def test_numbers_that_begin_anew_with_each_acquisition(phase: Phase | None) -> N
     ],
 )
 @pytest.mark.parametrize("phase", [VIEWS, BY_ORDER])
-def test_a_counter_of_16_or_32_bits_goes_on_at_its_end(numbers: list[int], phase: Phase) -> None:
+def test_a_counter_of_16_or_32_bits_goes_on_at_its_end(numbers: list[int], phase: BlockKey) -> None:
     for lost, swapped in ((None, None), (30, None), (None, 10), (None, numbers.index(min(numbers)) - 1)):
         order = [*range(60)]
         if swapped is not None:
@@ -258,7 +258,7 @@ def test_a_counter_of_16_or_32_bits_goes_on_at_its_end(numbers: list[int], phase
             order.remove(lost)
         sorter = Sorter([PlannedBlock(VIEW, 60)])
         decided = sort(sorter, [Seen(numbers[i], phase, pixels=i, frame=i) for i in order])
-        assert [each.trigger for _, each in decided if isinstance(each, Place)] == sorted(order)
+        assert [each.trigger for _, each in decided if isinstance(each, FramePosition)] == sorted(order)
         assert sorter.complete
 
 
@@ -357,11 +357,11 @@ def test_a_number_that_stays_the_same_is_not_set() -> None:
 
 
 def test_a_kind_that_is_not_told_for_some_frames() -> None:
-    phases = [*[DARKS] * 2, VIEWS, *[NOT_TOLD] * 3, VIEWS, FLATS]
+    phases = [*[DARKS] * 2, VIEWS, *[UNKNOWN_KIND] * 3, VIEWS, FLATS]
     sorter = Sorter(BLOCKS)
     decided = sort(sorter, [Seen(i, phase) for i, phase in enumerate(phases, 1)])
     assert triggers(decided) == {i: i - 3 for i in range(3, 8)} and not notes(decided)
-    phases = [*[DARKS] * 2, NOT_TOLD, *[VIEWS] * 4]  # the first projection, or of no scan, for all that is known
+    phases = [*[DARKS] * 2, UNKNOWN_KIND, *[VIEWS] * 4]  # the first projection, or of no scan, for all that is known
     decided = sort(Sorter(BLOCKS), [Seen(i, phase) for i, phase in enumerate(phases, 1)])
     assert triggers(decided) == {i: i - 4 for i in range(4, 8)} and isinstance(decided[2][1], Unknown)
     assert "Frame 4 counts as the first projection" in notes(decided)
@@ -388,9 +388,9 @@ def test_flats_within_the_projections(restarts: bool) -> None:
     decided = sort(sorter, frames)
     assert not sorter.complete
     decided += sort(sorter, later)
-    came = [each.trigger for _, each in decided if isinstance(each, Place) and each.kind is VIEW]
+    came = [each.trigger for _, each in decided if isinstance(each, FramePosition) and each.kind is VIEW]
     assert came == [*range(12 if restarts else 5)] and "continue with" in notes(decided) and sorter.complete
-    assert [each.kind for _, each in decided if isinstance(each, Place)].count(FLAT) == 6
+    assert [each.kind for _, each in decided if isinstance(each, FramePosition)].count(FLAT) == 6
 
 
 @dataclass(frozen=True)
@@ -418,8 +418,8 @@ class Scan:
             for i in range(n):
                 if len(frames) == self.anew:
                     number, epoch = 1, 1
-                phase = NO_SCAN if kind is None else Phase(0, kind) if self.phased else BY_ORDER
-                phase = NOT_TOLD if kind is not None and self.phased and len(frames) in self.untold else phase
+                phase = NO_SCAN if kind is None else BlockKey(0, kind) if self.phased else BY_ORDER
+                phase = UNKNOWN_KIND if kind is not None and self.phased and len(frames) in self.untold else phase
                 frames.append(Seen(number, phase, time, pixels=len(frames), frame=(kind, i, epoch)))
                 number, time = number + self.step, time + 1.0
             time += 10.0
@@ -475,11 +475,13 @@ def test_no_frame_has_a_wrong_angle_without_a_word(scan: Scan) -> None:
     except DataError as error:
         assert "uniqueId stays at" in str(error) and is_faulty
         return
-    views = [(seen.frame[:2], place) for seen, place in decided if isinstance(place, Place) and place.kind is VIEW]
+    views = [
+        (seen.frame[:2], place) for seen, place in decided if isinstance(place, FramePosition) and place.kind is VIEW
+    ]
     wrong = [(truth, place) for truth, place in views if truth != (VIEW, place.trigger)]
     assert not wrong or _is_said(sorter, decided), (frames, wrong)
     if not is_faulty:
         assert not wrong, wrong
-        said = [place.note for _, place in decided if isinstance(place, Place) and place.note]
+        said = [place.note for _, place in decided if isinstance(place, FramePosition) and place.note]
         assert all("rise by 5" in note for note in said) and bool(said) is (scan.step == 5), said
         assert not any(sorter.missing(i) for i in range(3))

@@ -109,8 +109,10 @@ class _EnergyScan:
     def _at(self, energy: float) -> _EnergyScan:
         """The same scan at that energy."""
         beam = replace(self.beam, energy_kev=energy)
-        matter = [m.attenuation for c in self.sample.constituents for m in (c.material, c.instead_of) if m is not None]
-        sample = self.sample.under(light(beam, matter, 2 * self.sample.radius, _no_filters))
+        attenuations = [
+            m.attenuation for c in self.sample.constituents for m in (c.material, c.instead_of) if m is not None
+        ]
+        sample = self.sample.under(light(beam, attenuations, 2 * self.sample.radius, _no_filters))
         scene = replace(self.scan.scene, sample=sample, beam=beam)
         return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
 

@@ -161,7 +161,7 @@ class _Band:
             method = EarlyTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
             if gains and at + 1 < _ROUNDS:
-                left = ring_offsets(data - projector.forward(volume.data), views) * self._told_apart()
+                left = ring_offsets(data - projector.forward(volume.data), views) * self._distinguished()
                 data -= left
                 gains_so_far += left
         assert volume is not None
@@ -173,7 +173,7 @@ class _Band:
         known = None if self.known is None else np.broadcast_to(self.known, left.shape)[:, rows]
         return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))
 
-    def _told_apart(self) -> F32:
+    def _distinguished(self) -> F32:
         """Weights [col]: 1 in columns in which a gain cannot be confused with a body on the axis."""
         off = np.abs(np.arange(self.data.shape[2]) - self.geometry.axis_col)
         still = np.ptp(self.geometry.shifts[:, 0]) < 2 * NEAR_AXIS

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.setting import setting
-from simulators.effects.chain import VISIBLE, Anomaly, ImageEffect, Label, Views, lit_share, within
+from simulators.effects.chain import VISIBLE, Anomaly, AnomalyLabel, ImageEffect, ViewRange, exposed_share, within
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, Whole
 from simulators.frame.shot import Image, Shot
 
@@ -118,7 +118,7 @@ class LostBeam(ImageEffect, Anomaly):
         share: share of the light that remains.
     """
 
-    views: Views | None = None
+    views: ViewRange | None = None
     seconds: tuple[float, float] | None = None
     share: BelowOne = 0.0
 
@@ -134,9 +134,9 @@ class LostBeam(ImageEffect, Anomaly):
             image *= 1 - lost
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
-        return [Label(self.name, (0, rows, 0, cols))] if shot.beam and self._lost(shot) > 0 else []
+        return [AnomalyLabel(self.name, (0, rows, 0, cols))] if shot.beam and self._lost(shot) > 0 else []
 
     def _lost(self, shot: Shot) -> float:
         """Share of the frame's light that is lost."""
@@ -176,12 +176,14 @@ class Ghost(ImageEffect, Anomaly):
         image[:, first : first + change.size] *= 1 + change
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         first, change = self._change(shot)
         visible = np.flatnonzero(np.abs(change) >= VISIBLE)
         if not shot.beam or not visible.size:
             return []
-        return [Label(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))]
+        return [
+            AnomalyLabel(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))
+        ]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
         """The first column that the ghost covers, and the relative change of the light from there to the right."""
@@ -210,7 +212,7 @@ class BlackBand(ImageEffect, Anomaly):
     width: Positive
     penumbra: NotNegative = 0.0
     share: BelowOne = 0.0
-    views: Views | None = None
+    views: ViewRange | None = None
 
     def apply(self, image: Image, shot: Shot) -> Image:
         if within(self.views, shot):
@@ -218,14 +220,14 @@ class BlackBand(ImageEffect, Anomaly):
             image[:, : light.size] *= light
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         cols = self._light(shot).size if shot.beam and within(self.views, shot) else 0
-        return [Label(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
+        return [AnomalyLabel(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
 
     def _light(self, shot: Shot) -> NDArray[np.float64]:
         """Share of the light in each column of the band."""
         from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
-        light = self.share + (1 - self.share) * lit_share(from_left - self.width, self.penumbra)
+        light = self.share + (1 - self.share) * exposed_share(from_left - self.width, self.penumbra)
         return light[light < 1]
 
 
@@ -257,12 +259,12 @@ class NarrowField(ImageEffect, Anomaly):
         image[last:] *= down[last:, None]
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
         (top, below), (left, right) = (_lit_fully(light, VISIBLE) for light in self._light(shot))
         strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
         return [
-            Label(self.name, strip, which)
+            AnomalyLabel(self.name, strip, which)
             for which, strip in enumerate(strips)
             if shot.beam and strip[0] < strip[1] and strip[2] < strip[3]
         ]
@@ -277,7 +279,7 @@ class NarrowField(ImageEffect, Anomaly):
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
         # The part of the source that is not covered. The two edges cover it from opposite ends.
-        one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
+        one, other = (exposed_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
         return np.maximum(one + other - 1, 0.0)
 
 

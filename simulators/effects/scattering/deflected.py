@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from recon.base.setting import Setting, setting
-from simulators.effects.chain import VISIBLE, Anomaly, ImageEffect, Label, Views, within
+from simulators.effects.chain import VISIBLE, Anomaly, AnomalyLabel, ImageEffect, ViewRange, within
 from simulators.frame.mapping import NotNegative, Positive, Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
@@ -76,7 +76,7 @@ class Floaters(ImageEffect, Anomaly):
     heights: tuple[Height, Height] = (-0.2, 0.2)
     motion: Literal["turning", "loose"] = "turning"
     speed: Length = 0.05
-    views: Views | None = None
+    views: ViewRange | None = None
     seed: Whole = 0
 
     def __post_init__(self) -> None:
@@ -99,10 +99,10 @@ class Floaters(ImageEffect, Anomaly):
             image[top:below, left:right] += crumb.depth * down[:, None] * across
         return image
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         if not (shot.beam and shot.sample):
             return []
-        return [Label(self.name, crumb.box(shot.detector.shape), crumb.which) for crumb in self.crumbs(shot)]
+        return [AnomalyLabel(self.name, crumb.box(shot.detector.shape), crumb.which) for crumb in self.crumbs(shot)]
 
     def crumbs(self, shot: Shot) -> Iterator[Crumb]:
         loose = self.motion == "loose"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from simulators.effects.chain import Anomaly, Label, PoseEffect
+from simulators.effects.chain import Anomaly, AnomalyLabel, PoseEffect
 from simulators.frame.mapping import NotNegative, Positive, Whole
 from simulators.frame.shot import AngleAt, Pose, Shot, frame_rng
 
@@ -100,10 +100,10 @@ def came_forwards(angle_at: AngleAt, time: float) -> bool:
         if ago > HISTORY:
             return True
         ago *= 2
-    stood = ago / 2 if ago > LOOK else 0.0
-    while ago - stood > LOOK:  # the step back may have skipped the last move
-        middle = (stood + ago) / 2
-        stood, ago = (stood, middle) if elsewhere(middle) else (middle, ago)
+    still = ago / 2 if ago > LOOK else 0.0
+    while ago - still > LOOK:  # the step back may have skipped the last move
+        middle = (still + ago) / 2
+        still, ago = (still, middle) if elsewhere(middle) else (middle, ago)
     return angle_at(time - ago) < here
 
 
@@ -186,7 +186,7 @@ class Jump(PoseEffect, Anomaly):
             return pose
         return pose.turned_by(math.radians(self.turn_deg)).shifted_by(self._shift(pose.angle))
 
-    def labels(self, shot: Shot) -> Sequence[Label]:
+    def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         """All rows of the columns that the sample can reach; its height is not known here."""
         if not (shot.beam and shot.sample and shot.view >= self.view):
             return []
@@ -200,7 +200,7 @@ class Jump(PoseEffect, Anomaly):
         rows, cols = detector.shape
         first = max(0, math.ceil(detector.axis_col - radius / detector.pitch))
         last = min(cols - 1, math.floor(detector.axis_col + radius / detector.pitch))
-        return [Label(self.name, (0, rows, first, last + 1))] if first <= last else []
+        return [AnomalyLabel(self.name, (0, rows, first, last + 1))] if first <= last else []
 
     def _shift(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """mm along (u, b, v) at each angle, [row, 3]."""

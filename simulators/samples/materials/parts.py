@@ -139,8 +139,8 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
         for kind in kinds
     )
     reach = 2 * Phantom.of([part.solid for part in parts]).radius
-    matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
-    spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)
+    materials = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
+    spectrum = light(beam, [material.attenuation for material in materials], reach, filters or Palette().filters)
     thin = {kind: spectrum.mean(group.attenuation) for kind, group in zip(kinds, groups, strict=True)}
     solids = [
         replace(part.solid, attenuation=part.solid.attenuation * thin[part.material, part.instead_of]) for part in parts
@@ -167,11 +167,11 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
     def work(first: int, end: int) -> None:
         chords = thickness[:, first:end]
         hit = (chords != 0.0).any(axis=0)  # air is exactly 0
-        matter = chords[:, hit]
-        least = functools.reduce(np.minimum, (_through(matter, mu) for mu in attenuation))
+        lengths = chords[:, hit]
+        least = functools.reduce(np.minimum, (_through(lengths, mu) for mu in attenuation))
         light = np.zeros_like(least)  # with the hardest energy factored out, against underflow
         for weight, mu in zip(weights, attenuation, strict=True):
-            light += weight * np.exp(least - _through(matter, mu))
+            light += weight * np.exp(least - _through(lengths, mu))
         depth = least - np.log(light)
         out[first:end][hit] = np.where(np.abs(depth) < ROUNDING, 0.0, depth)
 
@@ -179,9 +179,9 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
     return out
 
 
-def _through(matter: Reals, attenuation: Reals) -> Reals:
+def _through(lengths: Reals, attenuation: Reals) -> Reals:
     """Optical depth at one energy; not by BLAS, whose sums depend on where a ray lies in the array."""
-    return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, matter, strict=True)))
+    return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, lengths, strict=True)))
 
 
 _OWN_KEYS = ("material", "instead_of", "name")

@@ -7,7 +7,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.simulate import LabelledRun, LabelLog, labels_path, write_labels
-from simulators.effects.chain import Label
+from simulators.effects.chain import AnomalyLabel
 from tests.beamline.simulate.read_labels import read_labels
 
 A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)
@@ -16,7 +16,13 @@ A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)
 def test_consecutive_frames_of_a_kind_are_one_run() -> None:
     log = LabelLog()
     for frame, labels in enumerate(
-        [[], [Label("ghost", A)], [Label("jump", C), Label("ghost", B)], [], [Label("ghost", C)]]
+        [
+            [],
+            [AnomalyLabel("ghost", A)],
+            [AnomalyLabel("jump", C), AnomalyLabel("ghost", B)],
+            [],
+            [AnomalyLabel("ghost", C)],
+        ]
     ):
         log.add(frame, labels)
     runs = log.runs()
@@ -26,9 +32,9 @@ def test_consecutive_frames_of_a_kind_are_one_run() -> None:
 
 def test_each_of_several_of_a_kind_has_a_run_of_its_own() -> None:
     log = LabelLog()
-    log.add(0, [Label("floaters", A)])
-    log.add(1, [Label("floaters", B), Label("floaters", C, 1)])
-    log.add(2, [Label("floaters", A, 1)])
+    log.add(0, [AnomalyLabel("floaters", A)])
+    log.add(1, [AnomalyLabel("floaters", B), AnomalyLabel("floaters", C, 1)])
+    log.add(2, [AnomalyLabel("floaters", A, 1)])
     assert log.runs() == (LabelledRun("floaters", 0, (A, B)), LabelledRun("floaters", 1, (C, A)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.base.greys import class_levels, grey_windows, matter_window
+from recon.base.greys import class_levels, grey_windows, material_window
 
 
 def volume(noise: float, **classes: float) -> np.ndarray:
@@ -19,7 +19,7 @@ def volume(noise: float, **classes: float) -> np.ndarray:
 
 
 def grey(values: np.ndarray, level: float) -> float:
-    low, high = matter_window(values)
+    low, high = material_window(values)
     return (level - low) / (high - low)
 
 
@@ -38,7 +38,7 @@ def test_a_pin_of_metal_does_not_darken_the_matrix(noise: float) -> None:
     low, high = grey_windows(values)["all"]
     assert low < 0.05 and high > 9
     less = np.delete(values, np.flatnonzero(values > 9)[::2])  # half as large a pin
-    assert matter_window(less)[1] == pytest.approx(matter_window(values)[1], rel=0.1)
+    assert material_window(less)[1] == pytest.approx(material_window(values)[1], rel=0.1)
 
 
 def test_dense_matter_that_is_most_of_the_sample_is_no_metal() -> None:

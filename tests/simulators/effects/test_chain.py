@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simulators.effects.catalogue import CATALOGUE, Domain
-from simulators.effects.chain import AnyEffect, Chain, Label
+from simulators.effects.chain import AnomalyLabel, AnyEffect, Chain
 from simulators.effects.exposure import MotionBlur
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Image, Shot
@@ -33,12 +33,15 @@ class _Wanderer:
     def apply(self, image: Image, shot: Shot) -> Image:
         return image
 
-    def labels(self, shot: Shot) -> list[Label]:
+    def labels(self, shot: Shot) -> list[AnomalyLabel]:
         k = round(10 * shot.angle)
-        return [Label("wanderer", (10 + k, 12 + k, 20 + k, 22 + k)), Label("wanderer", (30 - k, 33 - k, 40, 41), 1)]
+        return [
+            AnomalyLabel("wanderer", (10 + k, 12 + k, 20 + k, 22 + k)),
+            AnomalyLabel("wanderer", (30 - k, 33 - k, 40, 41), 1),
+        ]
 
 
-def _labels(domain: Domain, turned: float, **state: bool) -> tuple[Label, ...]:
+def _labels(domain: Domain, turned: float, **state: bool) -> tuple[AnomalyLabel, ...]:
     shot = shots.shot(angle=0.0, angle_at=lambda time: turned * (time - 1000.0) / 0.01, radius=0.5, **state)
     order: list[AnyEffect] = [MotionBlur(0.1, 10), cast(AnyEffect, _Wanderer(domain))]
     return Chain.of(order).labels(shot)
@@ -47,17 +50,17 @@ def _labels(domain: Domain, turned: float, **state: bool) -> tuple[Label, ...]:
 def test_what_turns_with_the_sample_is_labelled_wherever_it_is_while_the_frame_looks() -> None:
     # 10 moments of a turn by 2 rad: from 1 to 19 tenths.
     assert _labels(Domain.OPTICAL_DEPTH, 2.0) == (
-        Label("wanderer", (11, 31, 21, 41)),
-        Label("wanderer", (11, 32, 40, 41), 1),
+        AnomalyLabel("wanderer", (11, 31, 21, 41)),
+        AnomalyLabel("wanderer", (11, 32, 40, 41), 1),
     )
     assert _labels(Domain.OPTICAL_DEPTH, -2.0) == (
-        Label("wanderer", (-9, 11, 1, 21)),
-        Label("wanderer", (31, 52, 40, 41), 1),
+        AnomalyLabel("wanderer", (-9, 11, 1, 21)),
+        AnomalyLabel("wanderer", (31, 52, 40, 41), 1),
     )
 
 
 def test_what_acts_on_the_whole_exposure_is_asked_once() -> None:
-    here = (Label("wanderer", (10, 12, 20, 22)), Label("wanderer", (30, 33, 40, 41), 1))
+    here = (AnomalyLabel("wanderer", (10, 12, 20, 22)), AnomalyLabel("wanderer", (30, 33, 40, 41), 1))
     assert _labels(Domain.PHOTONS, 2.0) == here
     assert _labels(Domain.OPTICAL_DEPTH, 2.0, sample=False) == here
 

@@ -74,15 +74,15 @@ class Foam(PieceBuilder):
             points = points[np.hypot(points[:, 0], points[:, 1]) < self.diameter / 2]
             wall = self.diameter / 2 - np.hypot(points[:, 0], points[:, 1])
             room = np.minimum(wall, z / 2 - np.abs(points[:, 2]))
-            matter: Cylinder | Box = Cylinder(self.diameter / 2, self.height, 1.0)
+            solid: Cylinder | Box = Cylinder(self.diameter / 2, self.height, 1.0)
         else:
             room = (np.array([x, y, z]) / 2 - np.abs(points)).min(axis=1)
-            matter = Box(self.edges, 1.0)
+            solid = Box(self.edges, 1.0)
         gap, largest = self.gap_um * 1e-3, self.largest_um * 0.5e-3
         radii = np.minimum(room - gap, largest)
         centres = holes(points, radii, self.smallest_um * 0.5e-3, gap, self.n_holes)
         return (
-            Piece(matter, "matter"),
+            Piece(solid, "matter"),
             *(
                 Piece(Ellipsoid((radius,) * 3, 1.0, (px, py, pz)), "hole", "matter")
                 for px, py, pz, radius in centres.tolist()

@@ -19,7 +19,7 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.projections.selection import Selection
 from beamline.storage.volumes.files import opened_volume
-from recon.base.greys import matter_window
+from recon.base.greys import material_window
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
 
@@ -142,7 +142,7 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
             assert np.array_equal(cut, stored[time].take(1, axis))
     facts = shown.facts()
     assert facts["seconds"] == pytest.approx((0, SPAN))
-    assert facts["window"] == pytest.approx(matter_window(stored), rel=0.05)
+    assert facts["window"] == pytest.approx(material_window(stored), rel=0.05)
     assert max(shown.histogram(0)["values"]) > max(shown.histogram(1)["values"])
     shown.close()
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simulators.effects.beam.open_beam import BeamBend, BlackBand, LostBeam, NarrowField, RingCurrent
-from simulators.effects.chain import Label
+from simulators.effects.chain import AnomalyLabel
 from simulators.frame.shot import Detector
 from tests.simulators import anomalies, shots
 
@@ -149,8 +149,8 @@ def test_the_region_covers_the_darkened_pixels(width: float, penumbra: float, sh
 
 def test_it_is_there_always_without_views() -> None:
     band = BlackBand(0.05)
-    assert band.labels(shots.shot(view=10_000)) == [Label("black_band", (0, 60, 0, 5))]
-    assert BlackBand(2.0).labels(shots.shot()) == [Label("black_band", (0, 60, 0, 80))]
+    assert band.labels(shots.shot(view=10_000)) == [AnomalyLabel("black_band", (0, 60, 0, 5))]
+    assert BlackBand(2.0).labels(shots.shot()) == [AnomalyLabel("black_band", (0, 60, 0, 80))]
 
 
 def test_the_light_is_a_rectangle_with_soft_edges() -> None:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from simulators.devices.clock import VirtualClock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.motor import PulseMotor
-from simulators.effects.chain import Label, PoseEffect
+from simulators.effects.chain import AnomalyLabel, PoseEffect
 from simulators.effects.stage.errors import EncoderError, Jump, Runout, StageWobble, came_forwards, series
 from simulators.frame.shot import Detector, Pose, Shot
 from tests.simulators import shots
@@ -247,6 +247,8 @@ def test_a_slip_along_the_beam_shows_in_a_cone_only() -> None:
     assert jump.labels(shots.shot(angle=0.1))
     cone = Detector.centred((60, 80), 0.01, sod=2.0)
     # A point at 0.35 mm from the axis is seen up to 0.35 / (1 - 0.35 / 2) = 0.4242 mm from it.
-    assert Jump(0, (0.0, 50.0, 0.0)).labels(shots.shot(angle=0.0, detector=cone)) == [Label("jump", (0, 60, 0, 80))]
+    assert Jump(0, (0.0, 50.0, 0.0)).labels(shots.shot(angle=0.0, detector=cone)) == [
+        AnomalyLabel("jump", (0, 60, 0, 80))
+    ]
     narrow = Detector.centred((60, 120), 0.01, sod=2.0)
-    assert jump.labels(shots.shot(angle=0.0, detector=narrow)) == [Label("jump", (0, 60, 18, 102))]
+    assert jump.labels(shots.shot(angle=0.0, detector=narrow)) == [AnomalyLabel("jump", (0, 60, 18, 102))]
