@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from beamline.monitor.change import FrameScatter, SampleChange
-from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, light, more_light
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, exposure_ratio, intensity
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brightest_place
 from drivers.base.frame import Frame, FrameKind
@@ -30,8 +30,8 @@ REMEDY = (
 TAKEN_OFF = "`beamline recon` corrects this if there is air next to the sample (--air auto)."
 GONE = 0.5  # share of the limit below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
-MEMORY = 0.05  # weight of the newest view in the usual light
-CONFIRMED = 0.5  # share of a change that the whole view's light must show: the rest may be the sample's turning
+MEMORY = 0.05  # weight of the newest view in the usual intensity
+CONFIRMED = 0.5  # share of a change that the whole view's intensity must show: the rest may be the sample's turning
 SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 
@@ -40,12 +40,12 @@ class BeamState:
     drifting: int = 0  # views in a row that would change the report
     flagged_drift: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
     covered: bool = False  # the missing air was reported
-    level: float = 0.0  # logarithm of the light over that of the first view, from its confirmed changes
+    level: float = 0.0  # logarithm of the intensity over that of the first view, from its confirmed changes
     usual: float = 0.0  # the normal level
     dipping: int = 0  # views in a row with a dip
-    whole: float = math.nan  # logarithm of the light of the whole view before; NaN before any
-    # changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit
-    # is at most 3.8 times `alarm`
+    whole: float = math.nan  # logarithm of the intensity of the whole view before; NaN before any
+    # changes: of the intensity from projection to projection, each counted as at most half of `alarm`. A single dip
+    # therefore does not count as scatter, and the limit is at most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
 
 
@@ -69,8 +69,8 @@ class BeamCheck(Logged):
 
     def look(self, state: BeamState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[BeamState]:
         if frame.kind is FrameKind.FLAT and context.flat is not None:
-            full = float(light(context.flat, context).mean()) * more_light(context, frame.exposure)
-            score = 1 - float(light(digest.preview, context).mean()) / full if full > 0 else 0.0
+            full = float(intensity(context.flat, context).mean()) * exposure_ratio(context, frame.exposure)
+            score = 1 - float(intensity(digest.preview, context).mean()) / full if full > 0 else 0.0
             return CheckResult(state, self._flat(frame.index, score))
         if context.view is None or context.grid is None:
             return CheckResult(state)

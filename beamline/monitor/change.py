@@ -32,7 +32,7 @@ MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not k
 class SampleChange:
     """The change of a projection relative to the projection before."""
 
-    gain: float  # relative change of the light, of all cells alike
+    gain: float  # relative change of the intensity, of all cells alike
     # across, down: displacement of the sample in pixels of the frame, to the right and downwards
     across: float
     down: float

@@ -100,7 +100,7 @@ def again_by(check: str) -> str:
     return f"With `monitor.retake: [{check}]` in the configuration, the scan takes such projections again at its end."
 
 
-def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
+def intensity(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
     """Counts above the dark [preview row, preview col]; raw counts if there was no dark yet."""
     return preview if context.dark is None else preview - context.dark
 
@@ -113,7 +113,7 @@ def at_edges(context: ScanContext) -> tuple[float, float]:
     return left - dimmer, right - dimmer
 
 
-def more_light(context: ScanContext, exposure: float) -> float:
+def exposure_ratio(context: ScanContext, exposure: float) -> float:
     """Intensity without a sample for this exposure (s), relative to the flats, whose exposure may differ."""
     return exposure / context.flat_exposure
 

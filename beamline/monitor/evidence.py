@@ -16,9 +16,9 @@ from recon.base.arrays import F32, Mask
 from recon.base.noise import deviation_between_frames, deviation_between_neighbours
 
 LEAST_NOISE = 0.5  # counts: what rounding hides
-BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
-DRIFT = 0.02  # share of the light by which a beam may drift within a scan (as in the check `beam`)
-UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
+BRIGHT = 90.0  # percentile of a frame's blocks that represents its intensity
+DRIFT = 0.02  # fraction of the intensity by which a beam may drift within a scan (as in the check `beam`)
+UNLIT = 0.05  # share of the bright part's intensity: a place with less counts as dark
 LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
 ZINGER = 12.0  # times the median change: more is not noise
 
@@ -128,9 +128,9 @@ class Evidence:
     @cached_property
     def brightest(self) -> Group:
         """The group of flats with the highest intensity; empty without flats."""
-        return max(self.of_kind(FrameKind.FLAT), key=self.light_of, default=())
+        return max(self.of_kind(FrameKind.FLAT), key=self.intensity_of, default=())
 
-    def light_of(self, group: Group) -> float:
+    def intensity_of(self, group: Group) -> float:
         """Counts of the bright part above the darks, per second if the exposure is known."""
         dark = level(self.darkest) if self.darkest else 0.0
         return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
@@ -155,16 +155,18 @@ class Evidence:
         darks = [frame.places for frame in self.frames(FrameKind.DARK)]
         return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
 
-    def light(self, frame: FrameStatistics) -> F32:
+    def intensity(self, frame: FrameStatistics) -> F32:
         """Counts of a frame above the darks, at its places."""
         return np.asarray(np.nan_to_num(frame.places - self.base), np.float32)
 
     @cached_property
     def lit_views(self) -> list[FrameStatistics]:
         """The projections that are brighter than with a closed shutter, and have more than one value."""
-        light = [float(np.percentile(self.light(view), BRIGHT)) for view in self.views]
-        least = UNLIT * max(light, default=0.0)
-        return [view for view, bright in zip(self.views, light, strict=True) if bright > least and not view.constant]
+        intensity = [float(np.percentile(self.intensity(view), BRIGHT)) for view in self.views]
+        least = UNLIT * max(intensity, default=0.0)
+        return [
+            view for view, bright in zip(self.views, intensity, strict=True) if bright > least and not view.constant
+        ]
 
 
 def level(group: Group) -> float:
@@ -187,9 +189,9 @@ def place_noise(values: NDArray[np.floating]) -> float:
     return deviation_between_neighbours(values, 2)
 
 
-def lit_places(light: F32) -> Mask:
+def lit_places(intensity: F32) -> Mask:
     """Mask of the places that get beam."""
-    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
+    return intensity > UNLIT * max(float(np.percentile(intensity, BRIGHT)), 1e-30)
 
 
 def photons(flats: Group, darks: Group) -> float | None:
@@ -199,8 +201,8 @@ def photons(flats: Group, darks: Group) -> float | None:
     flickering or moving beam does not count as noise. None if there are too few frames or blocks, or if the flats have
     no photon noise.
     """
-    light = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
-    lit = light > UNLIT * float(np.nanpercentile(light, BRIGHT))
+    intensity = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
+    lit = intensity > UNLIT * float(np.nanpercentile(intensity, BRIGHT))
     beside = lit[:, 1:] & lit[:, :-1]
     if len(flats) < 2 or (len(flats) - 1) * beside.sum() < LEAST_BLOCKS:
         return None
@@ -210,7 +212,7 @@ def photons(flats: Group, darks: Group) -> float | None:
     squares = change.astype(np.float64) ** 2
     variance = float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 4 * flats[0].block ** 2
     brought = variance - pixel_noise(darks) ** 2
-    return float(np.median(light[lit]) * light[lit].mean()) / brought if brought > 0 else None
+    return float(np.median(intensity[lit]) * intensity[lit].mean()) / brought if brought > 0 else None
 
 
 def full_scale(largest: float) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, at_edges, light
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, at_edges, intensity
 from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
@@ -82,17 +82,17 @@ class FieldOfViewCheck(Logged):
             return CheckResult(replace(state, cut=cut, inside=state.inside or cut == 0))
         return CheckResult(replace(state, reported=True), self._cut(frame.index, edges, context.grid, state.inside))
 
-    def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
-        bright = float(np.percentile(light[::2, ::2], BRIGHT))
+    def _unlit(self, frame: Frame, intensity: NDArray[np.float32]) -> Flag | None:
+        bright = float(np.percentile(intensity[::2, ::2], BRIGHT))
         rows, cols = frame.counts.shape
-        if bright <= NO_BEAM * deviation_between_neighbours(light[::2]):
+        if bright <= NO_BEAM * deviation_between_neighbours(intensity[::2]):
             advice = "Check that the beam is on and the shutter is open: this flat is as dark as the darks."
             return Flag(self.name, Level.WARN, frame.index, 1.0, self.unlit, advice, (0, rows, 0, cols))
-        unlit = light < UNLIT * bright
+        unlit = intensity < UNLIT * bright
         share = float(unlit.mean())
         if share <= self.unlit:
             return None
-        step = frame.counts.shape[0] / light.shape[0]
+        step = frame.counts.shape[0] / intensity.shape[0]
         strips = [
             (first, after, axis) for axis in (0, 1) for first, after in _runs(unlit.mean(axis=1 - axis) > 0.5, step)
         ]
@@ -294,7 +294,7 @@ class PixelsCheck(Logged):
 
 def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlaces:
     """Positions of the pixels of a flat that are dark in a block with beam."""
-    above = light(digest.preview, context)
+    above = intensity(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above
     around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow is not dead

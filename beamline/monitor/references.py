@@ -39,11 +39,11 @@ from recon.base.arrays import MEDIAN
 from recon.base.setting import setting
 
 READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
-FEW = 20.0  # noises of the darks: flats with less light have hardly more noise, so that their variance tells nothing
+FEW = 20.0  # times the noise of the darks: the variance of flats with less intensity is mostly noise of the darks
 CHANGE_SIGMAS = 8.0  # standard deviations: a larger change between two flats is not noise
 WORST = 0.01  # share of the places of a flat that may be zingers
 ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
-LIT = 0.02  # share of the flats' light from which a dark is lit: 0.02 of transmission, if it were the only dark
+LIT = 0.02  # fraction of the intensity of the flats above which a dark counts as exposed to the beam
 LIT_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
 INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
 
@@ -144,14 +144,14 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
         same = [frame for frame in darks if frame.rounded_exposure == exposure]
         levels = np.array([level([frame]) for frame in same])
         base, lowest = same[int(levels.argmin())], float(levels.min())
-        light = (max(flats) if flats else float(levels.max())) - lowest
-        limit = max(LIT * light, LIT_SIGMAS * place_noise(base.blocks))
+        intensity = (max(flats) if flats else float(levels.max())) - lowest
+        limit = max(LIT * intensity, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
             odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
             yield BadFrames(odd, float(above.max()), limit, (
                 f"they were exposed to the beam, or their offset changed: they are {range_in_words(above)} counts "
-                f"above {least_dark} (limit {limit:.3g}, because the flats have {light:.6g} counts of beam)."
+                f"above {least_dark} (limit {limit:.3g}, because the flats have {intensity:.6g} counts of beam)."
             ))  # fmt: skip
 
 
@@ -188,12 +188,12 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         return
     noise, limit = max(pixel_noise(darks), darks[0].rounding), limits.light_over_noise
     for group in evidence.of_kind(FLAT):
-        light = level(group) - level(darks)
-        if light <= limit * noise:
-            yield BadFrames(group, light / noise if noise else 0.0, limit, (
+        intensity = level(group) - level(darks)
+        if intensity <= limit * noise:
+            yield BadFrames(group, intensity / noise if noise else 0.0, limit, (
                 "they show no beam. Was the shutter open for the flats, and closed for the darks? The level of these "
-                f"flats, {level(group):.6g}, is {light:.3g} above that of the darks, {level(darks):.6g}; the noise of "
-                f"a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
+                f"flats, {level(group):.6g}, is {intensity:.3g} above that of the darks, {level(darks):.6g}; the noise "
+                f"of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
             ))  # fmt: skip
 
 
@@ -201,7 +201,7 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
     """Flats with much less intensity than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
-        gone = np.array([1 - evidence.light_of([flat]) / evidence.light_of(bright) for flat in group])
+        gone = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
         if (gone > limit).any():
             others, most = spans([flat.row for flat in bright]), float(gone.max())
             sentence = (
@@ -215,7 +215,7 @@ def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[
     views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
     limit = 1 - limits.light_gone
     for group in evidence.of_kind(FLAT) if views else ():
-        share = evidence.light_of(group) / evidence.light_of(views)
+        share = evidence.intensity_of(group) / evidence.intensity_of(views)
         if share < limit and all(flat.exposure > 0 for flat in group):
             yield BadFrames(group, share, limit, (
                 f"they have {share:.2%} of the intensity of the projections (limit {limit:.0%}), but a sample can only "
@@ -229,12 +229,12 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     flats."""
     base, limit = offset(evidence.darkest), limits.uneven
     for group in evidence.of_kind(FLAT):
-        light = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
-        usual = np.median(light, axis=0)
+        intensity = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
+        usual = np.median(intensity, axis=0)
         lit = usual > max(0.0, UNLIT * float(np.nanpercentile(usual, BRIGHT)))
         if len(group) < 2 or not lit.any():
             continue
-        ratio = light[:, lit] / usual[lit]
+        ratio = intensity[:, lit] / usual[lit]
         levels = np.nanmedian(ratio, axis=1)
         local = np.sort(np.nan_to_num(np.abs(ratio / levels[:, None] - 1)), axis=1)
         places = local[:, max(0, lit.sum() - 1 - max(ZINGERS, round(lit.sum() * WORST)))]
@@ -259,8 +259,8 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
 def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats in which most of the frame gets no beam."""
     for group in evidence.of_kind(FLAT):
-        light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
-        score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
+        intensity = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
+        score, limit = float((intensity < UNLIT * np.nanpercentile(intensity, BRIGHT)).mean()), limits.unlit
         if score > limit:
             yield BadFrames(group, score, limit, (
                 f"{score:.0%} of the frame gets no beam (limit {limit:.0%}). Align beam and detector, or read out a "
@@ -268,7 +268,7 @@ def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
             ))  # fmt: skip
 
 
-def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
+def _beam_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Darks with the level and the noise of an exposed frame."""
     flats = evidence.brightest
     for darks in evidence.of_kind(DARK) if flats else ():
@@ -296,7 +296,7 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("no_beam", FLAT, _without_beam),
     ("saturated", FLAT, _saturated),
     ("beam_lost", FLAT, _beam_lost),
-    ("light_in_darks", DARK, _light_in_darks),
+    ("light_in_darks", DARK, _beam_in_darks),
     ("dimmer_than_views", FLAT, _dimmer_than_views),
     ("uneven", FLAT, _uneven),
     ("mostly_unlit", FLAT, _mostly_unlit),

@@ -38,16 +38,19 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     views, groups = evidence.lit_views, evidence.of_kind(FrameKind.FLAT)
     if len(views) < FEWEST:
         return
-    seen, light = [evidence.light(view) for view in views], [[evidence.light(flat) for flat in each] for each in groups]
+    seen, intensity = (
+        [evidence.intensity(view) for view in views],
+        [[evidence.intensity(flat) for flat in each] for each in groups],
+    )
     if single:  # of two flats each is the other one's only witness
         compared = [
             ([group[i]], own[i], [np.median(rest, axis=0)])
-            for group, own in zip(groups, light, strict=True)
+            for group, own in zip(groups, intensity, strict=True)
             for i in range(len(group))
             if (rest := own[:i] + own[i + 1 :])
         ]
     else:
-        means = [np.mean(own, axis=0) for own in light]
+        means = [np.mean(own, axis=0) for own in intensity]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
     beside, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
@@ -90,20 +93,20 @@ class ViewsAboveFlats(NamedTuple):
 
 
 def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
-    views = [evidence.light(view) for view in evidence.lit_views]
-    light = [
-        np.asarray(np.mean([evidence.light(flat) for flat in group], axis=0), np.float32)
+    views = [evidence.intensity(view) for view in evidence.lit_views]
+    intensity = [
+        np.asarray(np.mean([evidence.intensity(flat) for flat in group], axis=0), np.float32)
         for group in evidence.of_kind(FrameKind.FLAT)
     ]
-    lit = lit_places(np.maximum.reduce(light))
+    lit = lit_places(np.maximum.reduce(intensity))
     if len(views) < FEWEST or not lit.any():
         return None
-    over = [np.percentile([log_ratio(view, each, lit) for view in views], 100 - SHALLOW, axis=0) for each in light]
+    over = [np.percentile([log_ratio(view, each, lit) for view in views], 100 - SHALLOW, axis=0) for each in intensity]
     brightest = np.percentile(over, WORST, axis=1)
     columns, n = np.nonzero(lit)[1], max(1, lit.shape[1] // EDGE)
     sides = [columns < columns.min() + n, columns > columns.max() - n]
     at_edges = np.min([np.median(np.array(over)[:, side], axis=1) for side in sides], axis=0)
-    changes = [log_ratio(each, light[int(np.argmin(brightest))], lit) for each in light]
+    changes = [log_ratio(each, intensity[int(np.argmin(brightest))], lit) for each in intensity]
     mismatch = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
     return ViewsAboveFlats(
         brightest, at_edges, mismatch, max(AIR, SIGMAS * max(place_noise(change) for change in changes))
@@ -195,16 +198,16 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
 
     Only of projections that have air at the edges. None if there are too few of them, or too few places.
     """
-    light = np.mean([evidence.light(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
-    lit = lit_places(light)
+    intensity = np.mean([evidence.intensity(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
+    lit = lit_places(intensity)
     rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
     cols = np.flatnonzero(lit[rows].all(axis=0))
     views = evidence.lit_views
     if len(views) < FEWEST or not rows.size or cols.size < EDGE:
         return None
     part = np.ix_(rows, cols)
-    every = np.ones(light[part].shape, np.bool_)
-    seen = (log_ratio(evidence.light(view)[part], light[part], every).reshape(every.shape) for view in views)
+    every = np.ones(intensity[part].shape, np.bool_)
+    seen = (log_ratio(evidence.intensity(view)[part], intensity[part], every).reshape(every.shape) for view in views)
     depth = -np.stack(list(seen))
     n = max(1, cols.size // EDGE)
     left, right = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)

@@ -110,11 +110,11 @@ def grid_of(
     return CellGrid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
 
 
-def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
-    """A projection on the grid. `more_light` is its exposure divided by that of the flats."""
+def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, exposure_ratio: float) -> CellView:
+    """A projection on the grid. `exposure_ratio` is its exposure divided by that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
-    through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / more_light), darkest)
+    through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / exposure_ratio), darkest)
     lit = (grid.lit > 0) & ~np.isnan(through)
     weight = np.where(lit, np.minimum(through, 1), 0)
     depth = np.where(lit, -np.log(through), 0)
@@ -242,8 +242,8 @@ def _isolated(digest: FrameDigest, before: NDArray[np.float32], dark: float, noi
     rows, cols = np.divmod(far, rise.shape[1])
     (beside, was), peaks = (_around(image, rows, cols) for image in (digest.preview, before)), digest.peaks[rows, cols]
     around = np.delete(beside, 4, axis=1).max(axis=1)  # without the block itself
-    light = np.maximum(around - dark, 1)
-    bright = peaks - around > np.maximum(noises * np.sqrt(light), RELATIVE * light)
+    intensity = np.maximum(around - dark, 1)
+    bright = peaks - around > np.maximum(noises * np.sqrt(intensity), RELATIVE * intensity)
     new = was.max(axis=1) - around < 0.5 * (peaks - around)
     return np.stack([rows, cols], axis=1)[bright & new]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
-from beamline.monitor.check import Check, CheckResult, Flag, Level, ScanContext, at_edges, more_light
+from beamline.monitor.check import Check, CheckResult, Flag, Level, ScanContext, at_edges, exposure_ratio
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.field import PixelsCheck
@@ -36,9 +36,9 @@ NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a view to its n
 SAME, SAME_ANGLE = 0.1, math.radians(0.02)  # planned steps, or rad where they are not known, within a view
 ONE_WAY = 0.75  # of the steps, which golden angles have not: 0.62
 EVERY, MOST = math.radians(5), 72  # between the views that are kept for others near them that come later; number
-DARK = 0.5  # least light left of a view; with less it is skipped, see the check `lost`
+DARK = 0.5  # least intensity left of a view; with less it is skipped, see the check `lost`
 
-FLOODED = 0.1  # of the pixels more saturated than in the last good view: nine tenths of the places tell the light
+FLOODED = 0.1  # of the pixels more saturated than in the last good view: nine tenths of the places show the intensity
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class Monitor:
         states: of the checks, in their order.
         kind, counted: of the latest group of frames: their kind, and how many there are.
         before: digest of the frame before; None before any.
-        recent: the last projections with light, oldest first, each a neighbour of the one before in angle.
-        kept: a projection with light every few degrees.
+        recent: the last projections with beam, oldest first, each a neighbour of the one before in angle.
+        kept: a projection with beam every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
         shake: of the sample, over the views so far.
         saturated: fraction of the pixels of the last good view; 1 before any.
@@ -201,7 +201,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     if grid is None:
         block = block_side(frame.counts.shape, digest.preview.shape)
         grid = grid_of(digest.preview.shape, block, context.dark, context.flat)
-    longer = more_light(context, frame.exposure) if grid.flats else 1.0
+    longer = exposure_ratio(context, frame.exposure) if grid.flats else 1.0
     view = view_of(digest.preview, grid, frame.index, frame.angle, longer)
     recent, last = monitor.recent, monitor.recent[-1] if monitor.recent else None
     steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step

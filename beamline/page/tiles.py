@@ -64,8 +64,8 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
 
 def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray[np.float32]:
     """The flat with NaN in pixels without intensity, for example behind slits, because ratios there are noise."""
-    light = flat - dark
-    return np.where(light > UNLIT * np.nanpercentile(light, BRIGHT), flat, np.float32(np.nan))
+    intensity = flat - dark
+    return np.where(intensity > UNLIT * np.nanpercentile(intensity, BRIGHT), flat, np.float32(np.nan))
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ class ReferenceLog:
         found = (finding for finding in judge(self.evidence, limits) if finding.frames)
         return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
-    def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
+    def too_few_photons(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the projections, because a pixel of the open beam has few photons; or None.
         `exposure`: s, of the projections."""
         bad = {row for finding in judge(self.evidence, limits) for row in finding.frames}
@@ -83,8 +83,8 @@ class ReferenceReport:
     def faults(self, log: ReferenceLog, planned: Sequence[Block] = ()) -> Mapping[str, str]:
         """The faults of the darks and flats so far, as `ReferenceLog.faults`."""
         faults = log.faults(self._limits, planned)
-        little_light = log.too_little_light(self._limits, self._exposure)
-        statements = faults if little_light is None else {"little light": little_light, **faults}
+        few_photons = log.too_few_photons(self._limits, self._exposure)
+        statements = faults if few_photons is None else {"little light": few_photons, **faults}
         for group in [group for group in statements if group not in self._warned_of]:
             self._warned_of.add(group)
             self._sink(Warned(statements[group]))

@@ -15,12 +15,14 @@ from recon.base.jit import njit
 from recon.base.masks import Image, fill, plan_fill
 from recon.prep.unmeasured import DARK, NO_RUNS
 
-_LEAST = 0.005  # least noise of √light, as a share of the open beam's: 1 % of its light, for grain of screen and optics
+# smallest noise of √intensity, as a fraction of that of the open beam: 1 % of the intensity, for grain of the optics
+_LEAST = 0.005
 _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot in which the normal difference of the projections is measured
-# pixels (about; at least) from which the noise of a projection, and a change of its light, are measured
+# pixels (about; at least) from which the noise of a projection, and a change of its intensity, are measured
 _SAMPLE, _FEWEST = 600, 30
-_OPAQUE = DARK**0.5  # √light; where a projection is darker, it cannot show whether a gap is about to open in the sample
+# √intensity; if a projection is darker, it cannot show whether a gap is about to open in the sample
+_OPAQUE = DARK**0.5
 _MEDIAN = MEDIAN * 2**0.5  # median of |x - y| for normal variables of standard deviation 1
 
 
@@ -116,13 +118,13 @@ class SpotFilter:
         return views[:n], replace(self, before=before, waiting=waiting, left=left)
 
 
-def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:
+def without_spots(frames: Iterable[NDArray[Any]], intensity: float) -> Iterator[tuple[NDArray[Any], int]]:
     """Darks or flats [row, col] without their spots, and the number of filled pixels in each frame.
 
     A spot is filled with the mean of the frames before and after. A single frame is not changed.
 
     Args:
-        light: counts in the open beam.
+        intensity: counts in the open beam.
     """
     before: NDArray[Any] | None = None
     left = iter(frames)
@@ -131,16 +133,16 @@ def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tupl
         after = next(left, None)
         n, beside = 0, [each for each in (before, after) if each is not None]
         if beside:
-            first, second = (None if each is None else _root_of(each, light) for each in (before, after))
-            found, _ = spots(_root_of(here, light), first, second, SPOT_ERRORS, still=True)
+            first, second = (None if each is None else _root_of(each, intensity) for each in (before, after))
+            found, _ = spots(_root_of(here, intensity), first, second, SPOT_ERRORS, still=True)
             if n := int(np.count_nonzero(found)):
                 here = np.where(found, np.mean(beside, axis=0), here)
         yield here, n
         before, here = here, after
 
 
-def _root_of(counts: NDArray[Any], light: float) -> Image:
-    return np.sqrt(np.maximum(counts, 0) / max(light, 1e-30), dtype=np.float32)
+def _root_of(counts: NDArray[Any], intensity: float) -> Image:
+    return np.sqrt(np.maximum(counts, 0) / max(intensity, 1e-30), dtype=np.float32)
 
 
 def spots(
@@ -159,11 +161,11 @@ def spots(
 
     Args:
         before, after: the projections before and after; None: there is none. If most of this projection is brighter
-            than both, its light has changed, and both are scaled to its brightness.
+            than both, its intensity has changed, and both are scaled to its brightness.
         threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three
             values: the noise between the pixels of this projection, the difference of both neighbours around the pixel
-            (because the sample turns), and 1 % of the light. A normal variable exceeds 8 standard deviations once in
-            10¹⁵ pixels.
+            (because the sample turns), and 1 % of the intensity. A normal variable exceeds 8 standard deviations once
+            in 10¹⁵ pixels.
         still: True if there is no moving sample, as in darks and flats.
     """
     found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
@@ -180,10 +182,10 @@ def spots(
 
 @njit(nogil=True, cache=True)
 def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
-    """Two medians over some lit pixels: the difference from the next pixel, and the light over a neighbour's.
+    """Two medians over some lit pixels: the difference from the next pixel, and the intensity divided by a neighbour's.
 
     The neighbour is the brighter one of `before` and `after`. The second median is 0 if no pixel is lit, or if the sum
-    of the light is not larger."""
+    of the intensity is not larger."""
     rows, cols = view.shape
     step = max(1, rows * cols // _SAMPLE)
     differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
@@ -209,8 +211,8 @@ def _mark(  # type: ignore[no-untyped-def]
 ):
     """Mark the spots for `spots`, and count the pixels of spots that are too large.
 
-    Around a spot, `against` is compared with the projection before. `beam` is √light of the open beam, inf if there are
-    no gaps in a sample. `errors` is the threshold divided by the median difference of two normal variables."""
+    Around a spot, `against` is compared with the projection before. `beam` is √intensity of the open beam, or inf
+    if there are no gaps in a sample. `errors` is the threshold divided by the median difference of two normal variables."""
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
     left, brightest = 0, beam
@@ -219,9 +221,9 @@ def _mark(  # type: ignore[no-untyped-def]
             brightest = max(brightest, min(before[r, c], after[r, c]))
     for r in range(rows):
         for c in range(cols):
-            light = view[r, c]
-            stray = light > brightest + limit
-            if light <= before[r, c] + limit or (not stray and light <= after[r, c] + limit):
+            intensity = view[r, c]
+            stray = intensity > brightest + limit
+            if intensity <= before[r, c] + limit or (not stray and intensity <= after[r, c] + limit):
                 continue
             along, down = -np.inf, -np.inf  # light that the brightest piece of its line must exceed to be a spot
             for first in range(-_WIDEST, 1):
@@ -235,7 +237,7 @@ def _mark(  # type: ignore[no-untyped-def]
                     continue
                 near = before[max(0, r - 1) : r + 2, max(0, c - 1) : c + 2].max()
                 around = max(around, near, after[r, c])
-            height = light - max(around, before[r, c])
+            height = intensity - max(around, before[r, c])
             if height > limit:
                 n = 0
                 for i in range(max(0, r - _AROUND), min(rows, r + _AROUND + 1)):

@@ -32,26 +32,26 @@ _BELOW = 3.0  # standard deviations below the dark; no camera gives such values
 _CLEARLY = 0.5  # share of the changing absorption that may remain without the post
 
 
-def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: Mask | None) -> Mask | None:
+def unmeasured(values: NDArray[np.generic], intensity: F32, hidden: Mask, foreign: Mask | None) -> Mask | None:
     """Mask [row, col] of the pixels of a projection without data; None: no pixel, or all pixels.
 
     Args:
         values: pixel values as stored.
-        light: transmission; NaN: not finite.
+        intensity: transmission; NaN: not finite.
         hidden: areas that are masked in all projections.
         foreign: bool [row], rows in which dark pixels are not the sample, see `foreign_rows`; None: no such rows.
     """
-    if light.min() > DARK:  # false for NaN
+    if intensity.min() > DARK:  # false for NaN
         return None
-    low = ~(light > DARK)
-    unknown = low & ~np.isfinite(light) & ~hidden
+    low = ~(intensity > DARK)
+    unknown = low & ~np.isfinite(intensity) & ~hidden
     if not (_corners(low).any() or (foreign is not None and foreign.any()) or unknown.any()):
         return None
     labels, nothing_seen = _at_borders(low, hidden), np.zeros_like(low)
     for label in {*_corners(labels).flat} - {0}:
         part = (labels == label) & low & ~hidden & ~unknown
         solid = np.mean((low | hidden)[labels == label]) > _ONE_VALUE
-        stored, seen = values[part], light[part].astype(np.float64)
+        stored, seen = values[part], intensity[part].astype(np.float64)
         if (
             part.any()
             and solid
@@ -60,12 +60,12 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             nothing_seen |= labels == label
     if foreign is not None:
         nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), light)) | areas(unknown)
+    nothing_seen = with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), intensity)) | areas(unknown)
     nothing_seen &= ~hidden
     return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
 
 
-def with_rim(dark: Mask, light: F32) -> Mask:
+def with_rim(dark: Mask, intensity: F32) -> Mask:
     """Dark areas [row, col], extended on their four sides by the pixels whose intensity is mixed with the dark area.
 
     Blur, or interpolation in a shift, mixes the intensities at an edge. The median of the pixels next to the edge then
@@ -73,10 +73,10 @@ def with_rim(dark: Mask, light: F32) -> Mask:
     were not read, or the shift is by whole pixels, the next pixel is not affected.
 
     Args:
-        light: transmission [row, col]; NaN: unknown.
+        intensity: transmission [row, col]; NaN: unknown.
     """
     found, at = dark.copy(), np.arange(1, _RIM + _BEYOND + 1)
-    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(light, DARK))), at[-1], mode="edge")
+    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(intensity, DARK))), at[-1], mode="edge")
     for turn in range(4):
         area, known = np.rot90(found, turn), np.rot90(lines, turn)
         row, col = np.nonzero(area[:, :-1] & ~area[:, 1:])
@@ -99,27 +99,27 @@ def _mixed(lines: F64) -> bool:
     return bool(abs(middle) > max(_ALTERED, _SURE * median_deviation(away - middle) / np.sqrt(len(away))))
 
 
-def foreign_rows(light: F32, angles: F64) -> Mask:
+def foreign_rows(intensity: F32, angles: F64) -> Mask:
     """Rows [row] whose dark areas at borders come and go, and add more absorption than the other projections show.
 
     Args:
-        light: transmission [view, row, col], finite, of projections from all directions.
+        intensity: transmission [view, row, col], finite, of projections from all directions.
         angles: their angles in radians.
     """
-    lit = (light > DARK).any(axis=(1, 2))
-    light, angles = light[lit], angles[lit]
+    lit = (intensity > DARK).any(axis=(1, 2))
+    intensity, angles = intensity[lit], angles[lit]
     if not lit.any():
-        return np.zeros(light.shape[1], np.bool_)
-    dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
+        return np.zeros(intensity.shape[1], np.bool_)
+    dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in intensity])
     has_dark: Mask = np.any(dark, axis=2)
     rows = has_dark.any(axis=0) & ~has_dark.all(axis=0)
     with_dark = has_dark[:, rows].any(axis=1)
     if with_dark.all() or not with_dark.any():
         return np.zeros_like(rows)
-    lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
+    lines = -np.log(np.maximum(intensity[:, rows], np.float32(DARK)))
     mass = lines.sum(axis=(1, 2), dtype=np.float64)
     for view in np.flatnonzero(with_dark):
-        hidden = with_rim(dark[view], light[view])[rows]
+        hidden = with_rim(dark[view], intensity[view])[rows]
         if hidden.all():
             lines[view] = 0
         else:

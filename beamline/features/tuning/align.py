@@ -178,8 +178,8 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
         for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION)
     )
     dark = mean_counts(darks)
-    light = np.maximum(mean_counts(flats) - dark, 1.0)
-    integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / light) for frame in views]
+    intensity = np.maximum(mean_counts(flats) - dark, 1.0)
+    integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / intensity) for frame in views]
     one, other = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
     try:
         axis, tilt = align_pair(one, other)

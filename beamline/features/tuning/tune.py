@@ -182,12 +182,12 @@ def evaluate(
     pair = [frame for frame in flats if frame.exposure == used]
     (view,) = [frame for frame in frames if frame.kind is FrameKind.PROJECTION and frame.exposure == used]
     flat = mean_counts(pair)
-    light = flat - dark
-    lit = light > UNLIT * np.percentile(light, BRIGHTEST)
+    intensity = flat - dark
+    lit = intensity > UNLIT * np.percentile(intensity, BRIGHTEST)
     of_darks, of_flats = _variance(darks, np.ones(lit.shape, bool)), _variance(pair, lit)
-    typical = float(np.median(light[lit]))
-    gain = (of_flats - of_darks) / float(light[lit].mean()) if of_flats > of_darks and typical > 0 else math.nan
-    through = (view.counts - dark)[lit] / light[lit]
+    typical = float(np.median(intensity[lit]))
+    gain = (of_flats - of_darks) / float(intensity[lit].mean()) if of_flats > of_darks and typical > 0 else math.nan
+    through = (view.counts - dark)[lit] / intensity[lit]
     transmission = float(np.percentile(through, DARKEST)), float(np.median(through))
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
@@ -221,12 +221,14 @@ def evaluate(
     )
 
 
-def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: int) -> float:
+def _noise(share: float, intensity: float, gain: float, of_darks: float, n_flats: int) -> float:
     """Standard deviation of a line integral where a share of the light comes through; see the module."""
-    through = share * light
+    through = share * intensity
     if not through > 0:
         return math.inf
-    return math.sqrt((gain * through + of_darks) / through**2 + (gain * light + of_darks) / (n_flats * light**2))
+    return math.sqrt(
+        (gain * through + of_darks) / through**2 + (gain * intensity + of_darks) / (n_flats * intensity**2)
+    )
 
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
-from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, ScanContext, light
+from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, ScanContext, intensity
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
@@ -29,7 +29,7 @@ PATIENCE = 20  # flagged frames in a row after which the band is the new normal
 NARROW = 0.25  # share of the lines: if more lines jump, the beam or the sample changed
 REMAINS = 0.5  # share of the jump that remains while the band lasts
 STANDS_OUT = 0.25  # share of the jump from both neighbours: a passing edge is like one of them
-LEAST_LIGHT = 0.5  # counts
+LEAST_INTENSITY = 0.5  # counts
 
 Lines = NDArray[np.float64]
 Blocks = NDArray[np.float32]
@@ -104,7 +104,7 @@ class BandsCheck(Logged):
             )
             return CheckResult(replace(state, projection=profiles), flag)
         if frame.kind is FrameKind.FLAT:
-            counts = light(digest.preview, context)
+            counts = intensity(digest.preview, context)
             profiles, flag = self._both(state.flat, frame, (counts.mean(axis=1), counts.mean(axis=0)), digest, context)
             return CheckResult(replace(state, flat=profiles), flag)
         return CheckResult(state)
@@ -149,7 +149,7 @@ class BandsCheck(Logged):
         self, profile: Profile, means: Blocks, blocks: Blocks, dark: Blocks
     ) -> tuple[Profile, tuple[int, int, float, float] | None]:
         """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
-        lines = np.log(np.maximum(means.astype(np.float64), LEAST_LIGHT))
+        lines = np.log(np.maximum(means.astype(np.float64), LEAST_INTENSITY))
         if not profile.last or profile.last[-1].shape != lines.shape:
             if profile.change is not None and profile.change.shape == lines.shape:
                 return Profile((lines,), profile.change, profile.seen + 1, blocks), None
@@ -208,4 +208,4 @@ def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
 
 def _typical(now: Blocks, before: Blocks) -> float:
     """Median change of the log intensity along a line. The median ignores zingers."""
-    return float(np.median(np.log(np.maximum(now, LEAST_LIGHT)) - np.log(np.maximum(before, LEAST_LIGHT))))
+    return float(np.median(np.log(np.maximum(now, LEAST_INTENSITY)) - np.log(np.maximum(before, LEAST_INTENSITY))))

@@ -36,7 +36,7 @@ LEAST = 0.9  # highest useful limit; above it there are too few photons or edges
 GONE = 0.5  # share of the limit below which sharpness is back
 PATIENCE = 40  # views after which it is the new normal
 VIEWS_FOR_EDGES = 32  # whose outer edges are looked at
-DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
+DARKEST = 0.05  # share of the flat's mean: pixels with less intensity are not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,9 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
     if flat is None:
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))
     else:
-        light = flat - low
-        lit = light > DARKEST * max(float(light.mean()), 0.0)
-        scale = np.divide(1, light, out=np.zeros_like(light), where=lit)
+        intensity = flat - low
+        lit = intensity > DARKEST * max(float(intensity.mean()), 0.0)
+        scale = np.divide(1, intensity, out=np.zeros_like(intensity), where=lit)
     strip = min(STRIP, len(lines))
     shape, used = (-1, strip, lines.shape[1]), len(lines) // strip * strip
     seen, lit = ((lines - low) * scale)[:used].reshape(shape), (scale > 0)[:used].reshape(shape)
@@ -189,10 +189,10 @@ def _loss(now: float, usual: FrameScatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 
-def _ratio(light: CellValues, lit: NDArray[np.bool_]) -> float:
+def _ratio(intensity: CellValues, lit: NDArray[np.bool_]) -> float:
     """Contrast of second differences along the last axis, over that of first ones; NaN without any."""
-    n = max(light.shape[-1] - FAR, 0)
-    first, middle, last = (light[..., i : i + n] for i in (0, FAR // 2, FAR))
+    n = max(intensity.shape[-1] - FAR, 0)
+    first, middle, last = (intensity[..., i : i + n] for i in (0, FAR // 2, FAR))
     known = lit[..., :-FAR] & lit[..., FAR // 2 : -FAR // 2] & lit[..., FAR:]
     steps = (known * np.clip(each, -STEEPEST, STEEPEST) for each in (first - 2 * middle + last, last - first))
     near, far = (float(np.vdot(step[:, 1:], step[:, :-1])) for step in steps)

@@ -62,9 +62,9 @@ def _everywhere(change: SampleChange, view: CellView | None) -> float:
     """The gain, if it is equal in all fifths of the field, from left to right; otherwise 0, because it is a ghost."""
     assert view is not None
     weighted = change.residual * view.weight, view.weight
-    extra, light = (sums_of_places(part, 1, PARTS)[0] for part in weighted)
+    extra, intensity = (sums_of_places(part, 1, PARTS)[0] for part in weighted)
     brighter = math.log1p(change.gain)
-    gains = brighter - extra[light > 0] / light[light > 0]
+    gains = brighter - extra[intensity > 0] / intensity[intensity > 0]
     alike = gains.size > 0 and np.ptp(gains) < ALIKE * abs(brighter)
     return change.gain if alike else 0.0
 

@@ -35,7 +35,7 @@ LAGS = (-4, -3, -2, -1, 0)  # times the stride
 SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
 MOST_STRIDE = 3
 WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
-CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first light in the field to its last
+CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first change in the field to its last
 STRUCTURE, COMMON = 0.3, 0.05**2
 MARGIN = 1.2
 WIDER = 2.2  # as for a floater
@@ -195,19 +195,18 @@ class GhostCheck(Logged):
         trail = best_trail(peaks, FASTER * turn)
         if trail is None:
             return CheckResult(state)
-        light = abs(math.expm1(-depth))
-        level, limit = (Level.ALARM, self.alarm) if light > self.alarm else (Level.WARN, self.warn)
+        intensity = abs(math.expm1(-depth))
+        level, limit = (Level.ALARM, self.alarm) if intensity > self.alarm else (Level.WARN, self.warn)
         rows, cols = context.grid.shape
         broad = cols / COLUMNS
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
         advice = (
             "Look for something between source and detector that reflects or shadows the beam and moves with the "
-            f"stage: a broad shadow or reflection crosses the field of view. It changes the intensity by {light:.1%} "
-            f"and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster than any part of "
-            "the "
-            "sample. " + again_by(self.name)
+            "stage: a broad shadow or reflection crosses the field of view. It changes the intensity by "
+            f"{intensity:.1%} and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster "
+            "than any part of the sample. " + again_by(self.name)
         )
-        return CheckResult(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
+        return CheckResult(state, Flag(self.name, level, now, intensity, limit, advice, region, trail.first))
 
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:

@@ -25,7 +25,7 @@ PAIRS = 6  # of projections that are stated 180 degrees apart, which are compare
 UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a projection
 _AROUND = 9  # projections about the best of some that are looked at
-_LEAST_LIGHT = 1e-3  # of the beam
+_LEAST_INTENSITY = 1e-3  # of the beam
 _FAR, _NEXT = 4.0, 1.5  # steps from which two projections are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the projections: so few wrong angles are named one by one
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
@@ -66,7 +66,7 @@ class CoarseViews:
             return np.nan_to_num(cells.astype(np.float64))
         dark, flat = self.scan.beam
         beam = np.nan_to_num(flat - dark)
-        least = _LEAST_LIGHT * max(float(beam.max()), 1e-30)
+        least = _LEAST_INTENSITY * max(float(beam.max()), 1e-30)
         seen = np.nan_to_num(cells - dark)
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
@@ -81,11 +81,11 @@ class CoarseViews:
         return brightness(cells, dark, flat) > LEAST * self.scan.brightest
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether projections have light and show a sample [view]."""
+        """Whether projections have beam and show a sample [view]."""
         return np.array([self._is_lit(row) for row in rows.tolist()], np.bool_)
 
     def lit_pairs(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
-        """A few pairs of projections, evenly spread, both with light."""
+        """A few pairs of projections, evenly spread, both with beam."""
         some = spread(np.arange(first.size), PAIRS)
         some = some[self.lit(first[some]) & self.lit(second[some])]
         return list(zip(first[some].tolist(), second[some].tolist(), strict=True))

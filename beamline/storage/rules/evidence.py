@@ -31,10 +31,10 @@ VIEWS, BESIDE = 32, 2
 CELLS_ACROSS = 32  # flats are compared with projections by means of pixels: the frame is about so many wide
 WORST = 99.0  # percentile of the places of a projection that counts, so that zingers do not
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
-# share of the light of the brightest projections, in a projection's own bright part: all material leaves that much
-# open
+# fraction of the intensity of the brightest projections that the bright part of every projection exceeds, because the
+# sample does not cover the whole frame
 LEAST = 0.01
-_SUSPECT = 0.1  # share of the flats' light from which a projection is not looked at more closely
+_SUSPECT = 0.1  # share of the intensity of the flats from which a projection is not looked at more closely
 _ACROSS = 32  # pixels a side, about, by which a projection is suspected
 _TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
 
@@ -183,8 +183,8 @@ class ScanEvidence:
         kind = table.kind(row)
         if row not in self._seen:
             image = read_known(self.source, [row])[0]
-            light = self.in_counts and kind is not FrameKind.DARK
-            self._seen[row] = look_at(with_borders_filled(image) if light else image, row)
+            has_beam = self.in_counts and kind is not FrameKind.DARK
+            self._seen[row] = look_at(with_borders_filled(image) if has_beam else image, row)
         return replace(self._seen[row], kind=kind, exposure=float(table.exposures[row]))
 
     def cells(self, rows: I64) -> list[F32]:
@@ -237,10 +237,10 @@ class ScanEvidence:
         flats, darks, views = table.flats[~(exposures[table.flats] > 0)], table.darks, table.views
         if not (flats.size and darks.size and self.views_differ):
             return exposures
-        dark, light = (self.mean_cells(rows) for rows in (darks, flats))
-        lit = lit_places(light - dark)
+        dark, flat = (self.mean_cells(rows) for rows in (darks, flats))
+        lit = lit_places(flat - dark)
         seen = [self.mean_cells(row) for row in spread(views, VIEWS)[:, None]]
-        shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
+        shares = [np.percentile((cells - dark)[lit] / (flat - dark)[lit], WORST) for cells in seen if lit.any()]
         most = self.usual_exposure / max(float(np.median(shares)), 1e-30) if shares else 0.0
         of_views = exposures[views]
         for each in (of_views.max(), np.median(of_views), of_views.min()):
@@ -278,9 +278,9 @@ class ScanEvidence:
         if beam is None or not len(data):
             return uniform
         some = tuple(slice(None, None, max(1, n // _ACROSS)) for n in beam[0].shape)
-        dark, light = beam[0][some], (beam[1] - beam[0])[some]
-        lit, least = lit_places(light), _SUSPECT * max(self.brightest, 0.0)
-        shares = [np.median((view[some] - dark)[lit] / light[lit]) if lit.any() else 0.0 for view in data]
+        dark, intensity = beam[0][some], (beam[1] - beam[0])[some]
+        lit, least = lit_places(intensity), _SUSPECT * max(self.brightest, 0.0)
+        shares = [np.median((view[some] - dark)[lit] / intensity[lit]) if lit.any() else 0.0 for view in data]
         return uniform | ~(np.array(shares) >= least)
 
     def unlit(self, row: int) -> bool:
@@ -330,11 +330,11 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
 def brightness(view: F32, dark: F32, flat: F32) -> float:
     """Brightness of a projection's bright part relative to the flats, corrected for the bias by noise; from images of
     cells."""
-    light = flat - dark
-    lit = lit_places(light)
+    intensity = flat - dark
+    lit = lit_places(intensity)
     if not lit.any():
         return 1.0
-    share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
+    share = np.where(lit, (view - dark) / np.where(lit, intensity, 1), np.nan)
     noise = deviation_between_neighbours(share)
     known = share[np.isfinite(share)]
     if not known.size:

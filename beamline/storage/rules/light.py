@@ -27,7 +27,7 @@ AT_THE_ENDS = 1e-3  # share of a projection's pixels that its least and its larg
 ALIKE = 6  # pixels, at most, that had one count by chance before they were scaled
 SPREAD = 16  # grey values between them, at least, where they are whole numbers
 WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its projections, others 0.02
-REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
+REFUSE = 0.65  # half of the intensity, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
 BRIGHTER = 0.2  # line integral by which a ring that is filled again makes projections brighter than their flats
 NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of projections
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
@@ -36,7 +36,8 @@ BELOW, OF_VIEWS = (
     0.005,
     0.25,
 )  # shares of the lit places and of the projections that lie below the darks: no spots, no lost rows
-MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
+# errors of flats and darks, as fractions of the intensity, whose effect a message states if no air is visible
+BRIGHTER_FLATS, HIGHER = 0.1, 0.01
 """Limits, each with its reason."""
 
 
@@ -155,15 +156,15 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
     lit = lit_places(flat - dark)
     if not lit.any():
         return
-    light = float(np.percentile((flat - dark)[lit], BRIGHT))
-    limit = max(LIT * light, LIT_SIGMAS * place_noise(dark))
+    intensity = float(np.percentile((flat - dark)[lit], BRIGHT))
+    limit = max(LIT * intensity, LIT_SIGMAS * place_noise(dark))
     views = spread(scan.table.views, VIEWS)
     under = [(dark - view)[lit] for view in scan.cells(views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
             f"The darks are too high: in places the projections have {max(deep):.3g} counts less than the "
-            f"darks (limit {limit:.3g}; the beam gives {light:.4g} counts in the flats), but the beam can "
+            f"darks (limit {limit:.3g}; the beam gives {intensity:.4g} counts in the flats), but the beam can "
             "only add counts. Were the darks taken with beam, with another gain or exposure, or stored "
             "as sums of frames? Give --darks with the settings of the projections."
         )
@@ -201,10 +202,10 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
     of the relative change of the line integrals, and those of FISTA-TV by 0.9.
     """
     flats, views = scan.table.flats, scan.table.views
-    more = math.log1p(MORE_LIGHT)
+    more = math.log1p(BRIGHTER_FLATS)
     return (
         "Compare a density that you know: flats and darks cannot be checked, because no detector column "
-        f"shows air. If the flats are {MORE_LIGHT:.0%} too bright, every line integral is {more:.3f} too "
+        f"shows air. If the flats are {BRIGHTER_FLATS:.0%} too bright, every line integral is {more:.3f} too "
         f"large ({more / mean:.0%} of the mean), and densities are too large by up to the same fraction. "
         f"If the darks are too high by {HIGHER:.0%} of the intensity, the mean line integral is about "
         f"{HIGHER * math.expm1(mean):.2g} too large. {_exposures_in_words(scan, flats, views)}"
@@ -212,7 +213,7 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
 
 
 def _noise_ratio(scan: ScanEvidence) -> float:
-    """Variance over light of the flats, over that of the projections; 0 where it is not known.
+    """Variance divided by intensity of the flats, over that of the projections; 0 where it is not known.
 
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of projections, so that their quietest places count.
@@ -224,20 +225,20 @@ def _noise_ratio(scan: ScanEvidence) -> float:
     darks, flats, seen = (read_known(scan.source, some, rows).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0
-    light = flats.mean(axis=0) - darks.mean(axis=0)
-    light[~lit_places(light)] = np.nan
+    intensity = flats.mean(axis=0) - darks.mean(axis=0)
+    intensity[~lit_places(intensity)] = np.nan
     of_flats, of_views = (
-        np.median([_gain(image - darks.mean(axis=0), light) for image in kind]) for kind in (flats, seen)
+        np.median([_gain(image - darks.mean(axis=0), intensity) for image in kind]) for kind in (flats, seen)
     )
     ratio = float(of_flats / of_views) * len(flats) / (len(flats) - 1) if of_views > 0 else 0.0
     return ratio if math.isfinite(ratio) else 0.0
 
 
-def _gain(net: F32, light: F32) -> float:
+def _gain(net: F32, intensity: F32) -> float:
     """Variance of counts over their number, in the quietest tiles of an image; NaN if there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = np.diff(np.diff(net / light, axis=0), axis=1)
-        each = np.where(net > 0, light**2 / net, np.nan)[1:, 1:] * change**2 / 4
+        change = np.diff(np.diff(net / intensity, axis=0), axis=1)
+        each = np.where(net > 0, intensity**2 / net, np.nan)[1:, 1:] * change**2 / 4
     rows, cols = (n // TILE for n in each.shape)
     if not rows or not cols:
         return math.nan
@@ -280,10 +281,10 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
 
 # projections looked at; between them: a wide sample differs from farther sides
 _IN_A_ROW, _BESIDE = 12, np.radians(20.0)
-_AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
+_AS_GOOD = 0.8  # of the intensity of the best step, beside its flats: a sample takes as much of others
 
 
-def light_one(scan: ScanEvidence) -> Iterator[Finding]:
+def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
     """Consecutive projections have the same intensity, except for a drift; otherwise the finding names the step that
     selects one of the intensities, with its flats."""
     flats, views = scan.table.flats, scan.table.views
@@ -295,13 +296,13 @@ def light_one(scan: ScanEvidence) -> Iterator[Finding]:
         or any(np.ptp(part) != _IN_A_ROW - 1 for part in ends)
     ):
         return
-    levels = [_light_levels(scan, part) for part in ends]
+    levels = [_log_intensities(scan, part) for part in ends]
     n, change, most = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
     beside = np.median(np.abs(np.diff(scan.table.angles[ends[0]]))) <= _BESIDE
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
     yield Finding(
-        "error" if lights_in_turn(_light_levels(scan, flats[:_IN_A_ROW])) else "warning",
+        "error" if lights_in_turn(_log_intensities(scan, flats[:_IN_A_ROW])) else "warning",
         "light",
         f"The projections alternate between {n} intensities from frame to frame (from frame {views[0]} "
         f"on; {np.expm1(change):.0%} apart): thresholds, exposures or energies. A volume can use only one "
@@ -321,18 +322,18 @@ def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
     return f"{' or '.join(steps)} selects one of them, with its darks and flats (projections are counted from 0)."
 
 
-def _light_levels(scan: ScanEvidence, rows: I64) -> F64:
-    """Logarithms of the light of frames [frame]."""
+def _log_intensities(scan: ScanEvidence, rows: I64) -> F64:
+    """Logarithms of the intensity of frames [frame]."""
     darks = scan.table.darks
     dark = scan.mean_cells(darks) if darks.size else 0.0
-    light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in scan.cells(rows)]
-    return np.asarray(np.log(np.maximum(light, 1e-30)), np.float64)
+    intensity = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in scan.cells(rows)]
+    return np.asarray(np.log(np.maximum(intensity, 1e-30)), np.float64)
 
 
 def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
     """Light of the projections of a step over that of its flats; 0 where its flats differ, or are darker."""
     table = selected(scan.source, step).table
-    flats, views = (_light_levels(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
+    flats, views = (_log_intensities(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
     return share if np.ptp(flats) < most and share <= 1 + DRIFT else 0.0
 

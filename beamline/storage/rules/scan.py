@@ -24,7 +24,7 @@ from beamline.storage.rules.flag_policy import frames_flagged
 from beamline.storage.rules.light import (
     darks_beside_views,
     exposures_agree,
-    light_one,
+    one_intensity,
     references_usable,
     several_energies,
     views_scaled,
@@ -197,7 +197,7 @@ RULES: tuple[Rule, ...] = (
     Row("info", CONSTANT_DARKS, darks_computed),
     exposures_agree,
     Row("error", "energies", several_energies),
-    light_one,
+    one_intensity,
     pixels_measured,
     Row("warning", "pixels", lambda scan: (wrong := scan.source.attributes.get("pixels")) and (
         f"The type of the pixels is stated wrongly or not at all: they are {wrong}."

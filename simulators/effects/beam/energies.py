@@ -33,11 +33,11 @@ class Harmonics(ImageEffect):
         if self.share == 0:
             return image
         # The harmonic's exponential is factored out of the sum, so that large depths do not underflow.
-        light = np.exp((self.ratio - 1) * image)
-        light *= 1 - self.share
-        light += self.share
+        intensity = np.exp((self.ratio - 1) * image)
+        intensity *= 1 - self.share
+        intensity += self.share
         image *= self.ratio
-        image -= np.log(light, out=light)
+        image -= np.log(intensity, out=intensity)
         return image
 
 
@@ -81,12 +81,12 @@ class BeamHardening(ImageEffect):
     def apply(self, image: Image, shot: Shot) -> Image:
         # The most penetrating energy's exponential is factored out of the sum, so that large depths do not underflow.
         (weight, least), *others = self.terms()
-        light = np.full_like(image, weight)
+        intensity = np.full_like(image, weight)
         term = np.empty_like(image)
         for w, ratio in others:
             np.exp(np.multiply(image, least - ratio, out=term), out=term)
             term *= w
-            light += term
+            intensity += term
         image *= least
-        image -= np.log(light, out=light)
+        image -= np.log(intensity, out=intensity)
         return image

@@ -216,19 +216,19 @@ class BlackBand(ImageEffect, Anomaly):
 
     def apply(self, image: Image, shot: Shot) -> Image:
         if within(self.views, shot):
-            light = self._light(shot)
-            image[:, : light.size] *= light
+            intensity = self._intensity(shot)
+            image[:, : intensity.size] *= intensity
         return image
 
     def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
-        cols = self._light(shot).size if shot.beam and within(self.views, shot) else 0
+        cols = self._intensity(shot).size if shot.beam and within(self.views, shot) else 0
         return [AnomalyLabel(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
 
-    def _light(self, shot: Shot) -> NDArray[np.float64]:
+    def _intensity(self, shot: Shot) -> NDArray[np.float64]:
         """Share of the light in each column of the band."""
         from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
-        light = self.share + (1 - self.share) * exposed_share(from_left - self.width, self.penumbra)
-        return light[light < 1]
+        intensity = self.share + (1 - self.share) * exposed_share(from_left - self.width, self.penumbra)
+        return intensity[intensity < 1]
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class NarrowField(ImageEffect, Anomaly):
     penumbra: NotNegative = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        down, across = self._light(shot)
+        down, across = self._intensity(shot)
         first, last = _lit_fully(across)
         image[:, :first] *= across[:first]
         image[:, last:] *= across[last:]
@@ -261,7 +261,7 @@ class NarrowField(ImageEffect, Anomaly):
 
     def labels(self, shot: Shot) -> Sequence[AnomalyLabel]:
         rows, cols = shot.detector.shape
-        (top, below), (left, right) = (_lit_fully(light, VISIBLE) for light in self._light(shot))
+        (top, below), (left, right) = (_lit_fully(intensity, VISIBLE) for intensity in self._intensity(shot))
         strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
         return [
             AnomalyLabel(self.name, strip, which)
@@ -269,7 +269,7 @@ class NarrowField(ImageEffect, Anomaly):
             if shot.beam and strip[0] < strip[1] and strip[2] < strip[3]
         ]
 
-    def _light(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _intensity(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Shares of the light in each row and in each column; a pixel has their product."""
         detector = shot.detector
         across = self._between(detector.u() - self.centre[0], self.width)
@@ -283,10 +283,10 @@ class NarrowField(ImageEffect, Anomaly):
         return np.maximum(one + other - 1, 0.0)
 
 
-def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
+def _lit_fully(intensity: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
     """First pixel with at least 1 - `less` of the light, and the one after the last.
 
     The light falls off on both sides.
     """
-    full = np.flatnonzero(light >= 1 - less)
-    return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)
+    full = np.flatnonzero(intensity >= 1 - less)
+    return (int(full[0]), int(full[-1]) + 1) if full.size else (intensity.size, intensity.size)

@@ -152,25 +152,25 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
     return intensity
 
 
-def _transported(light: Image, share: float) -> Image:
+def _transported(intensity: Image, share: float) -> Image:
     """light - share x its Laplacian (in pixels, edges are mirrors): each pixel moves light to its brighter neighbours.
 
     A pixel that would give more light than it has gives all of it, in the same proportions."""
-    kept, out = np.empty_like(light), np.empty_like(light)
-    share_rows(lambda first, end: _keep(first, end, light, share, kept), light.shape)
-    share_rows(lambda first, end: _give(first, end, light, share, kept, out), light.shape)
+    kept, out = np.empty_like(intensity), np.empty_like(intensity)
+    share_rows(lambda first, end: _keep(first, end, intensity, share, kept), intensity.shape)
+    share_rows(lambda first, end: _give(first, end, intensity, share, kept, out), intensity.shape)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None:
+def _keep(begin: int, end: int, intensity: Image, share: float, kept: Image) -> None:
     """Limits what pixels of rows begin ... end give to the light that they have: writes a factor for each to `kept`."""
-    rows, cols = light.shape
+    rows, cols = intensity.shape
     for j in range(begin, end):
-        above, below = light[max(j - 1, 0)], light[min(j + 1, rows - 1)]
+        above, below = intensity[max(j - 1, 0)], intensity[min(j + 1, rows - 1)]
         for i in range(cols):
-            own = light[j, i]
-            left, right = light[j, max(i - 1, 0)], light[j, min(i + 1, cols - 1)]
+            own = intensity[j, i]
+            left, right = intensity[j, max(i - 1, 0)], intensity[j, min(i + 1, cols - 1)]
             given = share * (
                 max(above[i] - own, 0.0) + max(below[i] - own, 0.0) + max(left - own, 0.0) + max(right - own, 0.0)
             )
@@ -178,24 +178,24 @@ def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None
 
 
 @njit(cache=True, nogil=True)
-def _give(begin: int, end: int, light: Image, share: float, kept: Image, out: Image) -> None:
+def _give(begin: int, end: int, intensity: Image, share: float, kept: Image, out: Image) -> None:
     """The light of the pixels of rows begin ... end after the exchange."""
-    rows, cols = light.shape
+    rows, cols = intensity.shape
     for j in range(begin, end):
         above, below = max(j - 1, 0), min(j + 1, rows - 1)
         for i in range(cols):
             left, right = max(i - 1, 0), min(i + 1, cols - 1)
             gain = (
-                _gain(light, kept, j, i, above, i)
-                + _gain(light, kept, j, i, below, i)
-                + _gain(light, kept, j, i, j, left)
-                + _gain(light, kept, j, i, j, right)
+                _gain(intensity, kept, j, i, above, i)
+                + _gain(intensity, kept, j, i, below, i)
+                + _gain(intensity, kept, j, i, j, left)
+                + _gain(intensity, kept, j, i, j, right)
             )
-            out[j, i] = max(light[j, i] + share * gain, 0.0)  # negative by rounding only
+            out[j, i] = max(intensity[j, i] + share * gain, 0.0)  # negative by rounding only
 
 
 @njit(cache=True, nogil=True)
-def _gain(light: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
+def _gain(intensity: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
     """Light that pixel (j, i) gets from its neighbour (k, m) for a share of 1; negative if it gives light."""
-    more = light[j, i] - light[k, m]
+    more = intensity[j, i] - intensity[k, m]
     return more * (kept[k, m] if more > 0 else kept[j, i])

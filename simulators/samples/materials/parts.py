@@ -169,10 +169,10 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
         hit = (chords != 0.0).any(axis=0)  # air is exactly 0
         lengths = chords[:, hit]
         least = functools.reduce(np.minimum, (_through(lengths, mu) for mu in attenuation))
-        light = np.zeros_like(least)  # with the hardest energy factored out, against underflow
+        intensity = np.zeros_like(least)  # with the hardest energy factored out, against underflow
         for weight, mu in zip(weights, attenuation, strict=True):
-            light += weight * np.exp(least - _through(lengths, mu))
-        depth = least - np.log(light)
+            intensity += weight * np.exp(least - _through(lengths, mu))
+        depth = least - np.log(intensity)
         out[first:end][hit] = np.where(np.abs(depth) < ROUNDING, 0.0, depth)
 
     share_rows(work, (thickness.shape[1], thickness.shape[2]))

@@ -107,7 +107,7 @@ def _log(photons: float, exposure: float = 0.1, *, moving: float = 0.0, n_flats:
 
 @pytest.mark.parametrize(("photons", "moving"), [(5.0, 0.0), (14.5, 0.0), (60.0, 0.0), (60.0, 0.01)])
 def test_too_little_light_is_told_with_its_photons(photons: float, moving: float) -> None:
-    said = _log(photons, moving=moving).too_little_light(ReferenceLimits(), 0.1)
+    said = _log(photons, moving=moving).too_few_photons(ReferenceLimits(), 0.1)
     assert said is not None
     found = float(said.split("has ")[1].split(" photons")[0])
     assert found == pytest.approx(photons, rel=0.1)
@@ -116,13 +116,13 @@ def test_too_little_light_is_told_with_its_photons(photons: float, moving: float
 
 @pytest.mark.parametrize(("photons", "moving"), [(150.0, 0.0), (5000.0, 0.0), (5000.0, 0.03)])
 def test_enough_light_is_not_told_for_too_little(photons: float, moving: float) -> None:
-    assert _log(photons, moving=moving).too_little_light(ReferenceLimits(), 0.1) is None
+    assert _log(photons, moving=moving).too_few_photons(ReferenceLimits(), 0.1) is None
 
 
 def test_the_views_exposure_counts_and_one_flat_tells_nothing() -> None:
-    assert _log(60.0, exposure=0.1).too_little_light(ReferenceLimits(), 0.3) is None
-    assert _log(200.0, exposure=0.1).too_little_light(ReferenceLimits(), 0.025) is not None
-    assert _log(14.5, n_flats=1).too_little_light(ReferenceLimits(), 0.1) is None
+    assert _log(60.0, exposure=0.1).too_few_photons(ReferenceLimits(), 0.3) is None
+    assert _log(200.0, exposure=0.1).too_few_photons(ReferenceLimits(), 0.025) is not None
+    assert _log(14.5, n_flats=1).too_few_photons(ReferenceLimits(), 0.1) is None
 
 
 def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Path) -> None:

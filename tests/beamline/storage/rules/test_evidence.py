@@ -7,7 +7,7 @@ import numpy as np
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
-from beamline.storage.rules.light import darks_beside_views, exposures_agree, light_one, references_usable
+from beamline.storage.rules.light import darks_beside_views, exposures_agree, one_intensity, references_usable
 from tests.beamline.array_source import ArraySource, scan_of
 
 BALLS = (12.0, 8.0), (-14.0, 5.0)  # column off the axis, radius
@@ -34,7 +34,7 @@ def rows_read(source: ArraySource) -> list[int]:
 def test_rules_on_light_and_angles_read_each_frame_once_for_all_of_them() -> None:
     source = scan()
     evidence = ScanEvidence(source)
-    for rule in (references_usable, exposures_agree, light_one, angles_shown):
+    for rule in (references_usable, exposures_agree, one_intensity, angles_shown):
         assert not list(rule(evidence))
     read = rows_read(source)
     assert read == sorted(set(read)) and set(range(8)) <= set(read)
