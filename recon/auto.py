@@ -65,11 +65,13 @@ class Auto(Method):
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
         decide.prior = choice.prior
-        chosen, result = self._made(choice, problem, replace(control, decide=decide))
+        chosen, result = self._run_choice(choice, problem, replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": choice.reason}
         return replace(result, settings=settings, method=chosen.name, chosen=choice.reason)
 
-    def _made(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> tuple[Method, Reconstruction]:
+    def _run_choice(
+        self, choice: TrialChoice, problem: ReconProblem, control: RunControl
+    ) -> tuple[Method, Reconstruction]:
         """The chosen candidate and its result. If none was chosen, the last candidate whose library can be loaded."""
         chosen = self.candidates[-1 if choice.at is None else choice.at]
         try:
@@ -78,7 +80,7 @@ class Auto(Method):
             if choice.at is not None or len(self.candidates) == 1:
                 raise
             warnings.warn(f"{chosen.name} is not tried: {error}", stacklevel=2)
-            return replace(self, candidates=self.candidates[:-1])._made(choice, problem, control)
+            return replace(self, candidates=self.candidates[:-1])._run_choice(choice, problem, control)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> TrialChoice:
         """Choose the candidate that predicts the held-out projections best.

@@ -44,7 +44,7 @@ IN_TIME = next((name for name, entry in REGISTRY.items() if entry.several == "ti
 BASELINE = "fbp"  # Reports compare all methods with this one
 
 
-def _made(name: str, method: type[Method]) -> MethodEntry:
+def _entry(name: str, method: type[Method]) -> MethodEntry:
     """The registry's line for a method of another package."""
     if not issubclass(method, Method):
         raise ValueError("its class must derive from one of the classes in recon.base.method_kinds")
@@ -59,7 +59,7 @@ def _made(name: str, method: type[Method]) -> MethodEntry:
     return entry
 
 
-METHODS = Registry("method", REGISTRY, _made, reserved=(AUTO,))
+METHODS = Registry("method", REGISTRY, _entry, reserved=(AUTO,))
 """All methods, including those of other packages."""
 
 

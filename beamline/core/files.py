@@ -291,7 +291,7 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         path = replaceable(path)
     else:
         refuse_existing(path)
-    _remove_left(path)
+    _remove_remaining(path)
     partial = path.with_name(f".{path.name}.{_here()}-{os.getpid()}-{uuid.uuid4().hex[:4]}.partial")
     try:
         yield partial
@@ -315,7 +315,7 @@ def _here() -> str:
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
-def _remove_left(path: Path) -> None:
+def _remove_remaining(path: Path) -> None:
     """Remove the hidden files that killed programs left beside `path`."""
     with suppress(OSError):
         for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:

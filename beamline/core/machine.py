@@ -98,7 +98,7 @@ def usable_cores() -> int:
 
 def free_memory() -> int:
     """Free memory in bytes, without swapping, within the limits of the container and of `memory_limit`."""
-    free = [int(psutil.virtual_memory().available), *_left_in_cgroups(CGROUPS, OWN_CGROUP)]
+    free = [int(psutil.virtual_memory().available), *_free_in_cgroups(CGROUPS, OWN_CGROUP)]
     if (limit := memory_limit()) is not None:
         free.append(max(limit - int(psutil.Process().memory_info().vms), 0))
     return min(free)
@@ -147,7 +147,7 @@ def processor() -> str:
     return platform.processor() or platform.machine() or "unknown processor"
 
 
-def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
+def _free_in_cgroups(root: Path, own: Path) -> Iterator[int]:
     """Memory that each limit above this process leaves (cgroup v1 and v2), which psutil does not know.
 
     A container may see its own limit at the root.

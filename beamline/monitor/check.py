@@ -55,8 +55,8 @@ class ScanContext:
         follows: True if the previous projection is the neighbour in angle, so that checks may compare with it. False
             for repeated projections, at a new pass, and after projections of another file, where such checks start
             again. True for the first projection, and if `step` is not known.
-        light_left: intensity relative to the last good projection, see beamline.monitor.view.light_left; 1 if the
-            frame is not a projection.
+        light_left: intensity relative to the last good projection, see
+            beamline.monitor.view.remaining_intensity; 1 if the frame is not a projection.
         view: the frame on the grid; None if it is not a projection, has no beam, or is not the first one at its angle.
         truncated: True if the sample is wider than the field of view, in this projection or an earlier one, or if
             flats are missing.

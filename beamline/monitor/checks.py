@@ -47,7 +47,7 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
     """These checks and those of other packages."""
     found = ours
 
-    def made(name: str, kind: Callable[[], Check]) -> Check:
+    def entry(name: str, kind: Callable[[], Check]) -> Check:
         nonlocal found
         check = kind()
         if check.name != name:
@@ -56,7 +56,7 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
         found = _distinct(*found, check)
         return check
 
-    return Registry("check", {check.name: check for check in ours}, made)
+    return Registry("check", {check.name: check for check in ours}, entry)
 
 
 _MODULES = {name: f"beamline.monitor.{module}" for name, module in REGISTRY.items()}

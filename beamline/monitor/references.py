@@ -83,7 +83,7 @@ class ReferenceLimits:
 DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
 
 
-def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
+def reference_findings(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
     """Findings about darks and flats: errors if all of a kind are bad, warnings if good frames remain.
 
     A rule does not see the frames that earlier rules found. If these were all frames of a kind, later rules are not

@@ -125,7 +125,7 @@ def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: flo
     return CellView(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
 
 
-def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
+def remaining_intensity(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     """Upper bound of the intensity in nine tenths of the cells, relative to the last good projection (before the first
     one: relative to the flats).
 

@@ -24,7 +24,7 @@ from beamline.monitor.view import (
     CellView,
     dimmer_than_flats,
     grid_of,
-    light_left,
+    remaining_intensity,
     spots_of,
     view_of,
 )
@@ -207,12 +207,12 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step
     if last is not None and context.frames_per_view > 1 and _of_one_view(view.angle - last.angle, context.step):
         # It shows what the first frame of its view showed.
-        return replace(monitor, context=replace(context, grid=grid, light_left=light_left(view, last, grid)))
+        return replace(monitor, context=replace(context, grid=grid, light_left=remaining_intensity(view, last, grid)))
     follows = math.isnan(steps) or NEAREST < steps < FARTHEST
     if not follows:  # the view for comparison must be its neighbour in angle
         recent, last = (), _nearest(view.angle, monitor.kept)
         context = replace(context, spots=spots._replace(n=0))
-    left = light_left(view, last, grid)
+    left = remaining_intensity(view, last, grid)
     context = replace(context, grid=grid, light_left=left, follows=follows)
     if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
         return replace(monitor, context=context)  # no measure for the views after it

@@ -133,7 +133,7 @@ def warnings_shown(warn: Warn) -> Iterator[None]:
         yield
 
 
-Made = Mapping[str, Sequence[Any]]
+DecisionValues = Mapping[str, Sequence[Any]]
 
 
 def refuse_impossible(options: ReconOptions) -> None:
@@ -166,7 +166,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
 
 
 def deviation_of(
-    volume: Volume, method: Method, prepared: PreparedProjections, options: ReconOptions, decided: Made,
+    volume: Volume, method: Method, prepared: PreparedProjections, options: ReconOptions, decided: DecisionValues,
     control: RunControl,
 ) -> Volume | None:  # fmt: skip
     """The standard deviation of each voxel of a volume in memory; None if `control` stopped it.
@@ -186,7 +186,7 @@ def deviation_by_slabs(
     prepared: PreparedProjections,
     options: ReconOptions,
     slabs: Sequence[Slab],
-    decided: Made,
+    decided: DecisionValues,
     control: RunControl,
     say: Callable[[str], None],
 ) -> Volume | None:
@@ -217,7 +217,7 @@ def deviation_by_slabs(
 
 
 def _bars(
-    method: Method, prepared: PreparedProjections, options: ReconOptions, volume: Volume, decided: Made,
+    method: Method, prepared: PreparedProjections, options: ReconOptions, volume: Volume, decided: DecisionValues,
     control: RunControl,
 ) -> ErrorBars | None:  # fmt: skip
     views = Views(prepared.projections.data, prepared.geometry, _weights(method, prepared))

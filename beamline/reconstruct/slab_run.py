@@ -126,7 +126,7 @@ class _SlabJob:
         if (path := self.options.partial) is None:
             return None
         partial = open_partial(path)
-        refuse_other(path, _made_from(self.prepared, self.options), partial.made_from, "reconstruction")
+        refuse_other(path, _provenance(self.prepared, self.options), partial.made_from, "reconstruction")
         self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are done.")
         return partial
 
@@ -143,7 +143,7 @@ class _SlabJob:
             if slab is None:
                 continue
             record = _record(self.prepared, self.options, self.grid, self.begin)
-            made_from = _made_from(self.prepared, self.options)
+            made_from = _provenance(self.prepared, self.options)
             path, kept = self.options.partial_path, _kept(slab, decide)
             partial = create_partial(path, record, self.slabs, made_from, kept)
             partial.add(n, slab.volume.data)
@@ -219,7 +219,7 @@ def keeping(path: Path) -> Iterator[None]:
     remove(path)
 
 
-def _made_from(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
+def _provenance(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
     """All that determines the slabs."""
     weights = hashlib.sha256()
     if options.method.weighs:

@@ -9,7 +9,7 @@ from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest, check_block
 from beamline.monitor.evidence import Evidence, FrameStatistics, photons
-from beamline.monitor.references import ReferenceLimits, judge
+from beamline.monitor.references import ReferenceLimits, reference_findings
 from beamline.plan.plan import Block
 from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
@@ -45,13 +45,13 @@ class ReferenceLog:
             for block in planned
             if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }
-        found = (finding for finding in judge(self.evidence, limits) if finding.frames)
+        found = (finding for finding in reference_findings(self.evidence, limits) if finding.frames)
         return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
     def too_few_photons(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the projections, because a pixel of the open beam has few photons; or None.
         `exposure`: s, of the projections."""
-        bad = {row for finding in judge(self.evidence, limits) for row in finding.frames}
+        bad = {row for finding in reference_findings(self.evidence, limits) for row in finding.frames}
         good = self.evidence.without(bad)
         flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
         found = photons(flats, darks) if flats and darks else None

@@ -211,8 +211,9 @@ def _mark(  # type: ignore[no-untyped-def]
 ):
     """Mark the spots for `spots`, and count the pixels of spots that are too large.
 
-    Around a spot, `against` is compared with the projection before. `beam` is √intensity of the open beam, or inf
-    if there are no gaps in a sample. `errors` is the threshold divided by the median difference of two normal variables."""
+    Around a spot, `against` is compared with the projection before. `beam` is √intensity of the open beam, or inf if
+    there are no gaps in a sample. `errors` is the threshold divided by the median difference of two normal variables.
+    """
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
     left, brightest = 0, beam

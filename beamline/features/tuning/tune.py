@@ -23,7 +23,7 @@ from beamline.core.text import degrees, rounded
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.digest import digest
 from beamline.monitor.evidence import Evidence, FrameStatistics
-from beamline.monitor.references import ReferenceLimits, judge
+from beamline.monitor.references import ReferenceLimits, reference_findings
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
@@ -196,7 +196,7 @@ def evaluate(
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
     groups = tuple(references[: len(darks)]), tuple(references[len(darks) :])
-    faults = judge(Evidence(groups), limits)
+    faults = reference_findings(Evidence(groups), limits)
     known = not any(fault.rule in ("light_in_darks", "no_beam") for fault in faults)
     advised = rounded(min(used * room, longest)) if known else math.nan
     n = max(plan.flats.count, 1)

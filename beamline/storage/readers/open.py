@@ -37,7 +37,7 @@ from beamline.storage.readers.transforms import (
     cropped,
     in_parts,
     kinds_and_views,
-    only_left_out,
+    only_omits,
     real_type,
     selected,
     turned,
@@ -176,7 +176,7 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
     kinds, _ = kinds_and_views(options.frames)
     own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
-    kinds = None if only_left_out(kinds) else kinds
+    kinds = None if only_omits(kinds) else kinds
     opening = Opening(follow, own_angles, kinds is not None, options.quantity == "counts" and given == (None, None))
     with ExitStack() as opened:
 
@@ -206,7 +206,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
     kinds, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
-    kept = with_kinds(base, kinds) if kinds is not None and only_left_out(kinds) else None
+    kept = with_kinds(base, kinds) if kinds is not None and only_omits(kinds) else None
     listed = kept is None or angles is None or angles.size != kept.table.views.size  # also those that are left out
     base = base if listed or kept is None else kept
     base = with_order(

@@ -157,7 +157,7 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     return Frames(base, table=lambda known: known.without(np.concatenate(out)))
 
 
-def only_left_out(kinds: str | None) -> bool:
+def only_omits(kinds: str | None) -> bool:
     """True if the caller states no kinds of frames, only that some are left out."""
     return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
 
@@ -170,7 +170,7 @@ def _stated_keys(kinds: str, known: NDArray[np.int32]) -> NDArray[np.int32]:
             raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
         stated[first:end] = kind
     others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
-    return np.where(stated < 0, known if only_left_out(kinds) else others, stated).astype(np.int32)
+    return np.where(stated < 0, known if only_omits(kinds) else others, stated).astype(np.int32)
 
 
 def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:

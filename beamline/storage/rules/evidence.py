@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.flag import Finding
 from beamline.monitor.digest import block_means, check_block, is_valid, subsampled
 from beamline.monitor.evidence import BRIGHT, DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
-from beamline.monitor.references import ReferenceLimits, judge
+from beamline.monitor.references import ReferenceLimits, reference_findings
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource, read_known
@@ -133,7 +133,7 @@ class ScanEvidence:
             seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
             if flats or not self.taken.flats:
                 shown = Evidence((*darks, *seen), self._views_beside(views, flats))
-                found |= dict.fromkeys(judge(shown, self.asked.limits))
+                found |= dict.fromkeys(reference_findings(shown, self.asked.limits))
         rows = {row for finding in found for row in finding.frames}
         good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
         return tuple(

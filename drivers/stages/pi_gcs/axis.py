@@ -178,7 +178,7 @@ class PiGcsAxis:
             self._line.commanded = before
         if code == NOT_ALLOWED_TO_MOVE:
             raise self._may_not_move(command)
-        self._line.judge(command, code)
+        self._line.raise_error(command, code)
 
     def _may_not_move(self, command: str) -> DeviceRefused:
         """The error for code 5, with the one of its two reasons that is true."""

@@ -150,7 +150,7 @@ class GcsLine:
 
     def set(self, command: str) -> None:
         """Send a set command; raises an error if the register then contains a code."""
-        self.judge(command, self.tell(command))
+        self.raise_error(command, self.tell(command))
 
     def tell(self, command: str) -> int:
         """Send a set command; returns the code in the error register."""
@@ -167,7 +167,7 @@ class GcsLine:
         with self._register:
             code = self.read_error()
         if code in REFUSALS:
-            self.judge(command if isinstance(command, str) else f"#{command[0]}", code)
+            self.raise_error(command if isinstance(command, str) else f"#{command[0]}", code)
 
     def read_error(self) -> int:
         """Read and clear the error register; a code other than 0 becomes `fault`."""
@@ -176,7 +176,7 @@ class GcsLine:
             self.fault = code
         return code
 
-    def judge(self, command: str, code: int) -> None:
+    def raise_error(self, command: str, code: int) -> None:
         """Raise the error for a code that a command left."""
         if code:
             refused = code in REFUSALS

@@ -18,7 +18,7 @@ from beamline.core.sinks import Note
 from beamline.core.text import count, memory_size, safe_name
 
 if TYPE_CHECKING:
-    from splatline_structure.intervals import Found
+    from splatline_structure.intervals import MeasuredStructure
     from splatline_structure.materials import Spacing
     from splatline_structure.volumes import Box, ReadSlices
 
@@ -53,7 +53,7 @@ class Seen:
     box: Box
     grid: Any
     volume: Any
-    found: Found
+    found: MeasuredStructure
 
     def voxels(self, slices: slice) -> str:
         """The box in these slices of the volume, as text for the tables."""
@@ -241,7 +241,7 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     """
     import numpy as np
 
-    from splatline_structure.intervals import found_in
+    from splatline_structure.intervals import measured_structure
     from splatline_structure.materials import label_values
     from splatline_structure.numbers import Rules
 
@@ -279,7 +279,9 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     try:
-        found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure"))
+        found = measured_structure(
+            volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure")
+        )
     except ValueError as error:
         way_out = (
             f"only slices {read.slices.start}:{read.slices.stop} fit into the memory and were measured: give more "

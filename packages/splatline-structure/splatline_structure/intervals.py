@@ -80,7 +80,7 @@ class Interval:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class MeasuredStructure:
     """The structure of a volume, with the intervals of its numbers.
 
     Attributes:
@@ -106,14 +106,14 @@ class Found:
     along_all: F64 | None = None
 
 
-def found_in(
+def measured_structure(
     volume: F32,
     parts: Sequence[F32],
     count: int,
     spacing: Spacing,
     rules: Rules,
     tell: Callable[[int, int], None] = lambda n, of: None,
-) -> Found:
+) -> MeasuredStructure:
     """The structure of a volume, with the intervals of its numbers.
 
     Args:
@@ -168,7 +168,7 @@ def found_in(
         )
         for name, value in whole.numbers.items()
     }
-    return Found(whole, materials, intervals, undecided, unsure, tuple(halves), off, rules, spacing)
+    return MeasuredStructure(whole, materials, intervals, undecided, unsure, tuple(halves), off, rules, spacing)
 
 
 def _of_particles(name: str, particles: Particles) -> float:
@@ -231,7 +231,7 @@ def _judged(kind: str, interval: Interval) -> Interval:
     return replace(interval, low=low, high=high, why_not=why if high - low > WIDEST * abs(interval.value) else "")
 
 
-def with_all_slices(found: Found, slabs: Iterable[F32]) -> Found:
+def with_all_slices(found: MeasuredStructure, slabs: Iterable[F32]) -> MeasuredStructure:
     """Add fractions and surface of all slices, named `_all`, with the half-widths of the measured slices.
 
     Args:

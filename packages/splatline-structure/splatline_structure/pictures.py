@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
 from beamline.report.html import Picture
 from recon import Grid
-from splatline_structure.intervals import CAUSES, Found, Interval
+from splatline_structure.intervals import CAUSES, Interval, MeasuredStructure
 from splatline_structure.materials import F32
 from splatline_structure.volumes import ReadSlices
 
 
-def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
+def pictures_of(found: MeasuredStructure, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
     """All pictures of a page; the picture of sizes only if a particle is whole."""
     with_band = " (band: from each half of the projections)" if found.parts else ""
     shown = [
@@ -50,7 +50,7 @@ def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list
     ]
 
 
-def slices(found: Found, volume: F32, grid: Grid) -> bytes:
+def slices(found: MeasuredStructure, volume: F32, grid: Grid) -> bytes:
     """The middle slice, next to its labels and its particles."""
     figure = new_figure((WIDTH, WIDTH / 3 * grid.shape[1] / grid.shape[2] + 0.9))
     at, levels = grid.shape[0] // 2, found.materials.levels
@@ -71,7 +71,7 @@ def slices(found: Found, volume: F32, grid: Grid) -> bytes:
     return png(figure)
 
 
-def sizes(found: Found) -> bytes:
+def sizes(found: MeasuredStructure) -> bytes:
     """Cumulative volume of whole particles over diameter, with the intervals of the quantiles."""
     figure = new_figure((WIDTH, 3.2))
     axes = figure.subplots()
@@ -85,7 +85,7 @@ def sizes(found: Found) -> bytes:
     return png(figure)
 
 
-def profiles(found: Found, grid: Grid, read: ReadSlices) -> bytes:
+def profiles(found: MeasuredStructure, grid: Grid, read: ReadSlices) -> bytes:
     """The fraction of the particles' material along z (in grey: all slices), and in rings around the middle."""
     structures = [found.structure, *found.parts]
     figure = new_figure((WIDTH, 2.8))

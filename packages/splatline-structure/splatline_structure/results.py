@@ -17,7 +17,7 @@ from beamline.storage.volumes.base import Pixels
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import new_plot
 from recon import Grid, Volume
-from splatline_structure.intervals import CAUSES, Found, Interval
+from splatline_structure.intervals import CAUSES, Interval, MeasuredStructure
 from splatline_structure.numbers import unit_of
 from splatline_structure.particles import Particles
 
@@ -60,7 +60,7 @@ def particles_table(particles: Particles, grid: Grid) -> str:
     return csv_text(rows)
 
 
-def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of(found: MeasuredStructure, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The structure without its arrays, for JSON; numbers that are not determined are null."""
     particles = found.structure.particles
     return {

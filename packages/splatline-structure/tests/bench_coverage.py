@@ -14,7 +14,7 @@ import numpy as np
 from grain_scenes import BUILT_ON, BUILT_ON_TOO, F32, LOOKED_AT_ONCE, Scene
 
 import recon
-from splatline_structure.intervals import found_in
+from splatline_structure.intervals import measured_structure
 from splatline_structure.materials import materials_of
 from splatline_structure.numbers import Rules, structure_of
 from splatline_structure.volumes import Box, inscribed_box
@@ -55,7 +55,7 @@ def main(which: str, folder: Path | None) -> None:
         box = box_of(scene)
         truth, full, *halves = (np.ascontiguousarray(each[box]) for each in volumes.values())
         known = structure_of(truth, materials_of(truth, 2).thresholds, (1, 1, 1), RULES).numbers
-        found = found_in(full, halves, 2, (1, 1, 1), RULES)
+        found = measured_structure(full, halves, 2, (1, 1, 1), RULES)
         shown = []
         for name, each in found.intervals.items():
             if name in SHOWN and np.isfinite(known[name]) and not each.why_not:

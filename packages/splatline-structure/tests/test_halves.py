@@ -17,7 +17,7 @@ import recon
 from beamline import api
 from beamline.core.errors import DataError
 from splatline_structure import pictures, volumes
-from splatline_structure.intervals import found_in
+from splatline_structure.intervals import measured_structure
 from splatline_structure.study import numbers_of_views
 from splatline_structure.volumes import box_in, parts_of, read_volume
 from tests.beamline.cli.small_scan import beamline, left
@@ -89,7 +89,7 @@ def test_thirty_views_of_a_thousand_photons_across_256_columns_determine_nothing
         recon.reconstruct(data[part], scene.geometry.select(part), scene.method, grid=scene.grid).volume.data[box]
         for part in (views, views[::2], views[1::2])
     ]
-    intervals = found_in(of_views[0], of_views[1:], 2, (1, 1, 1), replace(RULES, side=0)).intervals
+    intervals = measured_structure(of_views[0], of_views[1:], 2, (1, 1, 1), replace(RULES, side=0)).intervals
     assert all("more projections or photons" in each.why_not for each in intervals.values())
 
 

@@ -10,11 +10,11 @@ from scipy import ndimage
 
 from splatline_structure.intervals import (
     SPLIT_OR_MERGED,
-    Found,
     Interval,
+    MeasuredStructure,
     _of_particles,
     difference,
-    found_in,
+    measured_structure,
     with_all_slices,
 )
 from splatline_structure.numbers import Rules, shares_of
@@ -54,11 +54,11 @@ def test_words_name_no_cause_where_none_moves_a_number() -> None:
 
 
 @pytest.fixture(scope="module")
-def found() -> Found:
+def found() -> MeasuredStructure:
     """A plane of half of the voxels."""
     volume = np.random.default_rng(0).normal(0, 0.02, (12, 20, 20)).astype(np.float32)
     volume[:, 10:] += 1
-    return found_in(volume, [], 2, (1, 1, 1), Rules(2, 1, side=0))
+    return measured_structure(volume, [], 2, (1, 1, 1), Rules(2, 1, side=0))
 
 
 def slabs(share: float) -> list[np.ndarray]:
@@ -77,7 +77,7 @@ def slabs(share: float) -> list[np.ndarray]:
     ],
 )
 def test_all_slices_have_the_half_width_of_the_middle_and_ends_of_their_own(
-    found: Found, share: float, low: float, high: float, why_not: str
+    found: MeasuredStructure, share: float, low: float, high: float, why_not: str
 ) -> None:
     middle = Interval(0.1, 0.02, 0.18, views=0.0, levels=0.08, voxels=0.0, particles=0.0, why_not="0.02 to 0.18")
     intervals = {**found.intervals, "fraction_2": middle}
@@ -86,7 +86,7 @@ def test_all_slices_have_the_half_width_of_the_middle_and_ends_of_their_own(
     assert of_all.why_not == why_not
 
 
-def test_what_determines_nothing_of_the_middle_determines_nothing_of_all_slices(found: Found) -> None:
+def test_what_determines_nothing_of_the_middle_determines_nothing_of_all_slices(found: MeasuredStructure) -> None:
     intervals = {name: Interval(0.5, why_not="no contrast") for name in found.intervals}
     of_all = with_all_slices(replace(found, intervals=intervals), slabs(0.5)).intervals["fraction_2_all"]
     assert of_all.why_not == "no contrast" and of_all.value == pytest.approx(0.5)
@@ -104,7 +104,7 @@ def blobs() -> np.ndarray:
 @pytest.mark.parametrize(("volume", "off"), [(layers(), 1e-12), (blobs(), 2e-3)])
 @pytest.mark.parametrize("n", [2, 5, 12])
 def test_fractions_and_surface_of_all_slices_are_those_of_the_whole(
-    found: Found, volume: np.ndarray, off: float, n: int
+    found: MeasuredStructure, volume: np.ndarray, off: float, n: int
 ) -> None:
     """Also where all surface lies between two slabs. Crossings within their common slices count in both of them."""
     whole = shares_of(volume.astype(np.uint8), 2, found.spacing, found.rules)

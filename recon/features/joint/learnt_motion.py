@@ -91,14 +91,14 @@ def unseen_squares(
                 return None
         if stop():
             return None
-        left.append(_squares_left(views, fit.densities(), now, grid))
+        left.append(_residual_squares(views, fit.densities(), now, grid))
     numbers = np.unique(block[held_out])
     of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in left])
-    own = _squares_left(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
+    own = _residual_squares(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
     return of_blocks / (own or 1.0)
 
 
-def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
+def _residual_squares(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
     """[view] weighted squared residual for densities [knot, z, y, x]."""
     projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
     weight = None if views.weight is None else projection_lines(views.weight)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.flag import Finding
 from beamline.monitor.digest import digest
 from beamline.monitor.evidence import Evidence, FrameStatistics, full_scale
-from beamline.monitor.references import ReferenceLimits, judge
+from beamline.monitor.references import ReferenceLimits, reference_findings
 from drivers.base.frame import FrameKind
 
 SHAPE = (64, 80)
@@ -50,7 +50,7 @@ def flats(images: Images, first: int = 10) -> list[FrameStatistics]:
 
 
 def found(*groups: list[FrameStatistics], limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
-    return judge(Evidence(tuple(map(tuple, groups))), limits)
+    return reference_findings(Evidence(tuple(map(tuple, groups))), limits)
 
 
 def rules(*groups: list[FrameStatistics], limits: ReferenceLimits | None = None) -> list[str]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beamline.monitor.view import COLS, grid_of, light_left, view_of
+from beamline.monitor.view import COLS, grid_of, remaining_intensity, view_of
 
 SHAPE = (40, 300)
 FLAT = np.full(SHAPE, 1100.0, np.float32)
@@ -54,6 +54,8 @@ def test_places_without_light_are_left_out_and_the_edges_are_those_of_the_light(
 @pytest.mark.parametrize("light", [0.02, 0.4, 1.0, 1.3])
 def test_light_left_is_the_beams_whatever_the_sample_does(light: float) -> None:
     last = view_of(counts(DEPTH), GRID, 0, 0.0, 1.0)
-    assert light_left(view_of(counts(DEPTH, light), GRID, 1, 0.1, 1.0), last, GRID) == pytest.approx(light, rel=0.01)
+    assert remaining_intensity(view_of(counts(DEPTH, light), GRID, 1, 0.1, 1.0), last, GRID) == pytest.approx(
+        light, rel=0.01
+    )
     turned = view_of(counts(DEPTH[:, ::-1], light), GRID, 1, 0.1, 1.0)
-    assert light_left(turned, last, GRID) > light
+    assert remaining_intensity(turned, last, GRID) > light

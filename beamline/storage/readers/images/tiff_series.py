@@ -104,7 +104,7 @@ class TiffSeriesSource(ScanSource):
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
             self.packing = next((self._text(name) for name in names if name.rpartition("/")[2] == _SCALES), "")
-        missing, gaps = _left_out(images)
+        missing, gaps = _omitted(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if images.half_turn:
             self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
@@ -254,7 +254,7 @@ def _refuse_more(path: Path, n: int) -> None:
         )
 
 
-def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
+def _omitted(images: NamedImages) -> tuple[tuple[int, ...], str]:
     """The places in the scan of numbers that a series leaves out, and these numbers in words."""
     numbers = images.of_series
     if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers count no images
