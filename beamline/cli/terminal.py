@@ -235,19 +235,25 @@ def trials(done: TrialReached, what: str = "trials") -> str:
     return "  ".join([*parts, one_line(done.label, SENTENCE)])
 
 
-def fit(at: FitReached) -> str:
+def fit(reached: FitReached) -> str:
     """n of N, rate, projections, Gaussians (not for iterations), residuals and remaining time."""
-    known = next((name for name in _ITERATIONS if at.unit.startswith(name)), None)
-    word = _ITERATIONS[known] if known else at.unit or ("steps" if at.n_gaussians else "iterations")
-    about = "about " if "as a rule" in at.unit or "usually" in at.unit else ""
-    parts = [f"{at.step} of {about}{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
-    parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
-    parts += [count(at.n_views, "projection")]
-    parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
-    errors = {"residual": at.residual, "residual of held-out projections": at.held_out}
+    known = next((name for name in _ITERATIONS if reached.unit.startswith(name)), None)
+    word = _ITERATIONS[known] if known else reached.unit or ("steps" if reached.n_gaussians else "iterations")
+    about = "about " if "as a rule" in reached.unit or "usually" in reached.unit else ""
+    parts = (
+        [f"{reached.step} of {about}{reached.steps} {word}"]
+        if reached.steps
+        else [f"{reached.step} {word}"]
+        if reached.unit
+        else []
+    )
+    parts += [f"{reached.per_s:.3g} {word.split()[0]}/s"] if reached.per_s else []
+    parts += [count(reached.n_views, "projection")]
+    parts += [f"{reached.n_gaussians} Gaussians"] if reached.n_gaussians else []
+    errors = {"residual": reached.residual, "residual of held-out projections": reached.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    left = "left for this step" if at.unit else "left"  # because other parts of the work may follow
-    parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} {left}"]
+    left = "left for this step" if reached.unit else "left"  # because other parts of the work may follow
+    parts += [] if reached.eta_s is None else [f"{timedelta(seconds=round(reached.eta_s))} {left}"]
     return ", ".join(parts)
 
 

@@ -63,11 +63,11 @@ def progress_events(
         if first is None or progress.step < step:  # the fit of a followed scan may start again
             first = progress
         step = progress.step
-        made, spent = progress.step - first.step, progress.seconds - first.seconds
-        rate = made / spent if made > 0 and spent > 0 else None
+        n_done, spent = progress.step - first.step, progress.seconds - first.seconds
+        rate = n_done / spent if n_done > 0 and spent > 0 else None
         eta = None
         if progress.steps:  # of this part of the work only
-            eta = seconds_left(made, progress.steps - first.step, spent)
+            eta = seconds_left(n_done, progress.steps - first.step, spent)
         elif seconds is not None and not progress.unit:
             eta = max(0.0, seconds - spent)
         sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=eta, waiting=waiting(), time=clock.now()))
@@ -191,14 +191,14 @@ def runner_of(
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     """Reconstruct in slabs or in one piece. Returns the volume (0 where no ray passed) and the projections used."""
-    made, used = _volume_of(job, decided)
-    lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), made.volume, used.geometry
+    result, used = _volume_of(job, decided)
+    lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), result.volume, used.geometry
     if lost.size and geometry.is_cone:
         share = measured_share(~np.isin(np.arange(geometry.detector_shape[0]), lost), geometry, volume.grid)
         volume.data[share <= 0] = 0
     elif lost.size and geometry.rows_show_slices and len(volume.data) == geometry.detector_shape[0]:
         volume.data[lost] = 0
-    return made, used
+    return result, used
 
 
 def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
@@ -209,18 +209,18 @@ def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPr
                 job.method, budget, prepared.geometry, prepared.box, job.channels.clock.now, job.channels.warn
             )
         job.say(words, "budget")
-        made, used = _volume_of(replace(job, options=replace(job.options, method=method, budget=None)), decided)
-        chosen = f"{made.chosen or made.method}; {words}"
-        return replace(made, chosen=chosen, settings={**made.settings, "budget": budget}), used
+        result, used = _volume_of(replace(job, options=replace(job.options, method=method, budget=None)), decided)
+        chosen = f"{result.chosen or result.method}; {words}"
+        return replace(result, chosen=chosen, settings={**result.settings, "budget": budget}), used
     if not job.slabs:
-        made = _at_once(job, decided)
-        return replace(made, outside=None), without_outside(prepared, made)
-    made = _by_slabs(job, decided)
+        result = _at_once(job, decided)
+        return replace(result, outside=None), without_outside(prepared, result)
+    result = _by_slabs(job, decided)
     if not job.options.method.weighs and prepared.view_weights is not None:
         # Only recorded, because FBP and its figures of merit treat all rays equally.
-        made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
+        result = replace(result, settings={**result.settings, "view_weights": prepared.view_weights})
         prepared = replace(prepared, view_weights=None)
-    return made, prepared
+    return result, prepared
 
 
 def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstruction:
@@ -229,16 +229,16 @@ def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstr
     return replace(result, chosen=chosen, ending=ending, checkpoint=None, at=None)
 
 
-def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
+def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Reconstruction:
     """The volume with the standard deviation of each voxel. If this is stopped, the volume without it and a warning."""
-    if made.ending.early:
+    if result.ending.early:
         job.channels.warn("No error bars were computed, because the reconstruction was stopped.")
-        return made
+        return result
     job.say("The volume is done; its error bars are computed next. Press Ctrl-C to leave them out.", "error_bars")
     method = job.options.method_for(job.prepared.geometry)
-    method = {each.name: each for each in method.alternatives}.get(made.method, method)
+    method = {each.name: each for each in method.alternatives}.get(result.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
-    given = made.volume, method, job.prepared, job.options
+    given = result.volume, method, job.prepared, job.options
 
     why = "their computation was stopped"
     try:
@@ -250,11 +250,11 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
         deviation, why = None, str(error)
     if deviation is None:
         job.channels.warn(f"No error bars were computed: {why}. The volume is complete.")
-        return made
+        return result
     factors = method_on_voxels(method, decided.made).error_bars
     assert factors is not None
     settings = dict(zip(("error_bars_spread", "error_bars_gradient"), factors, strict=True))
-    return replace(made, deviation=deviation, settings={**made.settings, **settings})
+    return replace(result, deviation=deviation, settings={**result.settings, **settings})
 
 
 def _at_once(job: Job, decided: Decisions) -> Reconstruction:

@@ -57,7 +57,7 @@ def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
 
 
 def write_result(
-    made: Reconstruction,
+    result: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -79,10 +79,10 @@ def write_result(
     """
     phases, ordinary = context.phases, prepared.centred
     phases.enter("checking the volume")
-    checked = check_volume(made, ordinary, truth, target, context, sink, clock)
+    checked = check_volume(result, ordinary, truth, target, context, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
     context = replace(context, warnings=remarks)
-    record, volumes = _record(made, checked, prepared, target, context, clock.now())
+    record, volumes = _record(result, checked, prepared, target, context, clock.now())
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
@@ -90,7 +90,7 @@ def write_result(
     if target.report is not None:
         phases.enter("report")
         try:
-            state_time = _report(made, ordinary, truth, checked, volumes, target, record.parameters, context)
+            state_time = _report(result, ordinary, truth, checked, volumes, target, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             sentence = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
             sink(Warned(sentence, time=clock.now()))
@@ -106,7 +106,7 @@ def write_result(
 
 
 def _report(
-    made: Reconstruction,
+    result: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     checked: CheckedVolume,
@@ -120,14 +120,14 @@ def _report(
     from beamline.report.html import write_report, write_timed
 
     assert target.report is not None
-    report = compose(made, prepared, truth, volumes, checked, parameters, context)
+    report = compose(result, prepared, truth, volumes, checked, parameters, context)
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(target.report, report, replace=target.replace)
-    return partial(write_timed, target.report, report, label_of(made.method))
+    return partial(write_timed, target.report, report, label_of(result.method))
 
 
 def _record(
-    made: Reconstruction,
+    result: Reconstruction,
     checked: CheckedVolume,
     prepared: PreparedProjections,
     target: OutputPaths,
@@ -141,32 +141,32 @@ def _record(
 
     volumes = {method: written(volume) for method, volume in checked.volumes.items()}
     record = ReconRecord(
-        volume=volumes[made.method],
+        volume=volumes[result.method],
         length_unit=prepared.length_unit,
         raw_file=str(context.facts.path.resolve()),
-        title=_title(made, context),
+        title=_title(result, context),
         sample=context.facts.sample or "not stated",
         time=now,
-        parameters=parameters_of(made, prepared, context),
-        metrics=checked.metrics[made.method],
-        history=history_arrays(made.history),
-        model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
-        deviation=None if made.deviation is None else written(made.deviation).data,
-        series=made.series,
+        parameters=parameters_of(result, prepared, context),
+        metrics=checked.metrics[result.method],
+        history=history_arrays(result.history),
+        model={} if result.gaussians is None else arrays_of_model(result.gaussians, prepared.geometry),
+        deviation=None if result.deviation is None else written(result.deviation).data,
+        series=result.series,
         compared=checked.metrics.get(BASELINE) if len(checked.metrics) > 1 else None,
         warnings=tuple(checked.warnings),
         hiding=checked.hiding_warning,
-        chosen=made.chosen,
+        chosen=result.chosen,
         output=target.output,
         report=target.report,
     )
     return record, volumes
 
 
-def _title(made: Reconstruction, context: ReportContext) -> str:
-    if made.series is not None:
-        return f"{made.series.n} volumes at successive times of {context.facts.name}"
-    return f"{label_of(made.method)} reconstruction of {context.facts.name}"
+def _title(result: Reconstruction, context: ReportContext) -> str:
+    if result.series is not None:
+        return f"{result.series.n} volumes at successive times of {context.facts.name}"
+    return f"{label_of(result.method)} reconstruction of {context.facts.name}"
 
 
 def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconRecord:
@@ -183,9 +183,9 @@ def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconReco
     return replace(record, volume=volume, series=series, deviation=None, model={})
 
 
-def _voxels(path: Path, at: int | None, part: Any) -> NDArray[np.float32]:
+def _voxels(path: Path, index: int | None, part: Any) -> NDArray[np.float32]:
     """Part [z, y, x] of the volume of a file, or of its volume number `at`."""
-    with opened_volume(path, at=at) as stored:
+    with opened_volume(path, at=index) as stored:
         return np.array(stored.volume.data[part])
 
 
@@ -194,12 +194,12 @@ def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
         return np.asarray(file["entry/data/data"][part])
 
 
-def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
+def parameters_of(result: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
     """All parameters of the volume, by name."""
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
     done, cols = recorded(in_order(selection), prepared.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {
-        "method": made.method,
+        "method": result.method,
         "axis_col": prepared.axis_col,
         **_axis_parameters(prepared.axis),
         "views": selection.views,
@@ -222,8 +222,8 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "replaced_fraction": float(prepared.projections.replaced),
         "filter": context.filter,
         "seed": context.seed,
-        **_flat("", made.settings),
-        **recorded_ending(made.ending),
+        **_flat("", result.settings),
+        **recorded_ending(result.ending),
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
     }

@@ -268,9 +268,9 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
     return found
 
 
-def _extent(at: NDArray[np.intp], coarse: int) -> Span:
+def _extent(positions: NDArray[np.intp], coarse: int) -> Span:
     """Fine voxels from the first to the last of these coarse ones."""
-    return int(at[0]) * coarse, (int(at[-1]) + 1) * coarse
+    return int(positions[0]) * coarse, (int(positions[-1]) + 1) * coarse
 
 
 def _widened(span: Span, n: int, coarse: int) -> Span:

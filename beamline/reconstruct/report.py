@@ -36,7 +36,7 @@ _NO_REFERENCE = (
 
 
 def compose(
-    made: Reconstruction,
+    result: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
@@ -50,8 +50,8 @@ def compose(
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
     } | {f"law: {name}": left for name, left in prepared.laws.items()}
     return Report(
-        title=f"{context.facts.sample or context.facts.name}: {label_of(made.method)}",
-        summary=_summary(made, prepared, truth, metrics, context),
+        title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
+        summary=_summary(result, prepared, truth, metrics, context),
         scan=context.facts.table,
         settings=settings,
         metrics={label_of(method): values for method, values in metrics.items()},
@@ -59,48 +59,48 @@ def compose(
         flags=[*context.facts.remarks, *context.warnings],
         done=[each.sentence for each in prepared.done.values() if each.sentence and not each.warned],
         pictures=[
-            *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
-            *_doubts(made, prepared, judgement.unexplained),
+            *(_slices(prepared, truth, volumes) if result.series is None else _several(result.series)),
+            *_doubts(result, prepared, judgement.unexplained),
             *_views(prepared),
-            *_further(made, prepared, judgement.stray, context),
+            *_further(result, prepared, judgement.stray, context),
         ],
         command=context.command,
         recipe=context.recipe,
-        footnotes=_footnotes(made, truth, metrics, judgement.unexplained),
+        footnotes=_footnotes(result, truth, metrics, judgement.unexplained),
         live_picture=context.facts.live_picture,
     )
 
 
 def _summary(
-    made: Reconstruction,
+    result: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     metrics: Mapping[str, Mapping[str, float]],
     context: ReportContext,
 ) -> str:
-    name, geometry = label_of(made.method), prepared.geometry
+    name, geometry = label_of(result.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
-    own = metrics[made.method]
+    own = metrics[result.method]
     best = best if best in own else "seconds"  # an FBP region has no figure of quality
-    shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
-    if made.series is not None:
-        seconds = made.series.seconds
+    shape, what = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
+    if result.series is not None:
+        seconds = result.series.seconds
         what = f"{len(seconds)} volumes at successive times, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
-        f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in {made.seconds:.1f} "
-        f"s; {METRICS[best].label} {formatted(best, own[best])}"
+        f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in "
+        f"{result.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
-    if BASELINE in metrics and made.method != BASELINE:
+    if BASELINE in metrics and result.method != BASELINE:
         summary += f" (FBP of the same projections: {formatted(best, metrics[BASELINE][best])})"
     if context.region is not None:
         summary += f". Only the region {context.region.region} [z, y, x] is written and shown in pictures of slices"
-    if made.chosen:
-        summary += f". Reason for the method: {made.chosen}"
+    if result.chosen:
+        summary += f". Reason for the method: {result.chosen}"
     return summary + "."
 
 
 def _footnotes(
-    made: Reconstruction,
+    result: Reconstruction,
     truth: Volume | None,
     metrics: Mapping[str, Mapping[str, float]],
     unexplained: Unexplained | None,
@@ -113,7 +113,7 @@ def _footnotes(
     of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
     footnotes = (
-        (True, f"Residual: {of_one if made.series is None else of_several}"),
+        (True, f"Residual: {of_one if result.series is None else of_several}"),
         (
             True,
             "Time of the whole command: from its start until volume and report are written, with reading and checks.",
@@ -132,13 +132,13 @@ def _footnotes(
             "the same amount.",
         ),
         (
-            views_grew(made),
+            views_grew(result),
             "Time of reconstruction of R²-Gaussian: from the first reading of the growing file to the volume, so it "
             "includes the scan.",
         ),
         (
-            bool(made.ending.resumed_from),
-            f"Time of reconstruction of {label_of(made.method)}: only the time since the fit was resumed.",
+            bool(result.ending.resumed_from),
+            f"Time of reconstruction of {label_of(result.method)}: only the time since the fit was resumed.",
         ),
         (
             unexplained is not None,
@@ -148,7 +148,7 @@ def _footnotes(
             "so that fewer voxels exceed it.",
         ),
         (
-            "stray" in metrics[made.method],
+            "stray" in metrics[result.method],
             "Mass in empty regions: fraction of the mass of the volume in voxels that at least two projections show to "
             "be empty. With few projections there are blobs and streaks in such regions.",
         ),
@@ -162,7 +162,7 @@ def _footnotes(
 
 
 def _further(
-    made: Reconstruction, prepared: PreparedProjections, stray: StrayMass | None, context: ReportContext
+    result: Reconstruction, prepared: PreparedProjections, stray: StrayMass | None, context: ReportContext
 ) -> Iterator[Picture]:
     """Pictures of stray mass, darks, flats and flagged frames, if there are any."""
     facts = context.facts
@@ -171,7 +171,7 @@ def _further(
             "Stray mass",
             "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
             "artefact: less is better.",
-            pictures.stray_mass(stray.map, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
+            pictures.stray_mass(stray.map, result.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -236,18 +236,20 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
         )
 
 
-def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None) -> Iterator[Picture]:
+def _doubts(
+    result: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None
+) -> Iterator[Picture]:
     """Pictures of missing angles, error bars, the residual, and the course of the reconstruction."""
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
-        yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(made.volume, unseen, unit))
-    if made.deviation is not None:
+        yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
+    if result.deviation is not None:
         yield Picture(
             "Error bars",
             "A slice, and the standard deviation of its voxels. In about two of three voxels the true density "
             "is within one standard deviation of the volume. Where the method smoothed fine texture away, the "
             "error may be larger.",
-            pictures.error_bars(made.volume, made.deviation, unit, kind),
+            pictures.error_bars(result.volume, result.deviation, unit, kind),
         )
     if unexplained is not None:
         at = len(unexplained.significance) // 2
@@ -256,13 +258,13 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
             "Filtered back-projection of the residual, divided by its noise. It should be even noise, with "
             "values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
             "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
-            pictures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
+            pictures.significance(unexplained.significance[at], result.volume.grid, unexplained.first + at, unit),
         )
-    if made.history:
+    if result.history:
         yield Picture(
             "Quality against time",
-            _history_caption(made),
-            quality_against_time(history_arrays(made.history)),
+            _history_caption(result),
+            quality_against_time(history_arrays(result.history)),
         )
 
 
@@ -310,12 +312,12 @@ def _of_wedges(unseen: Sequence[Wedge]) -> str:
     )
 
 
-def _history_caption(made: Reconstruction) -> str:
-    gaussians = {progress.n_gaussians for progress in made.history}
-    growing = ["views"] * views_grew(made) + ["Gaussians"] * (len(gaussians) > 1)
+def _history_caption(result: Reconstruction) -> str:
+    gaussians = {progress.n_gaussians for progress in result.history}
+    growing = ["views"] * views_grew(result) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the projections in use"]
-    if (judged := residual_curve(history_arrays(made.history))) is not None:
+    if (judged := residual_curve(history_arrays(result.history))) is not None:
         parts.append(f"the residual of {judged.views}, in dB below the data")
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
-    since = "the file was found" if views_grew(made) else "the start"
+    since = "the file was found" if views_grew(result) else "the start"
     return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."

@@ -68,17 +68,17 @@ def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -
     return prepared.ray_weights(held_out) if method.weighs or not prepared.on_disk else None
 
 
-def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
+def without_outside(prepared: PreparedProjections, result: Reconstruction) -> PreparedProjections:
     """Subtract the part of the sample outside the volume from the projections, in place, so that the volume and FBP are
     compared with the rest. Does nothing if nothing is known about the sample outside.
     """
-    if made.outside is None:
+    if result.outside is None:
         return prepared
     for first in range(0, prepared.geometry.n_views, _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        prepared.projections.data[some] -= made.outside(prepared.geometry.select(some))
+        prepared.projections.data[some] -= result.outside(prepared.geometry.select(some))
     if (held := prepared.held_out) is not None:
-        held = replace(held, data=held.data - made.outside(held.geometry))
+        held = replace(held, data=held.data - result.outside(held.geometry))
     return replace(prepared, held_out=held, inside=True)
 
 

@@ -81,10 +81,10 @@ def in_slabs(
             decide = Decisions(options.seed, decided)
             _add(partial, n, *job.made(n, run, decide, partial.n_slices_done, first=False), warn)
     else:
-        made = _as_they_come(
+        slabs_done = _as_they_come(
             lambda n: job.made(n, workers.run, Decisions(options.seed, decided), 0, first=False), missing, workers.count
         )
-        for n, (result, remark) in made:
+        for n, (result, remark) in slabs_done:
             _add(partial, n, result, remark, warn)
             job.tell(partial.n_slices_done)
     if control.decide is not None:
@@ -194,8 +194,8 @@ def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: i
         pool.shutdown(wait=not under_way, cancel_futures=True)
 
 
-def _add(partial: PartialVolume, n: int, made: Reconstruction | None, remark: str, warn: Warn) -> None:
-    partial.add(n, None if made is None else made.volume.data)
+def _add(partial: PartialVolume, n: int, result: Reconstruction | None, remark: str, warn: Warn) -> None:
+    partial.add(n, None if result is None else result.volume.data)
     if remark:
         warn(remark)
 

@@ -53,7 +53,7 @@ class CheckedVolume:
 
 
 def check_volume(
-    made: Reconstruction,
+    result: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -66,33 +66,33 @@ def check_volume(
     Checks are left out, with a remark, if they would take longer than the time limit in `context` allows, or if the
     reconstruction was stopped.
     """
-    volumes, warnings = {made.method: made.volume}, list(context.warnings)
+    volumes, warnings = {result.method: result.volume}, list(context.warnings)
 
     def tell(*sentences: str) -> None:
         for sentence in filter(None, sentences):
             sink(event_of_sentence(sentence, clock.now()))
             warnings.append(sentence)
 
-    if made.series is not None:  # each projection shows the volume at its own time
-        figures = {"residual": made.series.residual, "seconds": made.seconds}
-        return CheckedVolume(Judgement(figures), volumes, {made.method: figures}, warnings)
-    tell(_sample_radius(made, prepared), _unused_levels(made))
-    aspects, fitted = _aspects(made, prepared, context), by_name(made.method).fitted
-    time = TimeLeft(clock.now, lambda seconds: not made.ending.early and context.leaves(seconds))
+    if result.series is not None:  # each projection shows the volume at its own time
+        figures = {"residual": result.series.residual, "seconds": result.seconds}
+        return CheckedVolume(Judgement(figures), volumes, {result.method: figures}, warnings)
+    tell(_sample_radius(result, prepared), _unused_levels(result))
+    aspects, fitted = _aspects(result, prepared, context), by_name(result.method).fitted
+    time = TimeLeft(clock.now, lambda seconds: not result.ending.early and context.leaves(seconds))
     progress = context.phases.progress
     judgement = judge(
-        made.volume, prepared.views, truth,
+        result.volume, prepared.views, truth,
         held_out=prepared.views_held_out, aspects=aspects, seed=context.seed, time=time, progress=progress,
     )  # fmt: skip
-    metrics: dict[str, dict[str, float]] = {made.method: {**judgement.figures, "seconds": made.seconds}}
-    hiding = _structure(made, judgement)
-    tell(not_begun_warning(made, judgement), hiding, _stray_mass(made, judgement) if fitted else "")
-    tell(_needles(made, prepared), odd_views_warning(judgement.odd_views, prepared, context))
+    metrics: dict[str, dict[str, float]] = {result.method: {**judgement.figures, "seconds": result.seconds}}
+    hiding = _structure(result, judgement)
+    tell(not_begun_warning(result, judgement), hiding, _stray_mass(result, judgement) if fitted else "")
+    tell(_needles(result, prepared), odd_views_warning(judgement.odd_views, prepared, context))
     skipped = list(judgement.skipped)
     if fitted and target.report is not None and has_direct_method(prepared.geometry):
         if time.leaves(_FBP_WORK * judgement.seconds_of_views):
             before = clock.now()
-            fbp = _fbp(made, prepared, target, context)
+            fbp = _fbp(result, prepared, target, context)
             seconds, residual = clock.now() - before, aspects & Aspect.RESIDUAL
             of_fbp = judge(
                 fbp, prepared.views, truth, held_out=prepared.views_held_out, aspects=residual, progress=progress
@@ -101,28 +101,28 @@ def check_volume(
             metrics = {BASELINE: {**of_fbp, "seconds": seconds}, **metrics}
         else:
             skipped.append("FBP for comparison")
-    for name, figures in _beside_each_other(made, volumes, judgement, truth, context.seed).items():
+    for name, figures in _beside_each_other(result, volumes, judgement, truth, context.seed).items():
         metrics[name] |= figures
     if fitted and BASELINE in volumes:
-        tell(_lost_material(made, prepared, volumes[BASELINE]))
+        tell(_lost_material(result, prepared, volumes[BASELINE]))
     if skipped:
-        why = "the reconstruction was stopped" if made.ending.early else "the time limit was nearly reached"
+        why = "the reconstruction was stopped" if result.ending.early else "the time limit was nearly reached"
         text = f"These checks were left out, because {why}: {', '.join(skipped)}."
         sink(StateEntered("left_out", text, time=clock.now()))
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
 
-def _aspects(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Aspect:
+def _aspects(result: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Aspect:
     """The checks that this volume allows. No residual is computed if the projections show more than the volume.
 
     They show more if the volume is only a region, or if the sample is larger than the field of view and the part
     outside was not subtracted. The residual of a direct method contains the blur of its filter.
     """
-    geometry, fitted = prepared.geometry, by_name(made.method).fitted
-    if context.region is not None and made.volume.grid.shape != Grid.matching(geometry).shape:
+    geometry, fitted = prepared.geometry, by_name(result.method).fitted
+    if context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
-        show_more = SAMPLE in made.settings and not prepared.inside
+        show_more = SAMPLE in result.settings and not prepared.inside
     else:
         show_more = bool(FieldEdges.of(prepared.projections.data, geometry).beyond())
     if show_more:
@@ -130,11 +130,11 @@ def _aspects(made: Reconstruction, prepared: PreparedProjections, context: Repor
     return Aspect.STRAY | Aspect.RESIDUAL | (Aspect.FIT if fitted else Aspect(0))
 
 
-def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:
+def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str:
     """A note on the width of a sample larger than the field of view, and on the uncertainty that follows from it."""
-    if SAMPLE not in made.settings:
+    if SAMPLE not in result.settings:
         return ""
-    radius, low, high, density = (made.settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
+    radius, low, high, density = (result.settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
     unit, reach = prepared.length_unit, prepared.geometry.reach
     known, sure = "as given", ""
     if density == 1:
@@ -154,47 +154,47 @@ def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:
     )
 
 
-def not_begun_warning(made: Reconstruction, judgement: Judgement) -> str:
+def not_begun_warning(result: Reconstruction, judgement: Judgement) -> str:
     """The warning that a volume does not show the sample yet; empty if the residual is smaller than that of a uniform
     volume."""
     left, uniform = judgement.along_rows or (0.0, 0.0)
     if left < uniform or uniform == 0:
         return ""
-    last = made.history[-1] if made.history else None
+    last = result.history[-1] if result.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
-        f"Allow more time, steps or iterations: the {label_of(made.method)} volume does not show the sample yet. Its "
+        f"Allow more time, steps or iterations: the {label_of(result.method)} volume does not show the sample yet. Its "
         f"residual, {left:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} (both as a fraction of the "
-        f"variation along detector rows). The method ended after {made.seconds:.3g} s{steps}."
+        f"variation along detector rows). The method ended after {result.seconds:.3g} s{steps}."
     )
 
 
-def _structure(made: Reconstruction, judgement: Judgement) -> str:
+def _structure(result: Reconstruction, judgement: Judgement) -> str:
     """The warning about structure in the residual."""
     if judgement.unexplained is None or (share := judgement.unexplained.share) <= UNEXPLAINED_LIMIT:
         return ""
-    others = " and ".join(name for name in _COMPARED if name != made.method)
+    others = " and ".join(name for name in _COMPARED if name != result.method)
     return (
-        f"The {label_of(made.method)} volume may hide cracks, pores or edges: {share:.1%} of the sample voxels leave "
+        f"The {label_of(result.method)} volume may hide cracks, pores or edges: {share:.1%} of the sample voxels leave "
         f"structure above the noise in the residual (normally at most {UNEXPLAINED_LIMIT:.1%}). Look at 'Residual in "
         f"the projections' in the report, and compare with --method {others}."
     )
 
 
-def _stray_mass(made: Reconstruction, judgement: Judgement) -> str:
+def _stray_mass(result: Reconstruction, judgement: Judgement) -> str:
     """The warning about mass in regions that the projections show to be empty."""
     if judgement.stray is None or (share := judgement.stray.share) <= STRAY_LIMIT:
         return ""
     return (
         f"Do not trust faint features before you have looked at 'Stray mass' in the report: {share:.1%} of the mass of "
-        f"the {label_of(made.method)} volume lies in voxels that the projections show to be empty (normally at most "
+        f"the {label_of(result.method)} volume lies in voxels that the projections show to be empty (normally at most "
         f"{STRAY_LIMIT:.0%})."
     )
 
 
-def _needles(made: Reconstruction, prepared: PreparedProjections) -> str:
+def _needles(result: Reconstruction, prepared: PreparedProjections) -> str:
     """The warning about needle-shaped Gaussians."""
-    model = made.gaussians
+    model = result.gaussians
     share = needles(model, prepared.geometry).share if model is not None and model.n else 0.0
     if share <= NEEDLES_LIMIT:
         return ""
@@ -225,10 +225,10 @@ def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, con
     )
 
 
-def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPaths, context: ReportContext) -> Volume:
+def _fbp(result: Reconstruction, prepared: PreparedProjections, target: OutputPaths, context: ReportContext) -> Volume:
     """FBP of the same projections."""
     context.phases.enter("FBP for comparison", "slices")
-    grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
+    grid, on_disk = result.volume.grid, isinstance(result.volume.data, np.memmap)
     out = scratch_array(target.output.parent, grid.shape) if on_disk else None
     lines, progress = prepared.projections.data, context.phases.progress
     volume = direct(lines, prepared.geometry, grid, context.filter, progress, out)
@@ -238,14 +238,14 @@ def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPath
 
 
 def _beside_each_other(
-    made: Reconstruction, volumes: Mapping[str, Volume], judgement: Judgement, truth: Volume | None, seed: int
+    result: Reconstruction, volumes: Mapping[str, Volume], judgement: Judgement, truth: Volume | None, seed: int
 ) -> dict[str, dict[str, float]]:
     """Figures of merit that compare volumes: SNR and CNR in regions of one reference, and the air level.
 
     The reference is the ground truth, otherwise FBP of the projections; without both, SNR and CNR are not computed. The
     air level is in units of the FBP noise in air, and is given if the projections show air.
     """
-    direct_one = None if by_name(made.method).fitted else made.volume
+    direct_one = None if by_name(result.method).fitted else result.volume
     reference = truth or volumes.get(BASELINE) or direct_one
     figures: dict[str, dict[str, float]] = {name: {} for name in volumes}
     if reference is not None:
@@ -257,26 +257,26 @@ def _beside_each_other(
     return figures
 
 
-def _lost_material(made: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
+def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
     """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
     lit, seen = prepared.measured, None  # seen [z]: the detector row of the slice was in the beam
     if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):
         seen = np.asarray(lit.any(axis=1))
-    if (lost := lost_matter(made.volume.data, fbp.data, seen)) is None:
+    if (lost := lost_matter(result.volume.data, fbp.data, seen)) is None:
         return ""
     z, y, x = (f"{first}:{end}" for first, end in lost.region)
     return (
-        f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(made.method)} volume "
-        f"has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This happens, for "
-        "example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the air (--air, see "
-        "docs/corrections.md)."
+        f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(result.method)} "
+        f"volume has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This happens, "
+        "for example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the air (--air, "
+        "see docs/corrections.md)."
     )
 
 
-def _unused_levels(made: Reconstruction) -> str:
+def _unused_levels(result: Reconstruction) -> str:
     """The warning that the levels of --levels were not used."""
-    levels = made.settings.get("levels")
-    if levels is None or not np.size(levels) or "levels_of_materials" in made.settings:
+    levels = result.settings.get("levels")
+    if levels is None or not np.size(levels) or "levels_of_materials" in result.settings:
         return ""
     stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
     return (

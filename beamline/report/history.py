@@ -75,9 +75,9 @@ def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve 
     return ResidualCurve(_WORDS[name], seconds[measured], residuals[measured])
 
 
-def views_grew(made: Reconstruction) -> bool:
+def views_grew(result: Reconstruction) -> bool:
     """True if the number of projections grew during the fit."""
-    return len({progress.n_views for progress in made.history}) > 1
+    return len({progress.n_views for progress in result.history}) > 1
 
 
 def quality_against_time(

@@ -112,9 +112,9 @@ def orthogonal_slices(
     return png(figure)
 
 
-def _orthogonal_cuts(volume: Volume, at: Sequence[int]) -> list[NDArray[np.float32]]:
+def _orthogonal_cuts(volume: Volume, centre: Sequence[int]) -> list[NDArray[np.float32]]:
     """The slices across z, y and x through a voxel."""
-    return [volume.data[(slice(None),) * i + (place,)] for i, place in enumerate(at)]
+    return [volume.data[(slice(None),) * i + (place,)] for i, place in enumerate(centre)]
 
 
 def _draw_cuts(
@@ -178,9 +178,9 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     return png(figure)
 
 
-def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> bytes:
+def significance(image: NDArray[np.float32], grid: Grid, index: int, unit: str) -> bytes:
     """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
-    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", (-8.0, 8.0), "RdBu_r")
+    return _map(image, grid, unit, f"Slice {index}", "standard deviations of the noise", (-8.0, 8.0), "RdBu_r")
 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:

@@ -66,14 +66,14 @@ class UnderHdf5:
     def close(self) -> None:
         self._file.close()
 
-    def _read(self, at: int, out: memoryview) -> None:
+    def _read(self, offset: int, out: memoryview) -> None:
         """Read into `out` from byte offset `at`."""
-        self._from_disk(at, out)
+        self._from_disk(offset, out)
 
-    def _from_disk(self, at: int, out: memoryview) -> None:
+    def _from_disk(self, offset: int, out: memoryview) -> None:
         got = 0
         try:
-            self._file.seek(at)
+            self._file.seek(offset)
             while got < len(out) and (n := self._file.readinto(out[got:])):
                 got += n
         finally:
@@ -90,11 +90,11 @@ class GrowingFile(UnderHdf5):
         super().__init__(path, "r", _ENDLESS)
         self._head = head.closed(_ENDLESS)
 
-    def _read(self, at: int, out: memoryview) -> None:
-        super()._read(at, out)
-        head = self._head[at : at + len(out)]
+    def _read(self, offset: int, out: memoryview) -> None:
+        super()._read(offset, out)
+        head = self._head[offset : offset + len(out)]
         out[: len(head)] = head
-        mend_checksum(at, out)
+        mend_checksum(offset, out)
 
 
 class DiskFile(UnderHdf5):
@@ -110,15 +110,15 @@ class DiskFile(UnderHdf5):
         self._error: BaseException | None = None
         self._since: list[tuple[int, bytes]] = []
 
-    def _read(self, at: int, out: memoryview) -> None:
+    def _read(self, offset: int, out: memoryview) -> None:
         try:
-            self._from_disk(at, out)
+            self._from_disk(offset, out)
         except BaseException as error:
             self.keep(error)
         for first_byte, data in self._since:
-            first, end = max(first_byte, at), min(first_byte + len(data), at + len(out))
+            first, end = max(first_byte, offset), min(first_byte + len(data), offset + len(out))
             if first < end:
-                out[first - at : end - at] = data[first - first_byte : end - first_byte]
+                out[first - offset : end - offset] = data[first - first_byte : end - first_byte]
 
     def write(self, buffer: Any) -> int:
         data, put = memoryview(buffer).cast("B"), 0

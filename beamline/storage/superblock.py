@@ -80,11 +80,11 @@ def marked_as_being_written(path: Path) -> bool:
     return head is not None and head.open_for_writing
 
 
-def mend_checksum(at: int, read: memoryview) -> None:
+def mend_checksum(offset: int, read: memoryview) -> None:
     """Repair the checksum of a block in `read`, the bytes from `at` on that HDF5 asked for, that a kill or a loss of
     power left half written: across the end of a page of memory, each field is the new or the old one."""
     size = block_size(read)
-    if 8 < size <= len(read) and at // _PAGE != (at + size - 1) // _PAGE:
+    if 8 < size <= len(read) and offset // _PAGE != (offset + size - 1) // _PAGE:
         read[size - 4 : size] = lookup3(bytes(read[: size - 4]))
 
 

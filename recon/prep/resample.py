@@ -139,9 +139,9 @@ class Resampling:
         return (col, row) if self.distortion is None else self.distortion.seen_at(col, row)
 
 
-def _split(at: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+def _split(positions: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
     """The whole pixels of a position, and the rest in units of 1 / number of phases."""
-    steps = np.rint(at * _PHASES)
+    steps = np.rint(positions * _PHASES)
     whole = np.floor(steps / _PHASES)
     return whole.astype(np.int32), (steps - whole * _PHASES).astype(np.int16)
 

@@ -356,8 +356,8 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
         )
 
 
-def _taken_again(source: ScanSource, at: int, step: I64) -> bool:
+def _taken_again(source: ScanSource, row: int, step: I64) -> bool:
     """Whether each trigger between a frame and the next has its frame elsewhere in the file."""
     triggers, key = source.table.triggers, source.table.kinds
-    between = np.arange(triggers[at] + 1, triggers[at + 1])
-    return between.size == step - 1 and bool(np.isin(between, triggers[key == key[at]]).all())
+    between = np.arange(triggers[row] + 1, triggers[row + 1])
+    return between.size == step - 1 and bool(np.isin(between, triggers[key == key[row]]).all())

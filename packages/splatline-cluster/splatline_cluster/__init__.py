@@ -67,13 +67,13 @@ class Cluster:
         future = self.client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
         try:
             self._wait_for(future)
-            made: Reconstruction = future.result()
+            result: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
             raise WorkersLostError(
                 f"The scheduler was lost, or several workers with the same slab ({error}). They may have too little "
                 "memory: give a smaller --memory, or fewer workers. Finished slabs are kept: continue with --resume."
             ) from error
-        return made
+        return result
 
     def _wait_for(self, future: Future) -> None:
         """Return when the work is done. WorkersLostError: no worker for `patience`."""
@@ -102,8 +102,8 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
 
     data, geometry, method, settings, decide = work
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    made = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
-    return replace(made, gaussians=None, checkpoint=None, settings=dict(made.settings))
+    result = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
+    return replace(result, gaussians=None, checkpoint=None, settings=dict(result.settings))
 
 
 @contextmanager

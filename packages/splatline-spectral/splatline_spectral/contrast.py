@@ -299,10 +299,10 @@ def _victoreen(energies: Reals) -> Reals:
     return np.stack([np.ones_like(x), x**3, x**4], axis=1)
 
 
-def _top(energies: Reals, values: Reals, at: int, reach: int) -> float:
+def _top(energies: Reals, values: Reals, index: int, reach: int) -> float:
     """The energy at which the parabola through the points around a maximum is highest, within a step of the maximum."""
-    part = slice(max(at - reach, 0), at + reach + 1)
-    _, slope, bend = np.polynomial.polynomial.polyfit(energies[part] - energies[at], values[part], 2)
-    low, high = energies[max(at - 1, 0)], energies[min(at + 1, energies.size - 1)]
-    vertex = energies[at] - slope / (2 * bend) if bend < 0 else energies[at]
+    part = slice(max(index - reach, 0), index + reach + 1)
+    _, slope, bend = np.polynomial.polynomial.polyfit(energies[part] - energies[index], values[part], 2)
+    low, high = energies[max(index - 1, 0)], energies[min(index + 1, energies.size - 1)]
+    vertex = energies[index] - slope / (2 * bend) if bend < 0 else energies[index]
     return float(np.clip(vertex, low, high))

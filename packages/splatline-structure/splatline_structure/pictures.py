@@ -101,10 +101,10 @@ def profiles(found: MeasuredStructure, grid: Grid, read: ReadSlices) -> bytes:
     return png(figure)
 
 
-def _banded(axes: Any, at: NDArray[np.floating], curves: Sequence[NDArray[np.floating]]) -> None:
+def _banded(axes: Any, x: NDArray[np.floating], curves: Sequence[NDArray[np.floating]]) -> None:
     """Draw the first curve, and a band from the lowest to the highest of all curves."""
-    axes.fill_between(at, np.min(curves, axis=0), np.max(curves, axis=0), alpha=0.3)
-    axes.plot(at, curves[0])
+    axes.fill_between(x, np.min(curves, axis=0), np.max(curves, axis=0), alpha=0.3)
+    axes.plot(x, curves[0])
 
 
 def causes(intervals: Mapping[str, Interval]) -> bytes:
@@ -122,14 +122,14 @@ def causes(intervals: Mapping[str, Interval]) -> bytes:
     return png(figure)
 
 
-def curves_of(series: Mapping[str, Sequence[Interval]], at: Sequence[float], across: str) -> bytes:
+def curves_of(series: Mapping[str, Sequence[Interval]], x: Sequence[float], across: str) -> bytes:
     """Numbers with their intervals, against time or number of projections."""
     figure = new_figure((WIDTH, 2.2 * len(series)))
     for axes, (name, each) in zip(
         np.ravel(figure.subplots(len(series), 1, sharex=True, squeeze=False)), series.items(), strict=True
     ):
         low, high, value = (np.array([getattr(one, part) for one in each], float) for part in ("low", "high", "value"))
-        axes.fill_between(at, low, high, alpha=0.3)
-        axes.plot(at, np.where(np.isfinite(value), value, np.nan), "o-")
+        axes.fill_between(x, low, high, alpha=0.3)
+        axes.plot(x, np.where(np.isfinite(value), value, np.nan), "o-")
         finish(axes, across, name, size=8, grid=True)
     return png(figure)

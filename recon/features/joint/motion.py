@@ -79,19 +79,19 @@ class Motion:
         return np.asarray(np.multiply.outer(self._shares[time], some))
 
 
-def _spline(at: F64, knots: int) -> F64:
+def _spline(times: F64, knots: int) -> F64:
     """Natural cubic splines through `knots` evenly spaced knots in 0 to 1, [place, knot].
 
     For two knots they are straight lines, for one knot the constant 1.
     """
     if knots == 1:
-        return np.ones((at.size, 1))
+        return np.ones((times.size, 1))
     even = np.linspace(0, 1, knots)
     if knots == 2:
-        return np.stack([1 - at, at], 1)
+        return np.stack([1 - times, times], 1)
     from scipy.interpolate import CubicSpline  # loading takes half a second
 
-    return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(at))
+    return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(times))
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,9 +114,9 @@ class TimedVolumes:
         return volume_slices(moved(volume_lines(before), now.at(0)))
 
 
-def hats(at: ArrayLike, knots: F64) -> F64:
+def hats(times: ArrayLike, knots: F64) -> F64:
     """Weights [time, knot] for linear interpolation between evenly spaced knots; constant beyond the ends."""
-    place = np.interp(np.atleast_1d(at), knots, np.arange(knots.size))
+    place = np.interp(np.atleast_1d(times), knots, np.arange(knots.size))
     return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
 
 

@@ -172,8 +172,8 @@ class Material:
     def _element(self, z: int, energies: Reals) -> Reals:
         """Mass attenuation of an element in cm²/g."""
 
-        def table(at: Reals) -> Reals:
-            return np.array([xraylib.CS_Total(z, float(energy)) for energy in at])
+        def table(energies: Reals) -> Reals:
+            return np.array([xraylib.CS_Total(z, float(energy)) for energy in energies])
 
         if self.state_of_charge is None or z not in K_EDGES:
             return table(energies)

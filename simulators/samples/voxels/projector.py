@@ -124,9 +124,9 @@ def _upright(
 
 
 @njit(cache=True, nogil=True)
-def _columns(at: float, step: float, n: int, cols: int) -> tuple[int, int]:
+def _columns(position: float, step: float, n: int, cols: int) -> tuple[int, int]:
     """Columns start ... stop - 1 with 0 < at + i step < n + 1, the padded line's inside."""
-    one, other = (_EDGE - at) / step, (n + 1 - _EDGE - at) / step
+    one, other = (_EDGE - position) / step, (n + 1 - _EDGE - position) / step
     start, stop = max(0.0, min(min(one, other), 1.0 * cols)), max(-1.0, min(max(one, other), cols - 1.0))
     return math.ceil(start), math.floor(stop) + 1
 
