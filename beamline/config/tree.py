@@ -23,7 +23,7 @@ from recon.base.findings import KeyPath, Schema, faults_of
 ENVIRONMENT_PREFIX = "BEAMLINE_"
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
-"""Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
+"""Errors of PyYAML next to its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 
 _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
 """Of a YAML text: characters, values (as often as aliases repeat them), groups within groups, digits of a number."""

@@ -25,7 +25,7 @@ PART = "part-{}"  # The folder of a later part of a scan that was resumed, in th
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
 RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
-JOINED = "joined.h5"  # The file of all parts of a run, beside the first one
+JOINED = "joined.h5"  # The file of all parts of a run, next to the first one
 CONFIG = "config.resolved.yaml"
 TABLE = ".csv"  # Suffix of a table of scans
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
@@ -181,7 +181,7 @@ def text_in(path: Path, largest: int = TEXT) -> str:
 
 
 def decoded(content: bytes, errors: str = "strict") -> str:
-    """Text with \n for any end of line, by its byte-order mark where it has one.
+    """Text with \n for any end of line, by its byte-order mark if it has one.
 
     Args:
         errors: "replace" what is no text; "strict": UnicodeDecodeError.

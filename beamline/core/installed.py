@@ -11,7 +11,7 @@ from types import FrameType, ModuleType, TracebackType
 
 
 def config_folder() -> Path:
-    """The folder of the configurations that come with the package: installed, or beside the packages of a checkout."""
+    """The folder of the configurations that come with the package: installed, or next to the packages of a checkout."""
     installed = Path(__file__).parents[1] / "configs"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
 
@@ -128,7 +128,7 @@ def _installed(file: str) -> bool:
 
 
 def _origin(name: str) -> str | None:
-    """The file that Python loads for a module, or has loaded; None where it has none."""
+    """The file that Python loads for a module, or has loaded; None if it has none."""
     if name in sys.modules:
         return getattr(sys.modules[name], "__file__", None)
     with suppress(ImportError):  # of a finder that forbids the library

@@ -26,7 +26,7 @@ class Need:
         seconds: None: not known before it is tried.
         least_seconds: where the data choose what takes least; otherwise `seconds`.
         output: bytes of the result.
-        scratch: bytes on its disk while it works, beside the result.
+        scratch: bytes on its disk while it works, next to the result.
     """
 
     memory: int | None = None

@@ -69,7 +69,7 @@ def ask_operator(request: str) -> None:
             "operator", "there is no terminal to ask the operator", request=request, advice=advice, state=_STATE
         )
     try:
-        # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
+        # A read from a terminal continues after a signal, so that a stop takes effect only when it returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
         click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
     except click.Abort as error:  # the end of input

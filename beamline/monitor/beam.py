@@ -127,7 +127,7 @@ class BeamCheck(Logged):
             return CheckResult(replace(state, drifting=state.drifting + 1))
         if gone:
             return CheckResult(replace(state, drifting=0, flagged_drift=0.0))
-        level = Level.INFO if state.flagged_drift else Level.WARN  # a view is no worse for a drift that goes on
+        level = Level.INFO if state.flagged_drift else Level.WARN  # a view is no worse for a drift that continues
         advice = f"Usually nothing to do: air is {_size(score)} than in the flats. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
         return CheckResult(replace(state, drifting=0, flagged_drift=score), flag)

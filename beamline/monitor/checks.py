@@ -35,7 +35,7 @@ REGISTRY = {  # class of a check: its module in this folder
 
 
 def _distinct(*checks: Check) -> tuple[Check, ...]:
-    """The checks; ValueError where two share a name or a bit, or a bit is outside the mask."""
+    """The checks; ValueError if two share a name or a bit, or a bit is outside the mask."""
     names, bits = {check.name for check in checks}, {check.bit for check in checks}
     if min(len(names), len(bits)) < len(checks) or not bits <= set(BITS):
         taken = ", ".join(f"{check.name} {check.bit}" for check in checks)

@@ -151,7 +151,7 @@ class TimingCheck(Logged):
             )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
-            return CheckResult(after)  # armed anew, for another pass, or the same one again, or after a pause
+            return CheckResult(after)  # armed again, for another pass, or the same one again, or after a pause
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
             return CheckResult(after)

@@ -25,7 +25,7 @@ from recon.base.setting import setting
 EVERY = math.radians(5)  # radians between kept views
 MOST = 36  # of them: half a turn
 BESIDE = 1.01  # steps from the angle sought to a view, at most; a hundredth is rounding
-REACH = 2.0  # cells that the rim may move within these: the kept view goes on by its velocity
+REACH = 2.0  # cells that the rim may move within these: the kept view continues by its velocity
 LATER = 8  # views after the kept one at least
 LEAST_SHIFT, LEAST_REMAINDER, LEAST_AXIS = 0.05, 0.5, 0.25
 """Of a cell: the limits on large frames, where a cell is many pixels wide. With them one clean scan (the 44th, by its
@@ -205,7 +205,7 @@ class OppositeCheck(Logged):
     def _moved(self, fit: ViewFit, row: int, other: str, context: ScanContext) -> Flag | None:
         assert context.grid is not None
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
-        # The first pair, which gave the axis, had views beside the sample's way, too.
+        # The first pair, which gave the axis, had projections off the sample's path, too.
         shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
         moves = self.warn, LEAST_SHIFT * cell, SIGMAS * fit.sigma, shaken
         limits = max(fit.unsure, *moves), max(fit.unsure, self.changed, LEAST_REMAINDER * cell)

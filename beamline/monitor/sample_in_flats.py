@@ -60,7 +60,7 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
                 f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {beside}, but only "
                 f"by {like:.2g} from the projection in frame {views[nearest].row}."
             )))  # fmt: skip
-    if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
+    if len(odd) < len(compared):  # else a drift of the beam: each is like the views next to it
         yield from odd
 
 

@@ -32,7 +32,7 @@ _REFERENCES = 8  # darks and flats that are averaged
 _VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
 _MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
 _CENTRED = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
-_BESIDE = 2  # rows beside that of the slice, by which the axis is found
+_BESIDE = 2  # rows next to that of the slice, by which the axis is found
 _MISSES = math.radians(2)  # by which a pair may miss 180 degrees
 
 

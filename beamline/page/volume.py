@@ -262,7 +262,7 @@ class ShownVolume:
         return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._at(time).ready)
 
     def histogram(self, time: int = 0) -> dict[str, list[float]]:
-        """Centres of 256 bins over the values, and voxels in each (of a sample, where there are many)."""
+        """Centres of 256 bins over the values, and voxels in each (of a sample, if there are many)."""
         sample = self._sample(time).astype(np.float64)  # in float32 a wide range overflows
         ends = (float(sample.min()), float(sample.max())) if sample.size else (0.0, 1.0)
         counts, edges = np.histogram(sample, BINS, apart(*ends))

@@ -123,7 +123,7 @@ MOST_PASSES = 100
 ROOM = 1.1
 """Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
 CLOSING = 20_000_000
-"""Bytes that a file may take to be closed, with its /exchange view: a scan with less beside its frames pauses."""
+"""Bytes that closing a file may need, with its /exchange view. A scan pauses if its frames and these do not fit."""
 MARGIN = 1.01
 """Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
 

@@ -119,7 +119,7 @@ def _slices(slabs: Sequence[Slab]) -> int:
 def _seconds(
     options: ReconOptions, method: Method, geometry: Geometry, missing: Sequence[Slab], now: Clock
 ) -> tuple[float, float] | None:
-    """The least and the most seconds of these slabs; None where they are not known before the method is tried."""
+    """The least and the most seconds of these slabs; None if they are not known before the method is tried."""
     if not missing:
         return 0.0, 0.0
     grid = Grid.matching(geometry)

@@ -190,7 +190,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs or in one piece. Returns the volume (0 where no ray passed) and the projections used."""
+    """Reconstruct in slabs or in one piece. Returns the volume (0 if no ray passed) and the projections used."""
     result, used = _volume_of(job, decided)
     lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), result.volume, used.geometry
     if lost.size and geometry.is_cone:

@@ -305,7 +305,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 
 def _refuse_several_volumes(options: ReconOptions) -> None:
-    """Raises ConfigError where options of one volume stand beside a method that makes several."""
+    """Raises ConfigError if options of one volume stand next to a method that makes several."""
     if options.method.volumes > 1:
         target = options.target
         if target.written and target.output.suffix.lower() not in SUFFIXES:
@@ -337,7 +337,7 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
 
 
 def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
-    """Raises DataError for an unfinished scan, unless it is to be taken as it is, and where a chunk of its file cannot
+    """Raises DataError for an unfinished scan, unless it is to be taken as it is, and if a chunk of its file cannot
     be unpacked in the memory."""
     if not (source.finished or options.unfinished):
         raise DataError(

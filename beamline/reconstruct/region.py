@@ -170,7 +170,7 @@ _EDGE = 0.04  # share of the columns, on either side, that show air
 _NOISE, _SHARE = 6.0, 0.01  # deviations of the air's pixels, and share of the deepest line integrals: less is air
 _DEEPEST = 99.5  # percentile of the line integrals
 _SEEN = 0.2  # share of the views that show matter in a row with matter
-_WITHIN = 0.9  # share of the views in whose shadow a voxel of the sample lies; all, but for noise
+_WITHIN = 0.9  # share of the views in whose shadow a voxel of the sample lies; all, except for noise
 _BANDS = 24  # of rows, whose shadows are taken together
 _MARGIN, _COARSE = 0.04, 2  # of the volume's side; coarse voxels
 
@@ -256,7 +256,7 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
         shadow = material[:, band].any(axis=1)
         first = np.where(shadow, cols, cols.size).min(axis=1)
         last = np.where(shadow, cols, -1).max(axis=1)
-        # A shadow at the edge may go on beyond it; a view without any does not say where the sample is.
+        # A shadow at the edge may continue beyond it; a view without any does not say where the sample is.
         unknown = last < 0
         low = np.where((first <= 1) | unknown, -np.inf, first - 1 - geometry.axis_col)
         high = np.where((last >= cols.size - 2) | unknown, np.inf, last + 1 - geometry.axis_col)

@@ -267,9 +267,9 @@ def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: V
     z, y, x = (f"{first}:{end}" for first, end in lost.region)
     return (
         f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(result.method)} "
-        f"volume has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This happens, "
-        "for example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the air (--air, "
-        "see docs/corrections.md)."
+        f"volume has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This "
+        "happens, for example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the "
+        "air (--air, see docs/corrections.md)."
     )
 
 

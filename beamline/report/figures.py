@@ -157,7 +157,7 @@ def panels(
 
     Args:
         across, down: widths and heights of the panels, inches.
-        left, gap, right: beside the first column, between columns, and beside the last, inches; BAR: room for a bar.
+        left, gap, right: next to the first column, between columns, and next to the last, inches; BAR: room for a bar.
     """
     width = left + sum(across) + gap * (len(across) - 1) + right
     height = _TOP + sum(down) + _BELOW * len(down)

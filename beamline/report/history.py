@@ -86,7 +86,7 @@ def quality_against_time(
     """A fit against time: loss and residuals, the residual as dB, number of views and Gaussians.
 
     Args:
-        history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
+        history: equally long "seconds", "loss", and if known "residual", "held_out", "n_views", "n_gaussians".
     """
     seconds = history["seconds"]
     growing = [

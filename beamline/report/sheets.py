@@ -103,7 +103,7 @@ class SliceSheet:
 
 
 def _differ_most(images: Sequence[F32]) -> tuple[slice, slice]:
-    """The square in which images of one size differ most; all of them where they are small or differ in size."""
+    """The square in which images of one size differ most; all of them if they are small or differ in size."""
     shape = images[0].shape
     if max(shape) <= _CROP or any(image.shape != shape for image in images):
         return slice(None), slice(None)
@@ -120,7 +120,7 @@ class FlaggedFrame:
     """A frame for the sheet.
 
     Attributes:
-        image: [row, col] counts, binned where there are many.
+        image: [row, col] counts, binned if there are many.
         extent: (rows, cols) of the whole frame, in pixels of the detector.
         reasons: a line for each flag.
         regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
@@ -166,7 +166,7 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
     """Mean darks and flats as PNG, row 0 at the top, each in its own grey window with its scale.
 
     Args:
-        images: [row, col] by title, counts or ratios, binned where they are large.
+        images: [row, col] by title, counts or ratios, binned if they are large.
         shape: (rows, cols) of the detector.
     """
     rows, cols = shape

@@ -138,7 +138,7 @@ class FlownTrain:
 
     @property
     def last_due(self) -> float:
-        """When the last trigger of the pass is due, in s since the Unix epoch; inf where that is not known."""
+        """When the last trigger of the pass is due, in s since the Unix epoch; inf if that is not known."""
         ledger, train = self.so_far, self.ledger.train
         if ledger.last >= 0:
             return ledger.phase + (train.n - 1 - ledger.last) * ledger.period

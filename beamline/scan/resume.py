@@ -1,8 +1,8 @@
 """Resume: continues a run that was killed, failed, stopped or aborted; the missing frames go into a new file.
 
 Existing files are only read (after `recover`, if their process was killed), so that stored frames are never at risk.
-The new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first file
-joins them all.
+The new part gets a folder like that of a run, inside the folder of the run: `part-2`, `part-3` ... The file `joined.h5`
+next to the first file joins all parts.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class UnderHdf5:
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        """Read into a buffer; zeros where nothing was written yet."""
+        """Read into a buffer; zeros if nothing was written yet."""
         out = memoryview(buffer).cast("B")
         self._read(self._at, out)
         return len(out)

@@ -204,7 +204,7 @@ def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
-    """[check, 4] the box around regions [frame, check, 4]; -1 where no frame has one."""
+    """[check, 4] the box around regions [frame, check, 4]; -1 if no frame has one."""
     there = regions[..., :1] >= 0
     low = np.where(there, regions, np.iinfo(np.int32).max).min(axis=0)
     high = regions.max(axis=0)

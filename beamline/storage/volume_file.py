@@ -79,7 +79,10 @@ def read_volume(
 def axes_of(
     file: h5py.File, dataset: str | None, unit: str = "mm"
 ) -> tuple[tuple[float, float, float] | None, tuple[float, ...] | None]:
-    """Spacing and first coordinates (z, y, x) from the arrays z, y, x beside a dataset; None without them in `unit`."""
+    """Spacing and first coordinates (z, y, x) from the arrays z, y, x next to a dataset.
+
+    None: the arrays are missing, or are not in `unit`.
+    """
     node = None if dataset is None else file.get(dataset)
     axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
     if not axes or any(not isinstance(axis, h5py.Dataset) or axis.size < 2 for axis in axes):
@@ -134,7 +137,7 @@ _PICTURES = (".png", ".bmp", ".jpg", ".jpeg")
 
 def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     """The slices of a folder, in the order of the numbers in their names, and the edges of a voxel in mm, if the log of
-    NRecon beside them states one.
+    NRecon next to them states one.
 
     Slices are the TIFFs, or else the grey pictures, whose names differ in numbers alone; a single one of another name,
     such as a preview, is none.

@@ -67,7 +67,7 @@ def check_output(scan: Scan, out: Path) -> None:
 def write_scan(
     scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
 ) -> SimulatedScan:
-    """Compute every frame of `scan` and write it to `out`, with the labels beside it, even if it ends early.
+    """Compute every frame of `scan` and write it to `out`, with the labels next to it, even if it ends early.
 
     Args:
         should_stop: called before each frame; true ends the scan with a valid file and labels.

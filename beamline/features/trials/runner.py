@@ -106,7 +106,7 @@ def opened_scan(
 
 
 def _run_and_show(slices: SliceSheet, data: TrialScan, trial: MethodTrial) -> tuple[Outcome, F32 | None]:
-    """The outcome and the volume [z, y, x] of a trial; None where it failed."""
+    """The outcome and the volume [z, y, x] of a trial; None if it failed."""
     outcome, volume = run_trial(trial, data)
     if volume is not None and trial.shown:
         slices.add(trial.shown, volume, "" if trial.choice is None else trial.choice.family, trial.method)
@@ -119,7 +119,7 @@ def _run_all(
     """Run the trials in turn, and write the table to a CSV file after each; after Ctrl-C it is `stopped`.
 
     Args:
-        run: the outcome and the volume [z, y, x] of a trial; None where it failed.
+        run: the outcome and the volume [z, y, x] of a trial; None if it failed.
 
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.

@@ -37,7 +37,7 @@ SHORTER = (1.0, 1 / 8, 1 / 64)  # of the configured exposure: one does not satur
 TARGET = 0.8  # share of the range for the brightest pixels: room for top-up and drift; more light gains 1/10 of noise
 BRIGHTEST = 99.9  # percentile of the flat that must not saturate
 DARKEST = 1.0  # percentile of the transmission that is the darkest part
-UNLIT = 0.05  # share of the brightest light: pixels with less are beside the beam
+UNLIT = 0.05  # fraction of the highest intensity: pixels with less are outside the beam
 BLOCK = 4  # pixels a side, whose mean has little noise
 ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 standard deviations: more is not noise
 
@@ -52,11 +52,11 @@ class Tuning:
     # dark, dark_noise: median of the darks, standard deviation of a pixel
     dark: float
     dark_noise: float
-    # flat, brightest: median of the flat where there is beam, and 99.9th percentile of its means of 4 x 4 pixels
+    # flat, brightest: median of the flat if there is beam, and 99.9th percentile of its means of 4 x 4 pixels
     flat: float
     brightest: float
     saturated: float  # fraction of its pixels that are saturated at the configured exposure
-    gain: float  # counts of a photon; NaN where the frames have no noise
+    gain: float  # counts of a photon; NaN if the frames have no noise
     transmission: tuple[float, float]  # of the view, at its darkest hundredth and in the median
     # advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
     # where darks have light or flats none
@@ -66,7 +66,7 @@ class Tuning:
     longest: float  # exposure that the period and the camera allow
     angle: float  # of the view, rad
     faults: tuple[str, ...]  # what is wrong with darks and flats at the configured exposure
-    x_rays: float = math.nan  # X-ray photons a count; NaN where optics.light_path is not known
+    x_rays: float = math.nan  # X-ray photons a count; NaN if optics.light_path is not known
 
     @property
     def photons(self) -> float:

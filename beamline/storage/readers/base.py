@@ -105,7 +105,7 @@ class ScanSource(ABC):
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
-        """Name and content of a text file with angles beside the frames, or None."""
+        """Name and content of a text file with angles next to the frames, or None."""
         return None
 
     @property

@@ -19,7 +19,7 @@ from recon.base.views import spread
 _LOOKED_AT = 3  # frames of a kind
 _SATURATED = 1e-3  # of the pixels, from which light, and no gap, is at the end of a type; as the limit of flats
 _UNLIT = 0.05  # of the bright part of a flat: darker pixels tell little of the noise of light
-_PHOTONS = 0.02  # by which the variance of counted photons may differ from their mean, beside its own error
+_PHOTONS = 0.02  # by which the variance of counted photons may differ from their mean, in addition to its own error
 _ERRORS = 2.5  # standard deviations of that error
 _FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
 
@@ -90,7 +90,7 @@ def counts_photons(source: ScanSource) -> bool:
     """True if flats fluctuate like counted photons, with the variance of their mean, so that they have no offset.
 
     For a camera, variance over mean is its gain times the share of the counts that comes from light. This share is
-    smaller where there is less light, for example in dark corners. Therefore the brighter and the darker half of the
+    smaller if there is less light, for example in dark corners. Therefore the brighter and the darker half of the
     pixels must give the same result.
     """
     rows = source.table.flats[: 2 * _LOOKED_AT]

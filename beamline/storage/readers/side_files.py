@@ -26,7 +26,7 @@ from beamline.core.text import NUMBER, with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
 
-_MOST = 20  # files beside a scan that are looked at
+_MOST = 20  # files next to a scan that are looked at
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 
 
 def reconstructed_pixel_mm(log: Path) -> float | None:
-    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None if it states none."""
+    """Edge of a voxel in mm by the log that NRecon writes next to its slices; None if it states none."""
     with suppress(Exception):  # whatever the log of another program holds
         edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
         return edge if 0 < edge < _LARGEST else None
@@ -275,7 +275,7 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
 
 
 def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection: as listed beside the file, or in equal steps; None if nothing is stated."""
+    """Degrees of each projection: as listed next to the file, or in equal steps; None if nothing is stated."""
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)

@@ -301,7 +301,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 WRAPPED = "wrapped-numbers"  # a rule
 _END_PART, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
-_SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
+_SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image continues there
 
 
 def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> int:

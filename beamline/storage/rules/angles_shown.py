@@ -28,7 +28,7 @@ _AROUND = 9  # projections about the best of some that are looked at
 _LEAST_INTENSITY = 1e-3  # of the beam
 _FAR, _NEXT = 4.0, 1.5  # steps from which two projections are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the projections: so few wrong angles are named one by one
-_MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
+_MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 if they spread evenly, as of frames taken in passes
 # of some projections: as many look like others that are far from them, if the frames were in another order
 _MOST = 0.75
 _STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps

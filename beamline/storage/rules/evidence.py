@@ -150,7 +150,7 @@ class ScanEvidence:
         return self._readable(np.array(sorted(chosen), np.int64))
 
     def _readable(self, rows: I64) -> tuple[FrameStatistics, ...]:
-        """The frames, of these rows, that can be read; all, where none can."""
+        """The frames, of these rows, that can be read; all, if none can."""
         read = tuple(self.frame(row) for row in rows.tolist())
         return tuple(frame for frame in read if frame.row not in self.source.unreadable) or read
 

@@ -213,7 +213,7 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
 
 
 def _noise_ratio(scan: ScanEvidence) -> float:
-    """Variance divided by intensity of the flats, over that of the projections; 0 where it is not known.
+    """Variance divided by intensity of the flats, over that of the projections; 0 if it is not known.
 
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of projections, so that their quietest places count.
@@ -281,7 +281,7 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
 
 # projections looked at; between them: a wide sample differs from farther sides
 _IN_A_ROW, _BESIDE = 12, np.radians(20.0)
-_AS_GOOD = 0.8  # of the intensity of the best step, beside its flats: a sample takes as much of others
+_AS_GOOD = 0.8  # of the intensity of the best step, next to its flats: a sample takes as much of others
 
 
 def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
@@ -331,7 +331,7 @@ def _log_intensities(scan: ScanEvidence, rows: I64) -> F64:
 
 
 def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
-    """Light of the projections of a step over that of its flats; 0 where its flats differ, or are darker."""
+    """Light of the projections of a step over that of its flats; 0 if its flats differ, or are darker."""
     table = selected(scan.source, step).table
     flats, views = (_log_intensities(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))

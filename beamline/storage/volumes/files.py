@@ -204,7 +204,7 @@ class Npy:
 
 
 def _header(path: Path) -> tuple[bytes, int]:
-    """The header of an NRRD and where its data begin; (b"", 0) where it has none."""
+    """The header of an NRRD, and where its data begin; (b"", 0) if it has none."""
     with path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)
     end = head.find(b"\n\n")

@@ -5,15 +5,15 @@ frame and only grow afterwards.
       instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
                                 count_time (s), x_pixel_size, y_pixel_size, distance (mm), field_of_view
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
-      instrument/filter         NXattenuator: type, where there is a filter
-      instrument/monochromator  NXmonochromator: energy (keV), where there is a monochromator
+      instrument/filter         NXattenuator: type, if there is a filter
+      instrument/monochromator  NXmonochromator: energy (keV), if there is a monochromator
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
       frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
                                 of its angle, image key and count_time (record_checksums); its flags,
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
-      record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
+      record/beam               NXlog: time, value of the beam monitor, if there is one (written at the end)
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
       record/parts              of joined.h5: name and frames of each file that it draws from
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance

@@ -303,7 +303,7 @@ class NXtomoWriter:
     def _require_untouched(self) -> None:
         """Raise OSError if another program has cut the file or deleted it: HDF5 would write on, into a hole."""
         now = os.fstat(self._handle)
-        if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
+        if now.st_nlink == 0 < self._before.st_nlink:  # if there are links at all
             raise _TouchedError(errno.ENOENT, "it was deleted")
         if now.st_size < self._before.st_size:
             raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")

@@ -29,7 +29,7 @@ from recon.base.volume import Grid, Volume, VolumeSeries
 
 DEFINITION = "NXtomoproc"
 DEVIATION = "data_errors"
-"""Datasets beside the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
+"""Datasets next to the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {

@@ -173,7 +173,7 @@ def _rows(file: h5py.File) -> dict[str, I64]:
 
 
 STATUSES = ("complete", "stopped", "failed")
-RUNNING = "running"  # of a scan that goes on, or whose program died
+RUNNING = "running"  # of a scan that continues, or whose program died
 DIED = "The process that took the scan was killed."
 
 

@@ -134,7 +134,7 @@ class Runout(PoseEffect):
 
     Attributes:
         radial: waves a turn, micrometres, phase in degrees, of the axis' motion across the beam and along it. 1 wave is
-        equivalent to a sample beside the axis, 0 waves to an axis at another place. Other numbers come from the
+        equivalent to a sample next to the axis, 0 waves to an axis at another place. Other numbers come from the
         bearing. A negative number turns against the sample.
         axial: the same, vertically.
         radial_random_um: standard deviation of the random part across the beam, and along it.

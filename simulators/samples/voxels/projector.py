@@ -71,7 +71,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         def rows(low: int, high: int) -> None:
             _any(lattice, rays, axes, origin, low, high, out)
 
-    share_rows(rows, detector.shape, bands=8)  # rows near the middle cost more than those beside the sample
+    share_rows(rows, detector.shape, bands=8)  # rows near the middle cost more than those next to the sample
     return out
 
 

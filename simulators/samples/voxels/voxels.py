@@ -4,7 +4,7 @@ The sample is the linear interpolation between the voxels' centres, for projecti
 
 phantom:
   kind: volume
-  file: thorax.nii.gz              # .tif, .npy, .npz, .nii(.gz) or .h5, beside the scene file or by its full path
+  file: thorax.nii.gz              # .tif, .npy, .npz, .nii(.gz) or .h5, next to the scene file or by its full path
   voxel_mm: 0.01                   # where the file does not state it, or to scale the sample
   window: [-1000, 1500]            # the file's values for no attenuation and the largest
   attenuation_max: 4.0             # 1/mm at the window's upper end; or largest_line_integral: 2.5
@@ -128,7 +128,7 @@ class Voxels:
         return project(self.padded, np.array(self.spacing[::-1]), np.array(self.first[::-1]), pose, detector)
 
     def _check_ahead(self, pose: Pose, sod: float) -> None:
-        """Raises CannotExposeError where a corner of the volume is not in front of the source."""
+        """Raises CannotExposeError if a corner of the volume is not in front of the source."""
         ends = [(first - step, -(first - step)) for first, step in zip(self.first, self.spacing, strict=True)]
         corners = np.array([(x, y, z) for z in ends[0] for y in ends[1] for x in ends[2]])
         axes, origin = pose.frames()
@@ -215,7 +215,7 @@ class VolumeSettings:
 
     Attributes:
         file: path; see ReadVolume.
-        dataset: path in an HDF5 file, name in an .npz; needed where there is more than one volume.
+        dataset: path in an HDF5 file, name in an .npz; needed if there is more than one volume.
         axes: the file's order of axes.
         voxel_mm: from voxel to voxel; None: as in the file.
         window: file's values (low, high) for 0 and the largest attenuation; None: low is 0, nothing is clipped.

@@ -2,11 +2,11 @@
 
 In mode 0 (PositionDistance) it gives one pulse for each step of travel. If the start threshold lies below the stop
 threshold, pulses begin only in the positive direction; if it lies above, only in the negative one. Equal thresholds
-switch the window off. A move that reverses inside the window goes on giving pulses at every step. They end beyond
+switch the window off. A move that reverses inside the window continues giving pulses at every step. They end beyond
 either threshold (C-863, E-727 manuals).
 
-A move is a closed form of time. So its pulses go on the cable with their exact times the moment it begins. A stop
-removes the pulses that are still to come.
+A move is a closed form of time. Therefore all its pulses are put on the cable, with their exact times, as soon as the
+move begins. A stop removes the pulses that are still to come.
 """
 
 from __future__ import annotations

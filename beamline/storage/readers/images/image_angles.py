@@ -149,7 +149,7 @@ def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) ->
 
 
 def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
-    """Why the digits beside a point, or beside the number, may or may not be decimals; "" if that is clear."""
+    """Why the digits next to a point, or next to the number, may or may not be decimals; "" if that is clear."""
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
         return "the digits on one side of their point or comma count the images"

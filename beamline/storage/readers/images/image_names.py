@@ -26,7 +26,7 @@ _PLAIN = re.compile(  # words of references, and those that go with them
 _AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the projections
 _DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # of a folder
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
-_DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
+_DATE = 100_000  # from which a number next to that of the image is a date or a time, which may stay the same
 
 
 def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
