@@ -100,7 +100,8 @@ def _rows(table: Path) -> Iterator[_Described | PlannedScan]:
         cells, place = dict(zip(head, row, strict=False)), f"{table}:{number}"
         if len(row) > len(head) or not cells.get(_CONFIG):
             fault = (
-                f"{','.join(row)!r} has {count(len(row), 'cell')}; expected {len(head)}, with a file under {_CONFIG}"
+                f"{','.join(row)!r} has {count(len(row), 'cell')}; expected {len(head)}, as in the first line, and a "
+                f"file in the column {_CONFIG}"
             )
             yield PlannedScan(place, faults=(ScanFault(fault, str(table), number),))
             continue

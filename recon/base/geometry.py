@@ -61,8 +61,10 @@ class Geometry:
             the central ray). In pixels, 0 at the centre of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
-        roll: float64 [view], radians; rotation of the detector about the beam: its columns run along u cos + v sin.
-        tilt: float64 [view], radians; tilt of the rotation axis along the beam: rows then run along v cos + d sin.
+        roll: float64 [view], radians; rotation of the detector about the beam. Its columns then run along u cos(roll) +
+            v sin(roll).
+        tilt: float64 [view], radians; tilt of the rotation axis along the beam. Rows then run along v cos(tilt) + d
+            sin(tilt), with d the direction of the beam.
         width: width of all rays; see `seen_with`.
         skew: radians from one row to the next (parallel beam only); `angles` are those of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point at the distance `sod` from the source

@@ -193,8 +193,8 @@ class FitSettings:
             field times the density unit), divided by the number of pixels of a Gaussian. If the sample changes by more
             than 0.16 of the density unit per voxel, the weight falls with the square of this change. It is at most
             0.25.
-        tv_least: smallest weight of total variation in a fit of `paced_for` steps; more steps need less, see
-            `in_steps`.
+        tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
+            is lower, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
         tv_moves: True: total variation may move centres. In the published code this gradient is too small by the voxel
