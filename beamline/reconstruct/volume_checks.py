@@ -157,15 +157,15 @@ def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str
 def not_begun_warning(result: Reconstruction, judgement: Judgement) -> str:
     """The warning that a volume does not show the sample yet; empty if the residual is smaller than that of a uniform
     volume."""
-    left, uniform = judgement.along_rows or (0.0, 0.0)
-    if left < uniform or uniform == 0:
+    residual, uniform = judgement.along_rows or (0.0, 0.0)
+    if residual < uniform or uniform == 0:
         return ""
     last = result.history[-1] if result.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
         f"Allow more time, steps or iterations: the {label_of(result.method)} volume does not show the sample yet. Its "
-        f"residual, {left:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} (both as a fraction of the "
-        f"variation along detector rows). The method ended after {result.seconds:.3g} s{steps}."
+        f"residual, {residual:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} (both as a fraction of "
+        f"the variation along detector rows). The method ended after {result.seconds:.3g} s{steps}."
     )
 
 

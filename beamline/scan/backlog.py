@@ -53,7 +53,7 @@ def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[
     return f"{frames} is reserved"
 
 
-def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> None:
+def hold_for_space(pause: PauseRequest, reserve: int, free: int, remaining: int) -> None:
     """Pause a scan before its disk is full, until twice the limit is free.
 
     Args:
@@ -61,14 +61,14 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> N
         free: bytes of the disk.
         left: bytes that are still to be written.
     """
-    again = min(2 * reserve, left) + CLOSING
-    if left and free < min(reserve, left) + CLOSING:
+    again = min(2 * reserve, remaining) + CLOSING
+    if remaining and free < min(reserve, remaining) + CLOSING:
         pause.hold(
             Cause.SPACE,
-            f"Free some space on the scan's disk: {size(free)} are free, and {size(left)} are still to be "
+            f"Free some space on the scan's disk: {size(free)} are free, and {size(remaining)} are still to be "
             f"written. The scan continues automatically when {size(again)} are free",
         )
-    elif not left or free >= again:
+    elif not remaining or free >= again:
         pause.release(Cause.SPACE)
 
 
@@ -118,9 +118,11 @@ class FrameProgress:
 
     def expect_fewer(self, done: int, n: int) -> None:
         """Count `n` frames fewer: those planned next after `done` will not come."""
-        left = min(done + n, self.total)
-        self._ahead = np.append(self._ahead[:done] - self._ahead[done] + self._ahead[left], self._ahead[left:])
-        self.total -= left - done
+        remaining = min(done + n, self.total)
+        self._ahead = np.append(
+            self._ahead[:done] - self._ahead[done] + self._ahead[remaining], self._ahead[remaining:]
+        )
+        self.total -= remaining - done
 
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
         """Record the n-th frame; None if the last event was less than EVENT_INTERVAL ago."""

@@ -305,8 +305,10 @@ class Recorder:
             if time.monotonic() - self._looked_at > LOOK:
                 self._looked_at = time.monotonic()
                 with suppress(OSError):  # a failing disk ends the scan when it does not accept a frame
-                    left = max(0, self._progress.total - self.n_frames) * self._row_bytes
-                    hold_for_space(self._pause, self._reserve, shutil.disk_usage(self._writer.path.parent).free, left)
+                    remaining = max(0, self._progress.total - self.n_frames) * self._row_bytes
+                    hold_for_space(
+                        self._pause, self._reserve, shutil.disk_usage(self._writer.path.parent).free, remaining
+                    )
             with suppress(Empty):
                 return self._waiting.get(timeout=LOOK)
 

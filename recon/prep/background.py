@@ -154,8 +154,8 @@ class AirSums:
             for width in (w for w in _WINDOWS if w <= max(n_views, 1)):
                 wide_g, wide_b = _around(g, width), _around(b, width)
                 c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # errors of each half, from the surface of the other half
-                left = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
-                error = float(left.sum() / count)
+                residual = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
+                error = float(residual.sum() / count)
                 if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
                     coefficients = np.zeros((n_views, len(powers(HIGHEST))))
                     coefficients[:, some] = _solved(wide_g.sum(axis=1), wide_b.sum(axis=1))
@@ -183,9 +183,9 @@ class AirSums:
         t, p = self._terms[air][:, :6], view[air].astype(np.float64)
         if p.size < 2 * t.shape[1]:
             return air
-        left = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
-        spread = median_deviation(left[air])
-        return np.asarray(air & (np.abs(left) <= _CLIPPED * max(spread, 1e-12)))
+        residual = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
+        spread = median_deviation(residual[air])
+        return np.asarray(air & (np.abs(residual) <= _CLIPPED * max(spread, 1e-12)))
 
 
 def _around(values: F64, width: int) -> F64:

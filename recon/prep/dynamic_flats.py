@@ -84,8 +84,8 @@ class DynamicFlats:
         """The weights from the pixels in air; `w` if there are few of them or they do not fit."""
         weights: NDArray[Any] = w
         for _ in range(2):
-            left = integral + np.tensordot(weights, self.components, axes=1)
-            smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
+            residual = integral + np.tensordot(weights, self.components, axes=1)
+            smooth = scipy.ndimage.uniform_filter(residual, _SMOOTHED, mode="nearest")
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
@@ -97,9 +97,9 @@ class DynamicFlats:
                 matrix.astype(np.float64), -integral.ravel()[pixels].astype(np.float64), rcond=None
             )[0]
             weights, level = weights[:-1], weights[-1]
-        left = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
-        smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
-        noise = float(np.median(np.abs(left - smooth)[air])) / _SMOOTHED
+        residual = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
+        smooth = scipy.ndimage.uniform_filter(residual, _SMOOTHED, mode="nearest")
+        noise = float(np.median(np.abs(residual - smooth)[air])) / _SMOOTHED
         return weights if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
 
 

@@ -173,8 +173,8 @@ class SweptScan(TrialScan):
             used.held_out_ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
         )
         self.unseen[trial.label] = unseen
-        left = squares_left(unseen.model, unseen.data, None, unseen.resolution)
-        return {HELD_OUT: left.residual}, left.left.tolist()
+        squares = squares_left(unseen.model, unseen.data, None, unseen.resolution)
+        return {HELD_OUT: squares.residual}, squares.left.tolist()
 
     def concluded(self, table: TrialTable) -> TrialTable:
         """The table with scores instead of the residuals in each trial's own projections, with verdicts and remarks.
@@ -263,7 +263,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
     if scale == 0:
         raise DataError("The slices cannot be scored, because the held-out projections show no sample.")
     residuals = [np.sum([np.sqrt(of.left) for of in row], axis=0) / scale for row in sums]
-    predictions = (Prediction(name, left.tolist()) for name, left in zip(slices, residuals, strict=True))
+    predictions = (Prediction(name, residual.tolist()) for name, residual in zip(slices, residuals, strict=True))
     return TrialChoice(f"{len(common)} views", _LEAST_CHANGE if direct else 0.0, tuple(predictions)), same
 
 

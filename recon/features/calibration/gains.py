@@ -161,17 +161,17 @@ class _Band:
             method = EarlyTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
             if gains and at + 1 < _ROUNDS:
-                left = ring_offsets(data - projector.forward(volume.data), views) * self._distinguished()
-                data -= left
-                gains_so_far += left
+                residual = ring_offsets(data - projector.forward(volume.data), views) * self._distinguished()
+                data -= residual
+                gains_so_far += residual
         assert volume is not None
         return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
         """[view] mean square residual of held-out projections for a volume and gains, in some rows."""
-        left = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
-        known = None if self.known is None else np.broadcast_to(self.known, left.shape)[:, rows]
-        return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))
+        residual = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
+        known = None if self.known is None else np.broadcast_to(self.known, residual.shape)[:, rows]
+        return np.asarray(np.average(np.square(residual[:, rows], dtype=np.float64), axis=(1, 2), weights=known))
 
     def _distinguished(self) -> F32:
         """Weights [col]: 1 in columns in which a gain cannot be confused with a body on the axis."""

@@ -278,10 +278,10 @@ def _ramp(images: F32) -> F32:
 
 
 def _solved(
-    model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], left: F32, rounds: int
+    model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], residual: F32, rounds: int
 ) -> tuple[F32, dict[str, F64]]:
     """The change of the volume and of each free quantity: [view] for positions of projections, [1] for others."""
-    first = model.adjoint(weighed(left))
+    first = model.adjoint(weighed(residual))
     seen = model.forward(first)
     typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
     scale: dict[str, NDArray[np.float64]] = {}
@@ -305,7 +305,7 @@ def _solved(
         return float(np.vdot(a[0], a[0])) + sum(float(v @ v) for v in a[1].values())
 
     y, c = np.zeros_like(first), {name: np.zeros(s.size) for name, s in scale.items()}
-    gradient = back(weighed(left))
+    gradient = back(weighed(residual))
     along = gradient[0].copy(), {name: v.copy() for name, v in gradient[1].items()}
     size = dot(gradient)
     for _ in range(rounds):

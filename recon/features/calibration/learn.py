@@ -60,9 +60,9 @@ class Judge:
             [self._left(view - image, image, known) for view, image in zip(self.views[unseen], images, strict=True)]
         )
 
-    def _left(self, left: F32, image: F32, known: F32) -> float:
+    def _left(self, residual: F32, image: F32, known: F32) -> float:
         """Root mean square residual of a projection after it was shifted to where it fits best."""
-        rays = _without_smooth(left)[known > 0]
+        rays = _without_smooth(residual)[known > 0]
         if self.placed:
             ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
             slopes = np.stack([way[known > 0] for way in ways], axis=1)

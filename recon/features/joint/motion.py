@@ -109,10 +109,10 @@ def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -
     right, slope = np.zeros_like(motion.control), list[F32]()
     for part in seen:
         u, x = motion.at(part.time), image(part.time)
-        left = part.data - part.projector.forward_lines(moved(x, u))
+        residual = part.data - part.projector.forward_lines(moved(x, u))
         slope.append(np.empty_like(u))
         slopes(x, u, slope[-1])
-        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(weighed(left, part.weight)))
+        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(weighed(residual, part.weight)))
     return right, slope
 
 
@@ -159,7 +159,7 @@ def _rough(control: F64) -> F64:
 
 
 def conjugate_gradients(
-    normal: Callable[[A], A], left: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
+    normal: Callable[[A], A], residual: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
 ) -> None:
     """Conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve `found` in place.
 
@@ -168,16 +168,16 @@ def conjugate_gradients(
         go_on: called before each iteration; False ends it.
     """
     of_kind = found.dtype.type
-    towards, squares = left.copy(), float(np.vdot(left, left))
+    towards, squares = residual.copy(), float(np.vdot(residual, residual))
     for _ in range(steps):
         if squares == 0 or not go_on():
             break
         image = normal(towards)
         length = of_kind(squares / float(np.vdot(towards, image)))
         found += length * towards
-        left -= length * image
-        before, squares = squares, float(np.vdot(left, left))
-        towards = left + of_kind(squares / before) * towards
+        residual -= length * image
+        before, squares = squares, float(np.vdot(residual, residual))
+        towards = residual + of_kind(squares / before) * towards
 
 
 def moved(x: F32, u: F32 | None) -> F32:

@@ -104,17 +104,17 @@ def _bottom(piece: Piece) -> float:
     raise ValueError(f"a {type(solid).__name__.lower()} does not settle: cylinders, boxes and ellipsoids do")
 
 
-def _sunk(piece: Piece, left: float, bottom: float) -> Ellipsoid | Cylinder | Box:
+def _sunk(piece: Piece, factor: float, bottom: float) -> Ellipsoid | Cylinder | Box:
     solid = piece.solid
     assert isinstance(solid, Ellipsoid | Cylinder | Box)  # `_bottom` refuses others
     x, y, z = solid.centre
-    centre = (x, y, bottom + left * (z - bottom))
+    centre = (x, y, bottom + factor * (z - bottom))
     if isinstance(solid, Ellipsoid):
         a, b, c = solid.semi_axes
-        return replace(solid, semi_axes=(left * a, left * b, left * c), centre=centre)
+        return replace(solid, semi_axes=(factor * a, factor * b, factor * c), centre=centre)
     if isinstance(solid, Cylinder):
-        return replace(solid, height=left * solid.height, centre=centre)
-    return replace(solid, edges=(*solid.edges[:2], left * solid.edges[2]), centre=centre)
+        return replace(solid, height=factor * solid.height, centre=centre)
+    return replace(solid, edges=(*solid.edges[:2], factor * solid.edges[2]), centre=centre)
 
 
 @dataclass(frozen=True)
