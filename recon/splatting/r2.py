@@ -112,7 +112,8 @@ class R2(Fit):
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The fit for a part of a volume: `share` of the Gaussians, in `of_time` of the seconds."""
+        """The fit for a part of a volume: with the fraction `share` of the Gaussians, in the fraction `of_time` of
+        the time limit."""
         count, seconds = self.gaussians, self.seconds
         return replace(
             self,

@@ -50,7 +50,7 @@ class Discrete(VoxelMethod):
     Held-out projections choose the number of levels, their values, the factor on the FISTA-TV weight μ,
     and β. The result is the FISTA-TV
     volume if discrete levels do not predict the held-out projections significantly better, or if there are too few
-    projections to hold any out. If it starts from a first volume, it uses total variation alone.
+    projections to hold any out. If it starts from a given first volume, the method uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.

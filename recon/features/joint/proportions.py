@@ -205,7 +205,7 @@ def fit_share(
         states: indices of the two materials.
         go_on: called before each of at most `STEPS` steps, with the number of steps that may still follow. If it
             returns False, the fit ends with the densities so far.
-        stop: called many times within a step. If it returns True, the fit also ends with the densities so far.
+        stop: called many times within a step. If it returns True, the fit ends at once, with the densities so far.
 
     Raises:
         ValueError: `states` are not two different materials.
