@@ -129,7 +129,8 @@ class StreamingFit:
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest projection and that of the model, line integrals [row, col]; equal in pixels without data.
+        """The newest projection, and the same projection computed from the model, as line integrals [row, col]. In
+        pixels without data both are equal.
 
         Raises:
             ValueError: there is no model yet.
@@ -170,9 +171,9 @@ class StreamingFit:
         self._stage = self._stage.with_newest(image)
 
     def move_axis(self, axis_col: float) -> None:
-        """Move the rotation axis. The model moves with it to its position in the projections.
+        """Move the rotation axis. The model moves with the axis, to where the projections show it.
 
-        The remaining errors are double edges, which the model must correct, so the rates rise again.
+        After the move the model has double edges. The learning rates rise again, so that the fit can remove them.
         """
         self._stage = self._stage.about(float(axis_col))
 
@@ -197,10 +198,11 @@ class StreamingFit:
 
     @property
     def last_steps(self) -> int:
-        """Number of steps of the final fit: those missing compared with a fit of all projections at once.
+        """Number of steps of the final fit. Together with the steps during the scan, they make up a fit to all
+        projections at once.
 
-        It is at least one per projection, and never more than a fit of all projections has. So a fit that was slow
-        during the scan catches up here.
+        It is at least one per projection, and never more than a fit of all projections has. A fit that was too slow
+        during the scan therefore catches up in the final fit.
         """
         each_view_once = math.ceil(self.n_views / self.settings.views_per_step)
         taken = self._stage.state.step if isinstance(self._stage, Growing) else 0
@@ -234,7 +236,8 @@ class StreamingFit:
         return replace(self.progress(), steps=last.begun + last.steps)
 
     def snapshot(self, grid: Grid | None = None) -> Volume:
-        """The current volume in 1/mm on a grid (None: that of the fit); all zero before the first model."""
+        """The current volume in 1/mm on a grid (None: the grid of the fit). It is 0 everywhere as long as there is no
+        model."""
         grid = grid or self._plan.grid
         if isinstance(self._stage, Waiting):
             return Volume(np.zeros(grid.shape, np.float32), grid)
