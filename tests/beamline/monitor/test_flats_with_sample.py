@@ -61,7 +61,7 @@ def told(source: ArraySource) -> list[Finding]:
     ("balls", "degrees", "moved", "said"),
     [
         (SOLID, 300.0, 0.0, "projections are locally brighter"),  # the angle of no view: only its mirror image is there
-        (WEAK, 300.0, 0.0, "the rotating part of the sample absorbs at least"),
+        (WEAK, 300.0, 0.0, "projections show that the sample absorbs at least"),
         (OFF, 227.0, 0.0, "the sample was in the beam"),
         (SOLID, 0.0, 14.0, "the sample was in the beam"),
         (ROUND, 0.0, 14.0, "projections are locally brighter"),

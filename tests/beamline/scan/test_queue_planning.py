@@ -48,7 +48,7 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
         (("sample.name", "a"), "{}: {} is not a table of scans"),
         (("config,x",), "is not a table of scans"),
         (("config,config", "a.yaml,b.yaml"), "is not a table of scans"),
-        (("config,sample.name", ",a"), "{}:2: ',a' has 2 cells; expected 2, with a file"),
+        (("config,sample.name", ",a"), "{}:2: ',a' has 2 cells; expected 2, as in the first line, and a file"),
         (("config,sample.name", "a.yaml,b,c"), "{}:2: 'a.yaml,b,c' has 3 cells"),
         (("config,scan.modd", f"{SIMULATED},1"), "{}:2: scan.modd is not a known key (did you mean mode?)"),
         (("config", "none.yaml"), "none.yaml does not exist"),
