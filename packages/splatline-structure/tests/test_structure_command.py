@@ -199,7 +199,10 @@ def test_of_a_volume_larger_than_the_memory_the_middle_is_looked_at_and_all_for_
     common = ("structure", "can.npy", *VOXEL_UM, "--side", "0", "--parts", "half.npy", "half.npy")
     result = beamline(*common, "--memory", "13.3M", "-o", "part")
     assert result.exit_code == 0, result.output
-    words = "Only 17 of 40 slices fit into 13.3 MB of memory, so the numbers are measured in the middle, in the slices 11:28"
+    words = (
+        "Only 17 of 40 slices fit into 13.3 MB of memory, so the numbers are measured in the middle, in the slices "
+        "11:28"
+    )
     assert words in result.stderr and words in result.stdout
     assert words in (here / "part/report.html").read_text(encoding="utf-8")
     rows = {row["number"]: row for row in _rows(here / "part/numbers.csv")}
