@@ -173,8 +173,8 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     for some, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
         if some.size:
             warn(
-                f"{count(some.size, what)} of {len(masked)} (counted from 0: {spans(some.tolist())}) contain no "
-                "data, because in all projections these detector rows have no beam, zeros, no finite values, or "
-                "dead pixels. They are "
+                f"No data in {count(some.size, what)} of {len(masked)} (counted from 0: "
+                f"{spans(some.tolist())}), because in all projections these detector rows have no beam, zeros, no "
+                "finite values, or dead pixels. They are "
                 f"{so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
             )
