@@ -92,7 +92,10 @@ def _values(name: str, text: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(value for value in (word.strip() for word in text.split(",")) if value))
     first, last, step = map(Decimal, match.groups())
     if step == 0 or (last - first) / step <= 0:
-        raise ValueError(f"{name}={text}: steps of {step} do not lead from {first} to {last}")
+        raise ValueError(
+            f"{name}={text}: a step of {step} does not get from {first} to {last}; expected a step other than 0, "
+            "with a minus sign if the values fall"
+        )
     steps = int((last - first) / step)
     if steps >= MOST:
         raise ValueError(f"{name}={text} has {steps + 1} values, but at most {MOST} are possible: use a larger STEP")
