@@ -122,11 +122,14 @@ class Stop:
 
 
 class GoesOn:
-    """A function `go_on` (step, residual) that also stores its last answer in `going`."""
+    """Whether work goes on: asks the function `go_on` (step, residual) after each step, until its answer is False.
+
+    Attribute `going`: the last answer; True before the first one.
+    """
 
     def __init__(self, go_on: Callable[[int, float], bool]) -> None:
         self._go_on, self.going = go_on, True
 
     def __call__(self, step: int, residual: float) -> bool:
-        self.going = self._go_on(step, residual)
+        self.going = self.going and self._go_on(step, residual)
         return self.going

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions, Prior
+from recon.base.decisions import Decisions, GoesOn, Prior
 from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
@@ -189,12 +189,13 @@ class Trial:
         self, scan: VoxelProblem, slab: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns,
         settings: TrialSettings,
     ) -> None:  # fmt: skip
-        self.scan, self.problem, self.start = scan, replace(slab, go_on=self._go_on), start
+        self._going = GoesOn(lambda sweep, residual: slab.trial_goes_on())
+        self.scan, self.problem, self.start = scan, replace(slab, go_on=self._going), start
         self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
         early, geometry = settings.early, scan.projector.geometry
         count = subsets_of(geometry, MANY_SUBSETS if early else SUBSETS, to_the_end=not early)
         self._subsets = Subsets.of(slab, count, to_the_end=not early)
-        self._ended, self._least = False, math.inf
+        self._least = math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None
 
@@ -257,14 +258,10 @@ class Trial:
         part = replace(seen, with_all_columns=all_columns.seen if matter else None)
         return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings)
 
-    def _go_on(self, sweep: int, residual: float) -> bool:
-        self._ended = self._ended or not self.problem.trial_goes_on()
-        return not self._ended
-
     @property
     def ended(self) -> bool:
         """Whether the trials were stopped; then no further volume is judged."""
-        return self._ended
+        return not self._going.going
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
         """Residuals for this prior and strength; each volume is made only once."""
@@ -389,7 +386,7 @@ class Trial:
     @property
     def control(self) -> RunControl:
         """The control for a run that is one of the trials."""
-        return RunControl(lambda: not self._go_on(0, 0.0), now=self.settings.now)
+        return RunControl(lambda: not self._going(0, 0.0), now=self.settings.now)
 
     def views_of(self, method: Method) -> ReconProblem:
         """The projections that are not held out, as methods get them: with all columns, in the units of the scan."""
@@ -427,7 +424,7 @@ class Trial:
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
         """The volume that `make` computes from a copy of the first volume; after the trials were stopped, this copy."""
         x = (self.start if start is None else start).copy()
-        if self._ended:
+        if self.ended:
             return x
         return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all volumes
 
@@ -438,7 +435,7 @@ class Trial:
             beyond: [held-out view, col, row], the part that its model adds to its projection.
         """
         unseen = self.unseen
-        if self._ended:
+        if self.ended:
             return np.full(len(unseen.data), np.inf)
         views = unseen.views if beyond is None else unseen.views - beyond
         return unseen_residuals(unseen.projector.forward_lines(x), views, unseen.weight, unseen.projector.resolution)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from recon.base.decisions import Stop
+from recon.base.decisions import GoesOn, Stop
 from recon.base.method import RunControl
 
 
@@ -13,6 +13,14 @@ def test_who_has_asked_is_not_asked_again() -> None:
     stop = Stop(lambda: next(answers))
     assert [stop(), stop(), stop()] == [False, True, True]
     assert stop.stopped and stop.cut(3, 9) and not stop.cut(9, 9) and stop.cut(9, 0)
+
+
+def test_work_that_was_ended_is_not_asked_again() -> None:
+    answers = [True, False, True]
+    going = GoesOn(lambda step, residual: answers.pop(0))
+    assert going.going
+    assert [going(step, 0.1) for step in range(4)] == [True, False, False, False]
+    assert not going.going and answers == [True]
 
 
 def test_a_deadline_ends_work_and_is_nobodys_stop() -> None:
