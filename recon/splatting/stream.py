@@ -28,7 +28,7 @@ from recon.base.method import Clock, Progress
 from recon.base.units import look_like_degrees, warn_of_degrees
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
-from recon.splatting.anytime import WHILE_VIEWS_COME, BetterVolume, PredictionErrors, averaged, checked_views
+from recon.splatting.anytime import WHILE_VIEWS_COME, BetterVolume, averaged, checked_views
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.stream_placement import Arrivals, StreamPlan
@@ -69,17 +69,9 @@ class StreamingFit:
         check_arguments(StreamingFit.__init__, locals())
         if sentence := unseen_axis(template.axis_col + template.offsets[:, 0], template.detector_shape[1]):
             raise ValueError(sentence)
-        alone = template.at([0.0])
-        if gaussians is not None and gaussians < 1:
-            raise ValueError(f"a fit needs at least one Gaussian, got {gaussians}")
-        settings = settings or WHILE_VIEWS_COME
-        if (settings.joined_pixels or 1) > 1:
-            raise ValueError(
-                f"joined_pixels={settings.joined_pixels} works only in a fit of a finished scan. For a fit "
-                "during a scan, leave it out and bin the scan"
-            )
-        self._plan = StreamPlan(settings, grid or Grid.matching(template), gaussians, first_views, first_span)
-        self._stage: Waiting | Growing = Waiting(Arrivals(alone), (), np.random.default_rng(seed))
+        arrivals, grid = Arrivals(template.at([0.0])), grid or Grid.matching(template)
+        self._plan = StreamPlan(settings or WHILE_VIEWS_COME, grid, gaussians, first_views, first_span)
+        self._stage: Waiting | Growing = Waiting(arrivals, (), np.random.default_rng(seed))
         self._now, self._start = now, now()
         self.unlearnt = math.nan
         """Running mean of ||rendered - measured|| / ||measured|| of new projections before a step uses them."""
@@ -123,10 +115,7 @@ class StreamingFit:
         if not look_like_degrees(before.angles, ended=False):  # otherwise the warning was given before
             warn_of_degrees(self._stage.views.angles, ended=False)
         if isinstance(self._stage, Growing) and theta.size:
-            measured, rendered = self._stage.newest(self.settings)
-            left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
-            kept = self.unlearnt if math.isfinite(self.unlearnt) else left
-            self.unlearnt = (1 - _NEW) * kept + _NEW * left
+            self.unlearnt = _running_mean(self.unlearnt, *self._stage.newest(self.settings))
 
     def newest_view(self) -> tuple[F32, F32]:
         """The newest projection, and the same projection computed from the model, as line integrals [row, col]. In
@@ -179,9 +168,9 @@ class StreamingFit:
 
     def clear(self) -> None:
         """Drop all projections and the model, so that their memory is free."""
-        views = self._stage.views
-        rng = self._stage.state.rng if isinstance(self._stage, Growing) else self._stage.rng
-        self._stage = Waiting(Arrivals(views.template), (), rng)
+        stage = self._stage
+        rng = stage.state.rng if isinstance(stage, Growing) else stage.rng
+        self._stage = Waiting(Arrivals(stage.views.template), (), rng)
 
     def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step if there is a model), and return the progress."""
@@ -223,33 +212,22 @@ class StreamingFit:
         if not look_like_degrees(views.angles, ended=False):
             warn_of_degrees(views.angles)
         self._stage = model = self._stage.completed(self._plan)
-        last, share = Finishing.of(model, self.last_steps, self.settings), 0.0
-        begin = reported = self._now()
-        while share < 1:
-            last.step(share)
-            now = self._now()
-            share = max(last.share, (now - begin) / seconds if seconds > 0 else 1.0)
-            if on_progress is not None and now - reported > 0.1:
-                reported = now
-                if on_progress(replace(self.progress(), steps=last.begun + last.steps)):
-                    break
-        return replace(self.progress(), steps=last.begun + last.steps)
+        last = Finishing.of(model, self.last_steps, self.settings)
+
+        def reached() -> Progress:
+            return replace(self.progress(), steps=last.begun + last.steps)
+
+        _run(last, seconds, self._now, lambda: on_progress is not None and on_progress(reached()))
+        return reached()
 
     def snapshot(self, grid: Grid | None = None) -> Volume:
         """The current volume in 1/mm on a grid (None: the grid of the fit). It is 0 everywhere as long as there is no
         model."""
-        grid = grid or self._plan.grid
-        if isinstance(self._stage, Waiting):
-            return Volume(np.zeros(grid.shape, np.float32), grid)
-        return self._stage.volume(grid, self.settings)
+        return self._stage.volume(grid or self._plan.grid, self.settings)
 
     def best_preview(self) -> BetterVolume:
         """The volume that predicts held-out projections better: the model, or FBP of the projections so far."""
-        stage = self._stage
-        if isinstance(stage, Waiting):
-            return BetterVolume(self.snapshot(), False, PredictionErrors())
-        apart = np.flatnonzero(stage.views.held_out).tolist()
-        return BetterVolume.of(averaged(stage.state), stage.problem, self.settings, self._plan.grid, apart)
+        return self._stage.preview(self._plan)
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -258,8 +236,24 @@ class StreamingFit:
 
     def progress(self) -> Progress:
         """The progress so far."""
-        seconds, stage = self._now() - self._start, self._stage
-        if isinstance(stage, Waiting):
-            return Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)
-        state = stage.state
-        return Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.n_views)
+        return self._stage.progress(self._now() - self._start)
+
+
+def _run(last: Finishing, seconds: float, now: Clock, ends: Callable[[], bool]) -> None:
+    """Make the steps of a final fit, for at most about `seconds` s. `ends` is called about ten times a second."""
+    share, begin = 0.0, now()
+    reported = begin
+    while share < 1:
+        last.step(share)
+        instant = now()
+        share = max(last.share, (instant - begin) / seconds if seconds > 0 else 1.0)
+        if instant - reported > 0.1:
+            reported = instant
+            if ends():
+                break
+
+
+def _running_mean(before: float, measured: F32, rendered: F32) -> float:
+    """The mean of ||rendered - measured|| / ||measured|| with one more projection; `before` NaN: it is the first."""
+    residual = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
+    return (1 - _NEW) * (before if math.isfinite(before) else residual) + _NEW * residual

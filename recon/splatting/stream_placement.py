@@ -43,6 +43,15 @@ class StreamPlan:
     first_views: int
     first_span: float
 
+    def __post_init__(self) -> None:
+        if self.count is not None and self.count < 1:
+            raise ValueError(f"a fit needs at least one Gaussian, got {self.count}")
+        if (self.settings.joined_pixels or 1) > 1:
+            raise ValueError(
+                f"joined_pixels={self.settings.joined_pixels} works only in a fit of a finished scan. For a fit "
+                "during a scan, leave it out and bin the scan"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:

@@ -9,16 +9,20 @@ change the model in place, because a copy of it takes as long as a step. So use 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
+from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
     HALF,
+    BetterVolume,
+    PredictionErrors,
     average,
     averaged,
     covered_angle,
@@ -98,6 +102,18 @@ class Waiting:
         """
         first = place_gaussians(self.views, self.images, plan, self.rng, all_views=True)
         return Growing.of(self.views, first)._with_room(plan, final=True)
+
+    def volume(self, grid: Grid, settings: FitSettings) -> Volume:
+        """A volume of zeros."""
+        return Volume(np.zeros(grid.shape, np.float32), grid)
+
+    def preview(self, plan: StreamPlan) -> BetterVolume:
+        """A volume of zeros, which is not compared."""
+        return BetterVolume(self.volume(plan.grid, plan.settings), False, PredictionErrors())
+
+    def progress(self, seconds: float) -> Progress:
+        """No step was made in these seconds."""
+        return Progress(0, 0, seconds, math.nan, math.nan, 0, self.views.n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +283,16 @@ class Growing:
     def volume(self, grid: Grid, settings: FitSettings) -> Volume:
         """The volume of the model in 1/mm."""
         return fit.volume_of(averaged(self.state), grid, self.views.template, settings)
+
+    def preview(self, plan: StreamPlan) -> BetterVolume:
+        """The volume that predicts held-out projections better: the model, or FBP of the projections so far."""
+        apart = np.flatnonzero(self.views.held_out).tolist()
+        return BetterVolume.of(averaged(self.state), self.problem, plan.settings, plan.grid, apart)
+
+    def progress(self, seconds: float) -> Progress:
+        """The steps so far, and the seconds since the begin of the fit."""
+        state = self.state
+        return Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.views.n)
 
 
 @dataclass(frozen=True, eq=False)
