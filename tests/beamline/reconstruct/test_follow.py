@@ -267,6 +267,17 @@ def test_it_waits_for_references_then_for_the_axis_then_feeds(tmp_path: Path) ->
     assert states == [(WaitsForReferences, 0), (WaitsForAxis, 0), (Feeds, 30)]
 
 
+def test_without_a_projection_there_is_no_last_fit(tmp_path: Path) -> None:
+    clock = ScanClock()
+    follower, _ = _follower(tmp_path, clock, frames_of(INTERLACED))
+    with follower.source:
+        clock.sleep(40.0)
+        follower.source.refresh()  # past the follower
+        with pytest.raises(DataError, match="taken none of the 30 projections"):
+            follower.end()
+    close(clock)
+
+
 def test_references_that_follow_the_views_are_waited_for_until_the_scan_has_ended(tmp_path: Path) -> None:
     clock, frames = ScanClock(), frames_of(INTERLACED)
     follower, events = _follower(tmp_path, clock, [*frames[4:], *frames[:4]])
