@@ -179,7 +179,12 @@ def guard_streams() -> None:
     streams: Any = sys  # typeshed knows text files alone
     if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
         out = open(  # noqa: SIM115
-            os.dup(1), "w", 1 if out.isatty() else -1, out.encoding, out.errors, closefd=False
+            os.dup(1),
+            "w",
+            1 if out.isatty() else -1,
+            out.encoding,
+            "backslashreplace" if out.errors == "strict" else out.errors,  # a code page of Windows lacks letters
+            closefd=False,
         )
         os.dup2(os.open(os.devnull, os.O_WRONLY) if "--json" in sys.argv else 2, 1)
     streams.stdout = _Printable(_Lasting(out))

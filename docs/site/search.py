@@ -24,10 +24,11 @@ def on_post_build(config: Any, **_: Any) -> None:
     """Remove the text of the API reference from the index of the search, and weigh guides."""
     folder = Path(config["site_dir"]) / "search"
     content = json.loads((folder / "search_index.json").read_text(encoding="utf-8"))
-    guides = tuple(page.replace(".md", ".html") for group in config["nav"] for page in _pages_of(group))
+    guides = tuple(str(Path(page).with_suffix(".html")) for group in config["nav"] for page in _pages_of(group))
     for entry in content["docs"]:
-        if entry["location"].startswith(("reference/", "public_names")):
-            entry["text"] = ""
+        is_notebook = entry["location"].startswith("notebooks/") and "#" not in entry["location"]
+        if is_notebook or entry["location"].startswith(("reference/", "public_names")):
+            entry["text"] = ""  # of a notebook: its styles; its sections have entries of their own
         entry["boost"] = BOOST if entry["location"].partition("#")[0] in guides else 1.0
     (folder / "search_index.json").write_text(json.dumps(content), encoding="utf-8")
     worker = (folder / "worker.js").read_text(encoding="utf-8")
