@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 jupytext = pytest.importorskip("jupytext", reason="jupytext is not installed: pip install '.[docs]'")
@@ -116,7 +117,7 @@ def test_an_interrupted_call_leaves_a_whole_volume_or_none(
         assert names == {"scan.h5"}
     else:
         assert names == {"scan.h5", "volume.h5", "volume.html"}
-        assert whole_volume(here / "volume.h5").grid.shape[0] > 0
+        assert np.isfinite(whole_volume(here / "volume.h5")[0]).all()
 
 
 def test_an_interrupted_command_leaves_no_part_of_a_file(kernel: tuple[KernelManager, Any], here: Path) -> None:
