@@ -248,7 +248,7 @@ assert wire.transmit() == b"0007"
 
 STEP = Extension(
     {"beamline/projections/corrections/lift.py": site("corrections")},
-    (("beamline/projections/registry.py", '    "Width": "width",', '    "Lift": "lift",'),),
+    (("beamline/projections/registry.py", '    "Width": "corrections.width",', '    "Lift": "corrections.lift",'),),
     """
 from pathlib import Path
 

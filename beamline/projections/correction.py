@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.corrections.references import current_scale
 from beamline.projections.open_beam import OpenBeam, Shadow, foreign_to_lines
+from beamline.projections.preparation import Preparation
 from beamline.projections.read import ViewFilters, ViewReader, reading_memory
+from beamline.projections.references import current_scale
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable

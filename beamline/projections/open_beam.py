@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
 from beamline.monitor.evidence import lit_places
-from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.corrections.references import (
+from beamline.projections.preparation import Preparation
+from beamline.projections.protocols import CountsStep
+from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
+from beamline.projections.references import (
     flats_sentence,
     light_scale,
     read_references,
     warn_of_parts_without_flats,
     with_dynamic_flats,
 )
-from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
+from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
@@ -85,13 +86,9 @@ class OpenBeam:
         tell_damaged(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]), warn)
         warn_of_parts_without_flats(scan, references, warn)
         photons = photons_of(scan, references, selection)
-        settings = CorrectionSettings(
-            asked.floor,
-            asked.hot_threshold,
-            asked.zinger_threshold,
-            selection.step(Air).columns,
-            selection.step(Air).sample_from,
-        )
+        settings = CorrectionSettings()
+        for step in in_order(selection):
+            settings = step.settings(settings) if isinstance(step, CountsStep) else settings
         flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air

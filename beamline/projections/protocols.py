@@ -1,5 +1,5 @@
-"""Protocols of a correction step: a filter of each projection, a search for the sample's position, or a change of
-all projections.
+"""Protocols of a correction step: settings of the conversion of counts, a filter of each projection, a search for the
+sample's position, or a change of all projections.
 
 A plug-in meets one of `ViewStep`, `PlaceStep` and `ScanStep`. The module of a step is imported for every help text:
 import what reads files or needs numba, torch or scipy in the function that uses it.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 from beamline.projections.step import NamedStep, StepDone, StepMemory
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.geometry import Geometry
+    from recon.prep.counts_plan import CorrectionSettings
     from recon.prep.projections import Projections
 
 
@@ -59,6 +60,14 @@ class PrepStep(NamedStep, Protocol):
         Raises:
             ConfigError: the step does not fit the scan.
         """
+
+
+@runtime_checkable
+class CountsStep(PrepStep, Protocol):
+    """A step that sets how counts become line integrals."""
+
+    def settings(self, before: CorrectionSettings) -> CorrectionSettings:
+        """These settings of the correction, changed as the options of the step say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +108,6 @@ class EstimatedStep(Protocol):
         """The step with the settings that these projections, corrected without it, determine; None if they determine
         none.
         """
-
-
-@runtime_checkable
-class BlurringStep(Protocol):
-    """A step that blurs the projections: corrections that look for fine detail run without it."""
-
-    blurs: ClassVar[Literal[True]]
 
 
 class ViewMotion(Protocol):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, frames_text, spans
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection

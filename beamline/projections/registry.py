@@ -18,22 +18,23 @@ if TYPE_CHECKING:
     from beamline.projections.selection import Selection
     from beamline.storage.recon_record import Value
 
+_OF_FEATURES = in_folders("beamline.projections.corrections", "STEPS")
 REGISTRY: dict[str, str] = {
-    "TiltAndLens": "resampling",
-    "Air": "air",
+    "TiltAndLens": "corrections.resampling",
+    "Air": "corrections.air",
     "Preparation": "preparation",
-    "PosesOfFile": "poses",
-    "Width": "width",
-    **in_folders("beamline.projections.corrections", "STEPS"),
+    "PosesOfFile": "corrections.poses",
+    "Width": "corrections.width",
+    **{step: f"corrections.{module}" for step, module in _OF_FEATURES.items()},
 }
-"""Class, and its module in `corrections`; options stand in this order. STEPS of a folder there says its steps."""
+"""Class, and its module here; options stand in this order. A folder in `corrections` lists its own in STEPS."""
 
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
     """Every step, in the order of the registry; steps of other packages come last."""
     ours: list[type[PrepStep]] = [
-        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for cls, module in REGISTRY.items()
+        getattr(import_module(f"beamline.projections.{module}"), cls) for cls, module in REGISTRY.items()
     ]
     by_name = {step.name: step for step in ours}
     taken = {option.name for step in ours for option in options_of(step).values()}

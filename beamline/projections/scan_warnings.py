@@ -14,8 +14,8 @@ from beamline.core.text import count, frames_text, spans
 from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.poses import ScanPoses
-from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.references import uncorrected_current
 from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection
 from beamline.storage.readers.base import ScanSource

@@ -12,8 +12,8 @@ from beamline.core.durations import Phases
 from beamline.core.errors import DataError
 from beamline.core.sinks import Note, Warn
 from beamline.projections.corrections.poses import poses_of, stated_poses
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.width import Width
+from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import GeometryLearnt, PlaceStep, ViewMotion
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.replay import judged_flags

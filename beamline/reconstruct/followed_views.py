@@ -11,8 +11,8 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.width import Width
+from beamline.projections.preparation import Preparation
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.corrections.poses import stated_poses
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from beamline.projections.protocols import ScanPart
     from recon.base.geometry import Geometry
     from recon.prep.background import AirSums, Background
+    from recon.prep.counts_plan import CorrectionSettings
 
 _VOXELS, _VIEWS = 2**20, 180  # upper limits for the volume that shows where the sample is
 # voxels around the sample that are left out, for each round. An uneven beam piles up there until the second round,
@@ -86,19 +87,13 @@ class Air:
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )
 
-    @property
-    def columns(self) -> Columns:
-        """The (left, right) columns of air, as in `recon.prep.counts_plan.CorrectionSettings`."""
-        return _parts(self.model)[0]
-
-    @property
-    def sample_from(self) -> float:
-        """Line integral above which the edges count as sample, as in the monitor. Columns that the user states
-        always count as air.
+    def settings(self, before: CorrectionSettings) -> CorrectionSettings:
+        """These settings with the columns of air, and the line integral above which edges count as sample, as in the
+        monitor. Columns that the user states always count as air.
         """
         from recon.voxels.field_edges import LEAST
 
-        return LEAST if self.model == "auto" else math.inf
+        return replace(before, air=_parts(self.model)[0], sample_from=LEAST if self.model == "auto" else math.inf)
 
     @property
     def surface(self) -> Surface:

@@ -13,8 +13,8 @@ import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
+from beamline.projections.preparation import Preparation
+from beamline.projections.protocols import ScanPart, ViewFilter, ViewStep
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone, StepMemory, option
 
@@ -242,8 +242,8 @@ def _refined(
 
 
 def _without_blur(selection: ScanSelection) -> ScanSelection:
-    """The selection without the corrections that blur the projections."""
-    sharp = tuple(step for step in selection.steps if not isinstance(step, BlurringStep))
+    """The selection without other filters of the projections, because each mixes neighbouring pixels."""
+    sharp = tuple(step for step in selection.steps if isinstance(step, TiltAndLens) or not isinstance(step, ViewStep))
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)
     return replace(selection, steps=sharp).with_steps(logarithms)
 

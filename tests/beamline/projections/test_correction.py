@@ -12,7 +12,7 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import references_usable

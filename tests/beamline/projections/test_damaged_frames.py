@@ -11,7 +11,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
 from beamline.storage.writers import layout

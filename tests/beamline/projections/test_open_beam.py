@@ -11,8 +11,8 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import survey
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.open_beam import OpenBeam
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.corrections.references import read_references
+from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned
+from beamline.projections.references import read_references
 from beamline.projections.selection import Selection
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import evidence_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.rings.rings import Rings
+from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import all_steps, recorded, registered, steps_of
 from beamline.projections.step import StepDone, key_of, options_of

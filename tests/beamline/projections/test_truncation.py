@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.scan_warnings import cut_sentence
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry

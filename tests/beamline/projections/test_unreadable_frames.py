@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from tests.beamline.prepared_views import prepare

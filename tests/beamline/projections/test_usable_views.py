@@ -11,7 +11,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_WEIGHT

@@ -21,7 +21,7 @@ from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.page.run_files import Reader, watched
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.views import checked_views

@@ -13,7 +13,7 @@ import numpy as np
 
 from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import ScanSelection

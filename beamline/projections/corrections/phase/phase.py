@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.step import StepDone, StepMemory, option, positive
 
@@ -64,7 +64,6 @@ class Phase:
     name: ClassVar[str] = "phase"
     follows: ClassVar[tuple[str, ...]] = ("tilt",)
     needs_finished: ClassVar[str] = ""
-    blurs: ClassVar[Literal[True]] = True  # corrections that look for fine detail run without this one
     material: str | None = option(
         "--phase",
         _AUTO,

@@ -15,9 +15,9 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.beam_hardening.hardening import Hardening
 from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.phase.phase import Phase
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.corrections.rings.rings import Rings
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection

@@ -11,8 +11,8 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from recon.assess.metrics import psnr

@@ -14,7 +14,7 @@ from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.calibration.calibrate import Calibrate
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from tests.beamline.prepared_views import prepare

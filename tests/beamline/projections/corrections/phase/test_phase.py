@@ -11,7 +11,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.phase.phase import Phase
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart

@@ -10,7 +10,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import source_findings
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import references_usable

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, get_args
 
 from beamline.projections.step import StepDone, StepMemory, option, positive
@@ -10,6 +10,7 @@ from recon.base.choices import FEW_PHOTONS, SPOT_ERRORS, FlatFields, Noise
 
 if TYPE_CHECKING:
     from beamline.projections.protocols import ScanPart
+    from recon.prep.counts_plan import CorrectionSettings
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,12 @@ class Preparation:
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":
             raise ValueError("Omit --gain or --noise log: --gain has an effect only with --noise counts.")
+
+    def settings(self, before: CorrectionSettings) -> CorrectionSettings:
+        """These settings with the limits of the pixels that are replaced."""
+        return replace(
+            before, floor=self.floor, hot_threshold=self.hot_threshold, zinger_threshold=self.zinger_threshold
+        )
 
     @property
     def uses_flags(self) -> bool:

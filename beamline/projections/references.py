@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Note, Warn
 from beamline.core.text import count, spans
 from beamline.monitor.evidence import BRIGHT
-from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import ScanSelection
 from beamline.storage.rules.evidence import ScanEvidence
