@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.page.tiles import TileRegion, lit
 from beamline.page.volume import ShownVolume, VolumeTile
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan, apply, survey
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource, read_known
@@ -89,7 +89,7 @@ class ShownScan:
         self._degrees = np.degrees(source.table.angles[self._views.frames])
         record = bare_record(source.path, self._views)
         self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
-        self._correction: ScanCorrection | None = None
+        self._plan: ScanCorrectionPlan | None = None
         self._row, self._beside, self._band = -1, 0, range(0)  # of the rows that are kept
         self._lines, self._ids = np.empty((0, 0, 0), np.float32), np.empty(0, np.int64)
 
@@ -207,10 +207,8 @@ class ShownScan:
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._correction = self._correction or ScanCorrection(
-                ScanEvidence(self._source), Selection().of(self._source), lambda _: None, some
-            )
-            corrected = self._correction.at_once(some, slice(band.start, band.stop))
+            self._plan = self._plan or survey(ScanEvidence(self._source), Selection().of(self._source), some)
+            corrected = apply(self._plan, some, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The projections cannot be corrected: {error}.") from error
         self._lines, self._ids = corrected.data, corrected.view_ids

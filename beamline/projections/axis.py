@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
-from beamline.projections.correction import ScanCorrection, line_integrals_of
+from beamline.projections.correction import ScanCorrectionPlan, apply, line_integrals_of, survey
 from beamline.projections.corrections.poses import ScanPoses
 from beamline.projections.selection import ScanSelection, check_axis, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
@@ -37,10 +37,22 @@ _CANDIDATES = 14  # candidates for the axis of a cone beam, the usual number
 _GUESSED = 0.01
 
 
+@dataclass(frozen=True)
+class LocatedAxis:
+    """The rotation axis found in a band of rows.
+
+    Attributes:
+        col: in columns of the full detector.
+        warning: what to check if there is no clear optimum; empty if there is one.
+    """
+
+    col: float
+    estimate: AxisEstimate
+    warning: str = ""
+
+
 def rotation_axis(
-    scan: ScanEvidence,
-    selection: ScanSelection,
-    correction: ScanCorrection,
+    plan: ScanCorrectionPlan,
     usable: UsableViews,
     poses: ScanPoses | None,
     warn: Warn,
@@ -56,30 +68,30 @@ def rotation_axis(
     """
     if poses is not None and poses.vectors is not None:
         return poses.axis_col, None
-    source, axis = scan.source, None
+    scan, selection, axis = plan.scan, plan.selection, None
     axis_col = selection.axis_col
     straight = poses is None and selection.cone is None
     if axis_col is None and not straight:
         axis_col, axis = _axis_by_views(scan, selection, usable.frames, poses, warn, progress)
     elif axis_col is None:
-        by = correction
-        if selection.axis_rows is not None:
-            by = ScanCorrection(scan, replace(selection, rows=selection.axis_rows), lambda _: None, usable.frames)
-        axis_col, axis = _axis_beside_jumps(by, usable, warn, progress)
-    check_axis(source, axis_col)
+        located = _axis_beside_jumps(plan, usable, warn, progress)
+        axis_col, axis = located.col, located.estimate
+        if located.warning:
+            warn(located.warning)
+    check_axis(scan.source, axis_col)
     if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:
-        _compare_with_views(axis_col, correction, usable.frames, warn)
+        _compare_with_views(axis_col, plan, usable.frames, warn)
     return axis_col, axis
 
 
-def _compare_with_views(given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn) -> None:
+def _compare_with_views(given: float, plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn) -> None:
     """Warn if some of the projections clearly show another axis than the one that was given."""
     with suppress(DataError):
         some = spread(frames, _COMPARED)
-        shown, estimate = locate_axis(correction.quiet(), some, lambda _: None, all_there=False)
-        if estimate.confident and abs(shown - given) > AGREE * correction.binning:
+        shown = locate_axis(plan, some, all_there=False)
+        if shown.estimate.confident and abs(shown.col - given) > AGREE * plan.selection.binning:
             warn(
-                f"Check --axis: the projections show the rotation axis at column {shown:.2f}, but "
+                f"Check --axis: the projections show the rotation axis at column {shown.col:.2f}, but "
                 f"{given:g} was given. Columns are counted from 0 at the centre of the first column. "
                 "Unless the sample moved, omit --axis, or compare columns with `beamline sweep FILE "
                 "axis=A:B:STEP`."
@@ -140,33 +152,35 @@ def _axis_by_views(
 
 
 def _axis_beside_jumps(
-    correction: ScanCorrection,
+    plan: ScanCorrectionPlan,
     usable: UsableViews,
-    warn: Warn,
+    warn: Warn | None,
     progress: Callable[[int, int], None],
-) -> tuple[float, AxisEstimate]:
+) -> LocatedAxis:
     """The rotation axis from the longest part between jumps of the sample, if that part shows it clearly, otherwise
     from all projections.
     """
+    if plan.selection.axis_rows is not None:
+        other_rows = replace(plan.selection, rows=plan.selection.axis_rows)
+        plan, warn = survey(plan.scan, other_rows, usable.frames), None
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            located = locate_axis(correction, part, lambda _: None, progress)
-            if located[1].confident:
+            located = locate_axis(plan, part, warn, progress)
+            if located.estimate.confident:
                 return located
-    return locate_axis(correction, usable.frames, warn, progress)
+    return locate_axis(plan, usable.frames, warn, progress)
 
 
 def locate_axis(
-    correction: ScanCorrection,
+    plan: ScanCorrectionPlan,
     frames: NDArray[np.int64],
-    warn: Warn,
+    warn: Warn | None = None,
     progress: Callable[[int, int], None] = lambda n, total: None,
     *,
     all_there: bool = True,
-) -> tuple[float, AxisEstimate]:
-    """Find the rotation axis, in columns of the full detector, from a band of rows of projections spread over
-    `frames`.
+) -> LocatedAxis:
+    """Find the rotation axis from a band of rows of projections spread over `frames`; `warn` as in `apply`.
 
     If the estimate has no clear optimum, the axis stated in the file is used. If the file states none and the
     projections are `all_there`, held-out projections find the axis. They would mislead if only a part of the turn
@@ -175,10 +189,11 @@ def locate_axis(
     Raises:
         DataError: no axis in the search range explains the projections.
     """
-    height = (correction.rows.stop - correction.rows.start) // correction.binning
-    start, source = max(0, (height - _AXIS_ROWS) // 2), correction.source
+    rows, binning = plan.selection.detector_rows, plan.selection.binning
+    height = (rows.stop - rows.start) // binning
+    start, source = max(0, (height - _AXIS_ROWS) // 2), plan.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
-    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
+    band = apply(plan, frames, slice(start, min(height, start + _AXIS_ROWS)), warn, progress)
     # columns behind slits, which were replaced; noise there has a large effect on the axis
     hidden = band.masked.all(axis=0)
     lit = np.flatnonzero(~hidden | hidden.all())
@@ -193,17 +208,17 @@ def locate_axis(
     unsure = not estimate.confident and source.axis_col is None and estimate.method != ENDS
     if all_there and (unsure or _hides_matter(band)):
         estimate = _by_unseen_views(band, angles) or estimate
-    axis_col = unbinned(estimate.value, correction.binning)
+    axis_col = unbinned(estimate.value, binning)
     if estimate.confident:
-        return axis_col, estimate
+        return LocatedAxis(axis_col, estimate)
     if source.axis_col is None:
-        warn(_unclear(axis_col))
-        return axis_col, estimate
-    warn(
+        return LocatedAxis(axis_col, estimate, _unclear(axis_col))
+    return LocatedAxis(
+        source.axis_col,
+        estimate,
         f"Check the slices, or give --axis COLUMN: the rotation axis found, column {axis_col:.2f}, is not "
-        f"a clear optimum, so the file's column {source.axis_col:.2f} is used."
+        f"a clear optimum, so the file's column {source.axis_col:.2f} is used.",
     )
-    return source.axis_col, estimate
 
 
 def _hides_matter(band: Projections) -> bool:

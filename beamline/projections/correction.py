@@ -1,12 +1,11 @@
-"""Correction of a scan's frames with one plan: all at once, in batches, or one by one during the scan."""
+"""Correction of a scan's frames: `survey` makes the plan, `apply` converts frames to line integrals with it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,25 +13,45 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.projections.open_beam import OpenBeam, Shadow, foreign_to_lines
+from beamline.projections.open_beam import Shadow, noise_sentence, photons_of, shadow_on_counts, shadow_on_lines
 from beamline.projections.preparation import Preparation
-from beamline.projections.read import ViewFilters, ViewReader, reading_memory
-from beamline.projections.references import current_scale
+from beamline.projections.protocols import CountsStep
+from beamline.projections.read import (
+    ViewFilters,
+    damaged_frames,
+    no_view,
+    read_views,
+    reading_memory,
+    unlit_sentence,
+)
+from beamline.projections.references import (
+    current_scale,
+    flats_sentence,
+    light_scale,
+    parts_without_flats,
+    read_references,
+    with_dynamic_flats,
+)
+from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
-from recon.prep import counts_plan
-from recon.prep.correct import Plan, apply
-from recon.prep.counts_plan import CorrectionPlan, UnlitViewsError
+from recon.base.arrays import F64
+from recon.prep import correct, counts_plan
+from recon.prep.correct import Plan
+from recon.prep.counts import Photons
+from recon.prep.counts_plan import CorrectionPlan, CorrectionSettings, UnlitViewsError
 from recon.prep.lines_plan import LinesPlan
 from recon.prep.projections import Projections, merge_and_empty
+from recon.prep.references import References
 
 _COPIES = 3  # float32 copies of the projections that are corrected at once
 _STEPS = 3  # steps per frame in the progress: reading, dividing by the flat, removing zingers
 NO_VIEWS = np.empty(0, np.int64)
+Done = Callable[[int, int], None]  # (n, N): n of N frames are done
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,54 +59,65 @@ class ScanCorrectionPlan:
     """How the frames of one scan are converted to line integrals, for the rows and the binning of a selection.
 
     Attributes:
+        scan: the evidence from which the plan was made.
         filters: filters of projections, with the rows and the binning.
-        beam: the open beam; None: the frames are line integrals already.
-        preparation: of the selection; logarithms if filters mix pixels.
-        shadow: objects in the beam of all projections; None: not searched for.
+        settings: of the conversion of counts.
+        references: darks and flats of the rows that are read, binned; None: the frames are line integrals already.
+        photons: how pixels count photons; None: logarithms are taken.
+        light: float64 [frame], factor to the usual exposure and, if asked for, to the median ring current; None: 1
+            for all.
+        shadow: objects in the beam of all projections; None: not searched for, or too few projections.
+        beam_done: what was done about flats, defects and noise, by these names.
+        warnings: sentences on damaged references, on zingers in them, and on parts of the scan without flats.
     """
 
+    scan: ScanEvidence
     filters: ViewFilters
-    beam: OpenBeam | None
-    preparation: Preparation
+    settings: CorrectionSettings
+    references: References | None = None
+    photons: Photons | None = None
+    light: F64 | None = None
     shadow: Shadow | None = None
+    beam_done: Mapping[str, StepDone] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def source(self) -> ScanSource:
+        """Reads the frames."""
+        return self.scan.source
+
+    @property
+    def selection(self) -> ScanSelection:
+        """The rows, the binning and the steps."""
+        return self.filters.selection
 
     @property
     def done(self) -> dict[str, StepDone]:
         """What each correction step did, by the name of the step."""
-        asked = self.preparation
-        return {asked.name: asked.done, **(self.beam.done if self.beam else {}), **self.filters.done}
+        asked = self.selection.step(Preparation)
+        return {asked.name: asked.done, **self.beam_done, **self.filters.done}
 
-    def of_rows(self, rows: slice | None) -> CorrectionPlan | LinesPlan:
+    def of_rows(self, rows: slice | None) -> Plan:
         """The plan of some binned rows, with the margin that filters need; of all rows for None.
 
         Raises:
             ValueError: references that cannot be used.
         """
-        read, beam = self.filters.within(rows), self.beam
+        read = self.filters.within(rows)
         standing, foreign = (None, None) if self.shadow is None else (part[read] for part in self.shadow)
-        if beam is None:
-            return LinesPlan.of(self.preparation.zinger_threshold, foreign)
-        references, photons, light = beam.references.rows(read), beam.photons, beam.light
+        if self.references is None:
+            return LinesPlan.of(self.settings.zinger_threshold, foreign)
         return counts_plan.survey(
-            references, beam.settings, standing=standing, photons=photons, foreign=foreign, light=light
-        )  # fmt: skip
-
-    def in_shadow(self, source: ScanSource, views: NDArray[np.int64]) -> ScanCorrectionPlan:
-        """The plan with the objects that stand in the beam of all projections of a finished scan, found in some of
-        these.
-        """
-        read, n = self.filters.read(None), self.filters.selection.binning
-        if not source.finished:
-            return self
-        if self.beam is None:
-            return replace(self, shadow=foreign_to_lines(source, views, read, n))
-        with refused(source, self.preparation):
-            return replace(self, shadow=self.beam.shadow(source, views, read.start, n))
+            self.references.rows(read),
+            self.settings,
+            standing=standing,
+            photons=self.photons,
+            foreign=foreign,
+            light=self.light,
+        )
 
 
-def survey(
-    scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
-) -> ScanCorrectionPlan:
+def survey(scan: ScanEvidence, selection: ScanSelection, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrectionPlan:
     """Read the reference frames that the scan has, and some projections of a finished scan.
 
     Groups of references with a fault are used only if no other group is left.
@@ -98,245 +128,245 @@ def survey(
 
     Raises:
         ConfigError: rows or binning that do not fit the detector; counted photons of a scan without counts, or
-            without the counts of a photon.
+            without the counts of a photon; too few flats for dynamic ones; or no ring current.
         DataError: references that cannot be used.
     """
-    source, beam = scan.source, None
-    filters = ViewFilters.of(source, selection)
-    if filters.filters:
-        selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
+    source, settings = scan.source, CorrectionSettings()
+    for step in in_order(selection):
+        settings = step.settings(settings) if isinstance(step, CountsStep) else settings
+    altered = (altered_sentence(source),) if source.table.altered.any() else ()
+    plan = ScanCorrectionPlan(scan, ViewFilters.of(source, selection), settings, warnings=altered)
     asked = selection.step(Preparation)
-    if source.table.altered.any():
-        warn(altered_sentence(source))
+    if plan.filters.filters:  # they mix pixels, whose counts then have no known likelihood
+        asked = replace(asked, noise="log", gain=None)
     if source.quantity == "counts":
-        beam = OpenBeam.of(scan, selection, filters.read(None), warn)
+        plan = _with_references(plan, selection.with_steps(asked))
     elif asked.noise == "counts":
         raise ConfigError(f"Omit --noise counts: {source.path} contains line integrals, not counts.")
     elif asked.by_current:
         current_scale(scan)  # raises an error if the file has no ring current
-    plan = ScanCorrectionPlan(filters, beam, asked)
-    return plan.in_shadow(source, views) if views.size else plan
+    return in_shadow(plan, views) if views.size else plan
+
+
+def _with_references(plan: ScanCorrectionPlan, selection: ScanSelection) -> ScanCorrectionPlan:
+    """The plan with the darks and flats in the file, and what they show of the beam."""
+    scan, read, asked = plan.scan, plan.filters.read(None), selection.step(Preparation)
+    light = light_scale(scan, asked.by_current) if asked.by_current or scan.views_differ else None
+    references, note = read_references(scan, read, selection)
+    if asked.flat_fields == "dynamic":
+        references = with_dynamic_flats(scan, references, read, selection)
+    _, damaged = damaged_frames(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]))
+    photons = photons_of(scan, references, selection)
+    flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
+    recorded = {name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()}
+    del recorded["sample_from"]  # follows from --air
+    done = {
+        "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
+        "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
+        "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
+    }
+    warnings = (*plan.warnings, *([note] if note else []), *damaged, *parts_without_flats(scan, references))
+    return replace(plan, references=references, photons=photons, light=light, beam_done=done, warnings=warnings)
+
+
+def in_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
+    """The plan with the objects that stand in the beam of all projections of a finished scan, found in some of these
+    (rows of the file).
+    """
+    where = plan.source, views, plan.filters.read(None), plan.selection.binning
+    if not plan.source.finished:
+        return plan
+    if plan.references is None:
+        return replace(plan, shadow=shadow_on_lines(*where))
+    with refused(plan):
+        return replace(plan, shadow=shadow_on_counts(*where, plan.references, plan.settings))
+
+
+def with_filters_of(plan: ScanCorrectionPlan, selection: ScanSelection, views: NDArray[np.int64]) -> ScanCorrectionPlan:
+    """The plan with the filters of another selection of the same rows.
+
+    Frames are read again only if the filters need other rows than before, or mix pixels whose photons were counted.
+    """
+    filters, before = ViewFilters.of(plan.source, selection), plan.filters
+    if filters.read(None) == before.read(None) and not (filters.filters and plan.photons):
+        return replace(plan, filters=filters)
+    return survey(plan.scan, selection, views)
 
 
 @contextmanager
-def refused(source: ScanSource, asked: Preparation) -> Iterator[None]:
+def refused(plan: ScanCorrectionPlan) -> Iterator[None]:
     """Turn a ValueError about the numbers into a DataError that names the file."""
     try:
         yield
     except UnlitViewsError as error:
-        advice = "" if asked.judged else " (--flags judge leaves out frames that the monitor finds dark)"
+        judged = plan.selection.step(Preparation).judged
+        advice = "" if judged else " (--flags judge leaves out frames that the monitor finds dark)"
         raise DataError(
-            f"{source.path} cannot be corrected: {error}{advice}. If the sample covers these columns, give --air none"
+            f"{plan.source.path} cannot be corrected: {error}{advice}. If the sample covers these columns, give "
+            "--air none"
         ) from error
     except ValueError as error:
-        raise DataError(f"{source.path} cannot be corrected: {error}") from error
+        raise DataError(f"{plan.source.path} cannot be corrected: {error}") from error
 
 
-class ScanCorrection:
-    """Converts frames of one scan to line integrals with its plan.
+def apply(
+    plan: ScanCorrectionPlan,
+    frames: NDArray[np.int64],
+    rows: slice | None = None,
+    warn: Warn | None = None,
+    progress: Done = lambda n, total: None,
+) -> Projections:
+    """Line integrals of `frames` (rows of the file), without projections that have no finite pixel: see `view_ids`.
 
-    `at_once` corrects frames that are all present. `feed` takes them in batches as they arrive. Both give
-    bit-identical line integrals as long as the references and the air columns stay the same. `outdated` is True when
-    they have changed; `renewed` then corrects with what is known now.
+    Args:
+        frames: rows of the file, in the order they were taken.
+        rows: narrows the detector rows, in binned rows.
+        warn: function that gets sentences on the frames that are left out, and on copies.
+        progress: function that gets the number of frames done and their total number; each frame is read, divided
+            by the flat, and cleared of zingers.
+
+    Raises:
+        DataError: frames that cannot be corrected; the message names the file.
     """
+    steps = 1 if plan.references is None else _STEPS
+    data, usable = read_usable(plan, frames, rows, warn, lambda n, of: progress(n // steps, of))
+    if not (n := usable.size):
+        raise no_view(plan.scan, plan.references)
+    with refused(plan):
+        order, at = by_angle(plan.source.table, usable), usable.astype(np.float64)
+        lines, _ = correct.apply(
+            data, at, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
+            order=order,
+        )  # fmt: skip
+    return plan.filters.apply(lines, rows)
 
-    def __init__(
-        self, scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
-    ) -> None:
-        """Read references and some projections; arguments and errors are those of `survey`."""
-        self.plan = survey(scan, selection, warn, views)
-        self.rows, self.binning = selection.detector_rows, selection.binning
-        self._scan, self.source, self._selection = scan, scan.source, selection
-        references = None if self.plan.beam is None else self.plan.beam.references
-        self._reader = ViewReader(scan, selection, self.plan.filters, references, warn)
-        self._stream: CorrectionPlan | LinesPlan | None = None  # with the projections fed so far
-        self._columns: set[tuple[int, int]] = set()  # air columns with which projections were corrected
-        self._fed = NO_VIEWS
 
-    def at_once(
-        self,
-        frames: NDArray[np.int64],
-        rows: slice | None = None,
-        progress: Callable[[int, int], None] = lambda n, total: None,
-    ) -> Projections:
-        """Line integrals of `frames` (rows of the file), without projections that have no finite pixel: see
-        `view_ids`.
+def apply_in_batches(
+    plan: ScanCorrectionPlan, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, warn: Warn | None,
+    progress: Done,
+) -> Projections:  # fmt: skip
+    """Line integrals bit-identical to those of `apply`, with at most `batch` frames in memory; a scan in counts is
+    read twice.
 
-        Args:
-            frames: rows of the file, in the order they were taken.
-            rows: narrows the detector rows, in binned rows.
-            progress: function that gets the number of frames done and their total number; each frame is read, divided
-                by the flat, and cleared of zingers.
+    Args:
+        out: float32 [frame, row, col], at least so many: takes the line integrals.
+        warn: as in `apply`.
+        progress: how many of how many frames were read.
 
-        Raises:
-            DataError: frames that cannot be corrected; the message names the file.
-        """
-        steps = 1 if self.plan.beam is None else _STEPS
-        data, usable = self._reader.read(frames, rows, lambda n, of: progress(n // steps, of))
-        if rows is None:  # a band of rows does not show whether a projection is usable
-            self._reader.tell_unlit(frames, usable)
-        if not (n := usable.size):
-            raise self._reader.no_view()
-        with refused(self.source, self.plan.preparation):
-            order, at = _by_angle(self.source.table, usable), usable.astype(np.float64)
-            lines, _ = apply(
-                data, at, self.plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
-                order=order,
-            )  # fmt: skip
-        return self.plan.filters.apply(lines, rows)
+    Raises:
+        DataError: as `apply`; photons are counted: their weights would have to be in memory.
+    """
+    if plan.photons is not None:
+        raise DataError(
+            f"{plan.source.path}: --noise counts needs all projections in memory. Give --noise log, "
+            f"or --bin {2 * plan.selection.binning}."
+        )
+    in_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
+    parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
+    passes, warn_again = (1, warn) if plan.references is None else (2, None)
 
-    def in_batches(
-        self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
-    ) -> Projections:
-        """Line integrals bit-identical to those of `at_once`, with at most `batch` frames in memory; the scan is read
-        twice.
+    def done(parts: int, before: int) -> None:
+        progress(before * frames.size + min(parts * batch, frames.size), passes * frames.size)
 
-        Args:
-            out: float32 [frame, row, col], at least so many: takes the line integrals.
-            progress: how many of how many frames were read.
-
-        Raises:
-            DataError: as `at_once`; photons are counted: their weights would have to be in memory.
-        """
-        if self.plan.beam is not None and self.plan.beam.photons is not None:
-            raise DataError(
-                f"{self.source.path}: --noise counts needs all projections in memory. Give --noise log, "
-                f"or --bin {2 * self.binning}."
-            )
-        in_time, frames = np.sort(frames), frames[_by_angle(self.source.table, frames)]
-        parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
-        passes = 1 if self.plan.beam is None else 2
-
-        def done(parts: int, before: int) -> None:
-            progress(before * frames.size + min(parts * batch, frames.size), passes * frames.size)
-
-        with refused(self.source, self.plan.preparation):
-            plan = self.plan.of_rows(None)
-            if isinstance(plan, CorrectionPlan):
-                parts, plan = self._with_air_found(parts, plan, lambda n: done(n, 0))
-            for n, part in enumerate(parts, 1):
-                lines, plan = self._next(*self._reader.read(part, None), plan, last=n == len(parts))
-                if lines is not None:
-                    out[np.searchsorted(in_time, lines.view_ids)] = lines.data
-                    kept.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
-                    done(n, passes - 1)
-        ids = np.sort(np.concatenate([part.view_ids for part in kept])) if kept else frames[:0]
-        self._reader.tell_unlit(in_time, ids)
-        if not ids.size:
-            raise self._reader.no_view()
-        for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
-            if at != place:
-                out[at] = out[place]
-        masked = np.logical_and.reduce([part.masked for part in kept])
-        found = merge_and_empty(kept, out[: ids.size])
-        return replace(found, masked=masked, view_ids=ids, air=found.air[np.argsort(found.view_ids)])
-
-    def _with_air_found(
-        self, parts: list[NDArray[np.int64]], plan: CorrectionPlan, done: Callable[[int], None]
-    ) -> tuple[list[NDArray[np.int64]], CorrectionPlan]:
-        """The frames of each part that can be used, and the plan with the air columns of all of them."""
-        usable = []
+    with refused(plan):
+        of_rows = plan.of_rows(None)
+        if isinstance(of_rows, CorrectionPlan):
+            parts, of_rows = _with_air_found(plan, parts, of_rows, warn, lambda n: done(n, 0))
         for n, part in enumerate(parts, 1):
-            data, some = self._reader.read(part, None)
-            if some.size:
-                usable.append(some)
-                plan = plan.surveyed(plan.transmission(data, some.astype(np.float64), some))
-            done(n)
-        return usable, replace(plan, settings=replace(plan.settings, air=plan.air_columns), profiles=())
+            pixels = read_views(plan.scan, plan.filters, plan.references, part, None, warn_again)
+            lines, of_rows = apply_next(plan, *pixels, of_rows, last=n == len(parts))
+            if lines is not None:
+                out[np.searchsorted(in_time, lines.view_ids)] = lines.data
+                kept.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
+                done(n, passes - 1)
+    ids = np.sort(np.concatenate([part.view_ids for part in kept])) if kept else frames[:0]
+    if warn is not None and (sentence := unlit_sentence(plan.scan, in_time, ids)):
+        warn(sentence)
+    if not ids.size:
+        raise no_view(plan.scan, plan.references)
+    for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
+        if at != place:
+            out[at] = out[place]
+    masked = np.logical_and.reduce([part.masked for part in kept])
+    found = merge_and_empty(kept, out[: ids.size])
+    return replace(found, masked=masked, view_ids=ids, air=found.air[np.argsort(found.view_ids)])
 
-    def _next(
-        self, data: NDArray[Any], frames: NDArray[np.int64], plan: Plan, last: bool
-    ) -> tuple[Projections | None, Plan]:
-        """Line integrals of the next frames, None if none is ready; and the plan of those that follow."""
-        if not frames.size and not (last and plan.spots.waiting is not None):
-            return None, plan
-        lines, plan = apply(data, frames.astype(np.float64), plan, frames, last=last)
-        return self.plan.filters.apply(lines, None), plan
 
-    def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
-        """Line integrals of the next frames; None while none is ready: the newest projection waits for the next one.
+def _with_air_found(
+    plan: ScanCorrectionPlan,
+    parts: list[NDArray[np.int64]],
+    counts: CorrectionPlan,
+    warn: Warn | None,
+    done: Callable[[int], None],
+) -> tuple[list[NDArray[np.int64]], CorrectionPlan]:
+    """The frames of each part that can be used, and the plan for counts with the air columns of all of them."""
+    usable = []
+    for n, part in enumerate(parts, 1):
+        data, some = read_views(plan.scan, plan.filters, plan.references, part, None, warn)
+        if some.size:
+            usable.append(some)
+            counts = counts.surveyed(counts.transmission(data, some.astype(np.float64), some))
+        done(n)
+    return usable, replace(counts, settings=replace(counts.settings, air=counts.air_columns), profiles=())
 
-        Args:
-            frames: rows of the file, those after the frames fed before; may be none if `last`.
-            last: no frame will come after these.
 
-        Raises:
-            DataError: as `at_once`.
-        """
-        data, usable = self._reader.read(frames, None)
-        self._reader.tell_unlit(frames, usable)
-        self._fed = np.append(self._fed, usable)
-        with refused(self.source, self.plan.preparation):
-            lines, self._stream = self._next(data, usable, self._stream or self.plan.of_rows(None), last)
-        if lines is None or not lines.view_ids.size:
-            return None
-        self._columns.add(lines.air_columns)
-        return lines
+def read_usable(
+    plan: ScanCorrectionPlan,
+    frames: NDArray[np.int64],
+    rows: slice | None,
+    warn: Warn | None,
+    progress: Done = lambda n, total: None,
+) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Pixels of the frames that can be used, and these frames, see `read_views`; `warn` also gets a sentence on
+    projections without beam.
+    """
+    data, usable = read_views(plan.scan, plan.filters, plan.references, frames, rows, warn, progress)
+    # a band of rows does not show whether a projection is usable
+    if warn is not None and rows is None and (sentence := unlit_sentence(plan.scan, frames, usable)):
+        warn(sentence)
+    return data, usable
 
-    def newest(self) -> Projections | None:
-        """Line integrals of the newest projection, which still waits for the next one, as if none followed.
 
-        It keeps waiting, because all its zingers are found only if both neighbours are known.
-        """
-        none = np.empty((0, 0, 0), np.float32)
-        return None if self._stream is None else self._next(none, NO_VIEWS, self._stream, last=True)[0]
+def apply_next(
+    plan: ScanCorrectionPlan, data: NDArray[Any], frames: NDArray[np.int64], state: Plan, last: bool
+) -> tuple[Projections | None, Plan]:
+    """Line integrals of the next frames, None if none is ready; and the state for those that follow.
 
-    def open_beam(self, most: int) -> NDArray[np.float32]:
-        """Line integrals [frame, row, col] of at most N consecutive flats, corrected like projections.
-
-        They are scaled so that their noise is that of the exposure of a projection. No frames if the scan contains
-        line integrals already.
-
-        Raises:
-            DataError: as `at_once`.
-        """
-        if self.plan.beam is None:
-            return np.zeros((0, 0, 0), np.float32)
-        flats = self._scan.used.flats[-1][:most]
-        exposures = float(np.median(self.source.table.exposures[flats])) / self._scan.usual_exposure
-        return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
-
-    @property
-    def outdated(self) -> bool:
-        """True if projections already fed would now be corrected differently: references came later, the air columns
-        changed, or neighbours in angle were not known then.
-        """
-        finds_spots = np.isfinite(self.plan.preparation.zinger_threshold)
-        if finds_spots and (np.diff(_by_angle(self.source.table, self._fed)) != 1).any():
-            return True
-        if self.plan.beam is None or self._stream is None:
-            return False
-        then, now = ((table.darks.size, table.flats.size) for table in (self._scan.table, self.source.table))
-        return then != now or self._columns != {self._stream.air_columns}
-
-    def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """True if `feed` treated an object in the beam of all these projections of a finished scan as part of the
-        sample.
-        """
-        shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self.source, views).shadow
-        return shadow is not None and any(part.any() for part in shadow)
-
-    def quiet(self) -> ScanCorrection:
-        """The same correction without warnings."""
-        other = copy(self)
-        other._reader = replace(self._reader, warn=lambda sentence: None)
-        return other
-
-    def renewed(self, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrection:
-        """A correction with all references recorded by now; `views` as in `survey`."""
-        return ScanCorrection(self._scan.renewed(), self._selection, self._reader.warn, views)
+    Args:
+        state: `of_rows(None)` of the plan, after the frames before these.
+    """
+    if not frames.size and not (last and state.spots.waiting is not None):
+        return None, state
+    lines, state = correct.apply(data, frames.astype(np.float64), state, frames, last=last)
+    return plan.filters.apply(lines, None), state
 
 
 def line_integrals_of(scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64]) -> Projections:
-    """Line integrals of some frames of a finished scan, corrected on their own and without a warning.
+    """Line integrals of some frames of a finished scan, corrected on their own.
 
     Raises:
-        ConfigError, DataError: as in `survey` and `ScanCorrection.at_once`.
+        ConfigError, DataError: as in `survey` and `apply`.
     """
-    return ScanCorrection(scan, selection, lambda sentence: None, frames).at_once(frames)
+    return apply(survey(scan, selection, frames), frames)
 
 
-def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
+def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.float32]:
+    """Line integrals [frame, row, col] of at most N consecutive flats, corrected like projections.
+
+    They are scaled so that their noise is that of the exposure of a projection. No frames if the scan contains
+    line integrals already.
+
+    Raises:
+        DataError: as `apply`.
+    """
+    if plan.references is None:
+        return np.zeros((0, 0, 0), np.float32)
+    flats = plan.scan.used.flats[-1][:most]
+    exposures = float(np.median(plan.source.table.exposures[flats])) / plan.scan.usual_exposure
+    return apply(plan, flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
+
+
+def by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
     """The order of frames in which neighbours in angle follow one another.
 
     It is the order of the scan, unless that skips angles, or the sample is offset in some frames; these are then
@@ -351,7 +381,7 @@ def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def at_once_memory(source: ScanSource, selection: ScanSelection, frames: int, rows: slice | None = None) -> int:
-    """Memory in bytes that is needed to correct N frames at once, including the line integrals; `rows` as in `at_once`.
+    """Memory in bytes that `apply` needs for N frames, including the line integrals; `rows` as there.
 
     Raises:
         ConfigError: the selection does not fit the scan.

@@ -1,30 +1,17 @@
-"""Open beam of a scan: darks and flats, ring current, photon statistics, and objects that stand in the beam of all
-projections.
-"""
+"""Open beam of a scan: objects that stand in the beam of all projections, and photon statistics."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.core.sinks import Warn
 from beamline.monitor.evidence import lit_places
 from beamline.projections.preparation import Preparation
-from beamline.projections.protocols import CountsStep
-from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
-from beamline.projections.references import (
-    flats_sentence,
-    light_scale,
-    read_references,
-    warn_of_parts_without_flats,
-    with_dynamic_flats,
-)
-from beamline.projections.registry import in_order
+from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import ScanSelection
-from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
@@ -40,89 +27,42 @@ from recon.prep.unmeasured import foreign_rows
 _LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64
 
 # bool [row, col], objects in the beam of all projections; bool [row], rows in which objects other than the sample come
-# and go
-# sample (`foreign_rows`).
+# and go (`foreign_rows`).
 Shadow = tuple[Mask, Mask]
 
 
-@dataclass(frozen=True, eq=False)
-class OpenBeam:
-    """The open beam by which the projections of a scan in counts are divided.
+def shadow_on_counts(
+    source: ScanSource,
+    views: NDArray[np.int64],
+    read: slice,
+    binning: int,
+    references: References,
+    settings: CorrectionSettings,
+) -> Shadow | None:
+    """Objects in the beam of all projections of a scan in counts, found in some of these; None if they are too few.
 
-    Attributes:
-        references: of the detector rows that are read, binned.
-        settings: of the correction.
-        photons: how pixels count photons; None: logarithms are taken.
-        light: float64 [frame], factor to the usual exposure and, if asked for, to the median ring current; None: 1
-            for all.
-        done: what was done about flats, defects and noise, by these names.
+    Args:
+        read: the detector rows that are read.
+        references: of these rows, binned.
     """
-
-    references: References
-    settings: CorrectionSettings
-    photons: Photons | None
-    light: NDArray[np.float64] | None
-    done: dict[str, StepDone]
-
-    @classmethod
-    def of(cls, scan: ScanEvidence, selection: ScanSelection, read: slice, warn: Warn) -> OpenBeam:
-        """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
-
-        Args:
-            read: the detector rows to read.
-            warn: function that gets sentences on damaged frames, on zingers, and on parts of the scan without flats.
-
-        Raises:
-            ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring
-                current.
-            DataError: references that cannot be used.
-        """
-        asked = selection.step(Preparation)
-        alike = not (asked.by_current or scan.views_differ)
-        light = None if alike else light_scale(scan, asked.by_current)
-        references = read_references(scan, read, selection, warn)
-        if asked.flat_fields == "dynamic":
-            references = with_dynamic_flats(scan, references, read, selection)
-        tell_damaged(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]), warn)
-        warn_of_parts_without_flats(scan, references, warn)
-        photons = photons_of(scan, references, selection)
-        settings = CorrectionSettings()
-        for step in in_order(selection):
-            settings = step.settings(settings) if isinstance(step, CountsStep) else settings
-        flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
-        recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
-        del recorded["sample_from"]  # follows from --air
-        done = {
-            "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
-            "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
-        }
-        return cls(references, settings, photons, light, done)
-
-    def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
-        """Objects in the beam of all projections, found in some of these; None if they are too few.
-
-        Args:
-            first: the detector row at which the rows read begin.
-        """
-        if views.size < _LEAST_VIEWS:
-            return None
-        references, settings = replace(self.references, dynamic=None), replace(self.settings, air="none")
-        in_shadow = np.zeros(references.dark.shape, np.bool_)
-        foreign = in_shadow[:, 0].copy()
-        views = spread(views, SHADOW_VIEWS)
-        for start in range(0, len(in_shadow), _BAND):
-            rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
-            read = slice(first + rows.start * binning, first + rows.stop * binning)
-            data = np.nan_to_num(read_binned(source, views, read, binning))
-            light = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
-            in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-            foreign[rows] |= foreign_rows(light, source.table.angles[views])
-        return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
+    if views.size < _LEAST_VIEWS:
+        return None
+    references, settings = replace(references, dynamic=None), replace(settings, air="none")
+    in_shadow, first = np.zeros(references.dark.shape, np.bool_), read.start
+    foreign = in_shadow[:, 0].copy()
+    views = spread(views, SHADOW_VIEWS)
+    for start in range(0, len(in_shadow), _BAND):
+        rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
+        read = slice(first + rows.start * binning, first + rows.stop * binning)
+        data = np.nan_to_num(read_binned(source, views, read, binning))
+        light = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
+        in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
+        foreign[rows] |= foreign_rows(light, source.table.angles[views])
+    return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
-def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
-    """As `OpenBeam.shadow`, for line integrals, which do not show objects that stand still in all projections."""
+def shadow_on_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
+    """As `shadow_on_counts`, for line integrals, which do not show objects that stand still in all projections."""
     if views.size < SHADOW_VIEWS:
         return None
     some = spread(views, SHADOW_VIEWS)

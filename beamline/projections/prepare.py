@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey, with_filters_of
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
@@ -91,11 +91,13 @@ def prepare_projections(
     usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, tilt = with_tilt(scan, selection, usable.frames, warn, phases.progress)
-    correction = ScanCorrection(scan, selection, warn, usable.frames)
+    plan = survey(scan, selection, usable.frames)
+    for sentence in plan.warnings:
+        warn(sentence)
     if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
-        warn_of_tilt(correction, usable.frames, warn, phases.progress)
+        warn_of_tilt(plan, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
-    axis_col, axis = rotation_axis(scan, selection, correction, usable, poses, warn, phases.progress)
+    axis_col, axis = rotation_axis(plan, usable, poses, warn, phases.progress)
     warn_of_other_axis(poses, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
     view_geometry = ViewGeometry(scan, selection, axis_col)
@@ -105,19 +107,19 @@ def prepare_projections(
     check(view_geometry.of(used))
     phases.enter("correction")
     used = np.union1d(used, wide) if buffer is None else used
-    projections = _corrected(correction, used, buffer, phases)
+    projections = _corrected(plan, used, buffer, phases, warn)
     geometry = view_geometry.of(projections.view_ids)
     if estimated := _estimated(source, selection, projections, geometry):
         selection = selection.with_steps(*estimated)
-        correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were already given
+        plan = with_filters_of(plan, selection, usable.frames)
         if any(step.on(source, selection)[0] is not None for step in estimated):
-            projections = _corrected(correction, used, buffer, phases)
+            projections = _corrected(plan, used, buffer, phases)  # whatever is unusual in the frames was reported
     light = compare_with_flats(scan, selection, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
-    prepared = _with_held_out(prepared, correction, view_geometry, others)
-    prepared = replace(prepared, done={**correction.plan.done, **tilt, **view_geometry.done})
+    prepared = _with_held_out(prepared, plan, view_geometry, others, warn)
+    prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
@@ -133,7 +135,11 @@ def _estimated(
 
 
 def _with_held_out(
-    prepared: PreparedProjections, correction: ScanCorrection, view_geometry: ViewGeometry, others: NDArray[np.int64]
+    prepared: PreparedProjections,
+    plan: ScanCorrectionPlan,
+    view_geometry: ViewGeometry,
+    others: NDArray[np.int64],
+    warn: Warn,
 ) -> PreparedProjections:
     """Add the line integrals of the held-out projections; nothing is added if there are none, or if none has
     intensity.
@@ -141,7 +147,7 @@ def _with_held_out(
     if not others.size:
         return prepared
     with suppress(NoViewError):
-        held_out = correction.at_once(others)
+        held_out = apply(plan, others, warn=warn)
         prepared = replace(
             prepared,
             held_out=Views(held_out.data, view_geometry.of(held_out.view_ids), held_out.weights),
@@ -188,19 +194,20 @@ def _chosen(
 
 
 def _corrected(
-    correction: ScanCorrection,
+    plan: ScanCorrectionPlan,
     used: NDArray[np.int64],
     buffer: DiskBuffer | None,
     phases: Phases,
+    warn: Warn | None = None,
 ) -> Projections:
     """Line integrals of these rows of the file. DataError if fewer than half of them can be used."""
     if buffer is None:
-        projections = correction.at_once(used, progress=phases.progress)
+        projections = apply(plan, used, None, warn, phases.progress)
     else:
-        projections = correction.in_batches(used, buffer.views, buffer.batch, phases.progress)
+        projections = apply_in_batches(plan, used, buffer.views, buffer.batch, warn, phases.progress)
     if 2 * (n := projections.view_ids.size) < used.size:
         raise DataError(
-            f"{correction.source.path}: only {n} of {used.size} projections can be used, which are too "
+            f"{plan.source.path}: only {n} of {used.size} projections can be used, which are too "
             "few for the scan. The others are without beam, have no finite pixel, or differ from what "
             "was written. Choose those that can be used with --views, or repeat the others."
         )

@@ -5,7 +5,7 @@ projections.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -88,16 +88,16 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def tell_damaged(
-    source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn
-) -> NDArray[np.bool_]:
-    """Warn of the frames that are left out: unreadable frames and, if the selection requires it, frames that differ
-    from their checksum. The warning lists the frames.
+def damaged_frames(
+    source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Which of these frames, which were read, are left out: unreadable frames and, unless the selection uses all,
+    frames that differ from their checksum. And sentences that list them.
     """
-    lost = np.isin(frames, sorted(source.unreadable))
+    lost, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
     if lost.any():
         first = int(frames[lost].min())
-        warn(
+        sentences.append(
             f"{count(int(lost.sum()), 'frame')} cannot be read and {'is' if lost.sum() == 1 else 'are'} "
             f"left out: {spans(np.sort(frames[lost]).tolist())}. {source.unreadable[first]}"
         )
@@ -105,11 +105,11 @@ def tell_damaged(
     used = selection.step(Preparation).uses_flags
     if damaged.any():
         taken = "left out" if used else "used anyway (--flags ignore)"
-        warn(
+        sentences.append(
             f"Look for an intact copy of {source.path}: {frames_text(np.sort(frames[damaged]))} "
             f"{'differs' if damaged.sum() == 1 else 'differ'} from the stored checksum, {taken}."
         )
-    return lost | damaged if used else lost
+    return lost | damaged if used else lost, sentences
 
 
 def spoilt_frames(source: ScanSource, use_damaged: bool) -> list[int]:
@@ -182,94 +182,90 @@ class NoViewError(DataError):
     """None of the requested projections can be used."""
 
 
-@dataclass(frozen=True, eq=False)
-class ViewReader:
-    """Reads the projections of one scan that can be used, and reports why the others cannot.
+def read_views(
+    scan: ScanEvidence,
+    filters: ViewFilters,
+    references: References | None,
+    frames: NDArray[np.int64],
+    rows: slice | None,
+    warn: Warn | None = None,
+    progress: Callable[[int, int], None] = lambda n, total: None,
+) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Pixels [frame, row, col] of the frames that have a finite pixel and intensity and are not damaged, and these
+    frames; of some binned rows, None: all.
 
-    Attributes:
-        selection: what is done with frames that differ from their checksums.
-        filters: rows and binning.
-        references: of the rows that are read, binned; None: the frames are line integrals.
-        named: projections without beam that were reported.
+    Args:
+        references: of the rows that `filters` read, binned; None: the frames are line integrals.
+        warn: function that gets sentences on frames that are left out for another reason than a lack of beam (see
+            `unlit_sentence`), and on copies.
     """
-
-    scan: ScanEvidence
-    selection: ScanSelection
-    filters: ViewFilters
-    references: References | None
-    warn: Warn
-    named: set[int] = field(default_factory=set)
-
-    def read(
-        self,
-        frames: NDArray[np.int64],
-        rows: slice | None,
-        progress: Callable[[int, int], None] = lambda n, total: None,
-    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Pixels [frame, row, col] of the frames that have a finite pixel and intensity and are not damaged, and
-        these frames; of some binned rows, None: all.
-        """
-        source = self.scan.source
-        data = read_binned(source, frames, self.filters.read(rows), self.selection.binning, progress)
-        lost = tell_damaged(source, self.selection, frames, self.warn)
-        data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
-        alive = np.isfinite(data).any(axis=(1, 2))
-        if not alive.all():
-            dark = frames[~alive]
-            if rows is None:  # a band of rows does not show whether a projection is usable
-                self.warn(
-                    f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
-                    f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
-                )
-            data, frames = data[alive], frames[alive]
-        lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references
-        references = None if used is None else (used.dark[part], used.flats[0][1][part])
-        for at in np.flatnonzero(self.scan.suspect(data, references)):
-            lit[at] = not self.scan.unlit(int(frames[at]))
-        if not lit.all():
-            data, frames = data[lit], frames[lit]
-        if rows is None and used is not None:
-            self._warn_of_copies(data, frames)
-        return data, frames
-
-    def _warn_of_copies(self, data: NDArray[Any], frames: NDArray[np.int64]) -> None:
-        """Warn of projections that equal the one before pixel by pixel: no camera takes the same counts twice."""
-        middle = data.shape[1] // 2
-        # the middle row quickly distinguishes most of them
-        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))
-        copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
-        if copies and 2 * len(copies) < len(frames):  # if most are equal, the images were computed
-            self.warn(
-                "Omit these frames with --views or --flags judge, or repeat them: "
-                f"{count(len(copies), 'projection')} of {self.scan.source.table.views.size} "
-                f"({frames_text(copies)}) {'is' if len(copies) == 1 else 'are'} identical to the "
-                "projection before. The camera or its driver delivered an image twice, so the angle of "
-                "the copy is wrong."
+    source = scan.source
+    data = read_binned(source, frames, filters.read(rows), filters.selection.binning, progress)
+    lost, reported = damaged_frames(source, filters.selection, frames)
+    data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
+    alive = np.isfinite(data).any(axis=(1, 2))
+    if not alive.all():
+        dark = frames[~alive]
+        if rows is None:  # a band of rows does not show whether a projection is usable
+            reported.append(
+                f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
+                f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
             )
+        data, frames = data[alive], frames[alive]
+    lit, part = np.ones(len(frames), np.bool_), filters.within(rows)
+    beam = None if references is None else (references.dark[part], references.flats[0][1][part])
+    for at in np.flatnonzero(scan.suspect(data, beam)):
+        lit[at] = not scan.unlit(int(frames[at]))
+    if not lit.all():
+        data, frames = data[lit], frames[lit]
+    if warn is not None:
+        if rows is None and references is not None:
+            reported += _copies(scan, data, frames)
+        for sentence in reported:
+            warn(sentence)
+    return data, frames
 
-    def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
-        """Report the projections without beam among those asked for, once, and the gap that they leave."""
-        unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self.scan.known_unlit, np.int64))
-        if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
-            return
-        gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
-        self.named.update(news.tolist())
-        self.warn(
-            f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} ({frames_text(news)}) had "
-            "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "
-            f"file. {'It is' if news.size == 1 else 'They are'} left out{gap}."
-        )
 
-    def no_view(self) -> NoViewError:
-        """The error if none of the projections can be used."""
-        beside_flats = (
-            ""
-            if self.references is None
-            else f" The brightest have {self.scan.brightest:.2g} of the intensity of the flats. If the "
-            "projections were already divided by their flats, give --quantity transmission or "
-            "line-integrals."
-        )
-        return NoViewError(
-            f"{self.scan.source.path}: none of the chosen projections can be used. Their pixels are "
-            f"unreadable, not finite, without beam, or differ from their checksums.{beside_flats}"
-        )
+def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -> list[str]:
+    """A sentence on projections that equal the one before pixel by pixel: no camera takes the same counts twice."""
+    middle = data.shape[1] // 2
+    # the middle row quickly distinguishes most of them
+    alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))
+    copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
+    if not copies or 2 * len(copies) >= len(frames):  # if most are equal, the images were computed
+        return []
+    return [
+        "Omit these frames with --views or --flags judge, or repeat them: "
+        f"{count(len(copies), 'projection')} of {scan.source.table.views.size} "
+        f"({frames_text(copies)}) {'is' if len(copies) == 1 else 'are'} identical to the "
+        "projection before. The camera or its driver delivered an image twice, so the angle of "
+        "the copy is wrong."
+    ]
+
+
+def unlit_sentence(scan: ScanEvidence, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> str:
+    """The projections without beam among those asked for, and the gap that they leave; empty if there are none."""
+    unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(scan.known_unlit, np.int64))
+    if not unlit.size:
+        return ""
+    gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, asked, lit)) else ""
+    return (
+        f"{count(unlit.size, 'projection')} of {scan.source.table.views.size} ({frames_text(unlit)}) had "
+        "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "
+        f"file. {'It is' if unlit.size == 1 else 'They are'} left out{gap}."
+    )
+
+
+def no_view(scan: ScanEvidence, references: References | None) -> NoViewError:
+    """The error if none of the projections can be used."""
+    beside_flats = (
+        ""
+        if references is None
+        else f" The brightest have {scan.brightest:.2g} of the intensity of the flats. If the "
+        "projections were already divided by their flats, give --quantity transmission or "
+        "line-integrals."
+    )
+    return NoViewError(
+        f"{scan.source.path}: none of the chosen projections can be used. Their pixels are "
+        f"unreadable, not finite, without beam, or differ from their checksums.{beside_flats}"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.sinks import Note, Warn
+from beamline.core.sinks import Note
 from beamline.core.text import count, spans
 from beamline.monitor.evidence import BRIGHT
 from beamline.projections.preparation import Preparation
@@ -81,14 +81,12 @@ class _Reading:
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
-def read_references(
-    scan: ScanEvidence, rows: slice, selection: ScanSelection, warn: Warn = lambda sentence: None
-) -> References:
+def read_references(scan: ScanEvidence, rows: slice, selection: ScanSelection) -> tuple[References, str]:
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are
-    required.
+    required. Also returns a note on zingers, empty if there are none.
 
     Damaged frames (see ScanSource) are left out, unless the selection uses all frames. Zingers in single frames are
-    replaced, with a note. Flats with another exposure than the projections are scaled to the exposure of the
+    replaced. Flats with another exposure than the projections are scaled to the exposure of the
     projections: dark + (flat - its dark) * t / t_flat, if both are known. If darks have several exposures, each kind of
     frame has its own dark, see `recon.prep.references.dark_at`.
 
@@ -113,11 +111,12 @@ def read_references(
             "unreadable or differs from its stored checksum. Use an intact copy of the file. --flags "
             "ignore uses the frames whose checksum differs."
         )
+    note = ""
     if reading.spots:
         n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
         spots = f"Zingers in darks and flats ({count(n, 'pixel')} in frames {frames})"
-        warn(Note(f"{spots} were replaced with the values of neighbouring frames."))
-    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(scan.table.part_starts.tolist()))
+        note = Note(f"{spots} were replaced with the values of neighbouring frames.")
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(scan.table.part_starts.tolist())), note
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
@@ -225,15 +224,16 @@ def flats_sentence(scan: ScanEvidence, references: References, by_current: bool)
     return " ".join(sentences)
 
 
-def warn_of_parts_without_flats(scan: ScanEvidence, references: References, warn: Warn) -> None:
+def parts_without_flats(scan: ScanEvidence, references: References) -> list[str]:
     """A warning for each part of the scan whose projections are corrected with the flats of another part."""
-    starts = scan.table.part_starts
+    starts, warnings = scan.table.part_starts, list[str]()
     flats = [position for position, _ in references.flats]
     for start, end in zip(starts, [*starts[1:], len(scan.table)], strict=True):
         has_views = scan.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
-            warn(
+            warnings.append(
                 f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. Their projections "
                 "are corrected with the nearest flats of another part, although the beam may have "
                 "changed."
             )
+    return warnings

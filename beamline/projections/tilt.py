@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan, apply
 from recon.base.views import spread_views
 from recon.prep.axis_wedge import FEWEST_BANDS
 from recon.prep.tilt import TiltEstimate, find_tilt
@@ -23,18 +23,18 @@ _SURE = 3.0  # standard deviations from which a tilt is significant
 BandsDone = Callable[[int, int], None]  # (n, N): n bands of rows of N are corrected
 
 
-def warn_of_tilt(correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone) -> None:
+def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn, progress: BandsDone) -> None:
     """Warn if the corrected rows of a parallel beam show a significant tilt.
 
     Args:
         frames: projections that may be used.
     """
-    rows = (correction.rows.stop - correction.rows.start) // correction.binning
+    rows = _rows_of(plan)
     if rows < _FEWEST_ROWS:
         return
-    frames = spread_views(correction.source.table.angles[frames], _VIEWS, frames)
+    frames = spread_views(plan.source.table.angles[frames], _VIEWS, frames)
     try:
-        shown = shown_tilt(correction, frames, (_BANDS, _BAND_ROWS), progress)
+        shown = shown_tilt(plan, frames, (_BANDS, _BAND_ROWS), progress, warn)
     except (ValueError, DataError):
         return  # the tilt could not be measured, and nobody asked for it
     if abs(shown.tilt) * rows > MATTERS and abs(shown.tilt) > _SURE * shown.uncertainty:
@@ -46,21 +46,29 @@ def warn_of_tilt(correction: ScanCorrection, frames: NDArray[np.int64], warn: Wa
         )
 
 
+def _rows_of(plan: ScanCorrectionPlan) -> int:
+    """Number of binned rows."""
+    rows = plan.selection.detector_rows
+    return (rows.stop - rows.start) // plan.selection.binning
+
+
 def shown_tilt(
-    correction: ScanCorrection,
+    plan: ScanCorrectionPlan,
     frames: NDArray[np.int64],
     size: tuple[int, int],
     progress: BandsDone,
+    warn: Warn | None = None,
 ) -> TiltEstimate:
     """The tilt measured in corrected projections, from the bands of rows that can be corrected.
 
     Args:
         size: number of bands, and rows of each.
+        warn: as in `apply`.
 
     Raises:
         ValueError: see `find_tilt`.
     """
-    rows = (correction.rows.stop - correction.rows.start) // correction.binning
+    rows = _rows_of(plan)
     bands, thick = size
     height = max(1, min(thick, rows // bands))
     means: list[NDArray[np.float32]] = []
@@ -68,7 +76,7 @@ def shown_tilt(
     for n, first in enumerate(np.unique(np.linspace(0, rows - height, min(bands, rows)).round().astype(int)).tolist()):
         progress(n, bands)
         try:
-            band = correction.at_once(frames, slice(first, first + height))
+            band = apply(plan, frames, slice(first, first + height), warn)
         except DataError:
             continue  # no beam in these rows
         if not means:
@@ -79,7 +87,7 @@ def shown_tilt(
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"only {len(means)} bands of rows can be used; at least {FEWEST_BANDS} are needed")
-    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), correction.source.table.angles[ids])
+    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), plan.source.table.angles[ids])
 
 
 def tilt_text(tilt: float, uncertainty: float) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan
 from beamline.projections.corrections.width import Width
 from beamline.projections.preparation import Preparation
 from beamline.projections.selection import ScanSelection
@@ -89,7 +89,7 @@ class AxisSearch:
     def look(
         self,
         followed: FollowedViews,
-        correction: ScanCorrection,
+        plan: ScanCorrectionPlan,
         views: NDArray[np.int64],
         known: float | None,
         ended: bool,
@@ -118,15 +118,16 @@ class AxisSearch:
             return search, known
         search = replace(search, next_views=views.size + views.size // 2, settled=ended)
         last_chance = ended and known is None
-        quiet = warn if last_chance else lambda sentence: None  # the axis will be searched again
         try:
-            axis_col, estimate = locate_axis(correction, views, quiet, all_there=ended)
+            located = locate_axis(plan, views, warn, all_there=ended)
         except DataError:  # the projections do not cover enough angles yet
             if last_chance:
                 raise
         else:
-            if estimate.confident or last_chance:
-                search, known = replace(search, estimate=estimate), axis_col
+            if last_chance and located.warning:  # before, the axis will be searched again
+                warn(located.warning)
+            if located.estimate.confident or last_chance:
+                search, known = replace(search, estimate=located.estimate), located.col
                 warn.withdraw(_UNKNOWN)
         if known is None and np.pi / 2 <= turned < np.pi and not self.told:
             search = replace(search, told=True)

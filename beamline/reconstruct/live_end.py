@@ -9,6 +9,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import StateEntered
 from beamline.core.text import count, frames_text
 from beamline.projections.consistency import compare_with_flats
+from beamline.projections.growing import outdated
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PlaceStep, ScanStep
@@ -48,7 +49,7 @@ def ended(live: LiveScan, state: Feeds, scan: ScanEvidence, usable: UsableViews)
             "scan, run `beamline recon` on the file: it uses the longer part of the scan, before or after the jump."
         )
     table = live.source.table
-    why = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if state.correction.outdated else _OFFSET
+    why = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if outdated(state.correction) else _OFFSET
     state = corrected_again(live, state, usable, why, table.offset_views)
     return LastFit(_prepared(live, state, scan, usable), state.fit, state.axis_col, state.history)
 

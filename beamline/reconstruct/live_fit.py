@@ -16,7 +16,7 @@ from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.job import progress_events
 from beamline.reconstruct.live_end import ended, final_fit
 from beamline.reconstruct.live_states import Cursor, Feeds, Following, LastFit, LiveScan, WaitsForAxis
-from beamline.reconstruct.live_steps import after_progress, first_state, next_state
+from beamline.reconstruct.live_steps import after_progress, corrected_alone, first_state, next_state
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.pass_laws import PassLaws
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
@@ -115,10 +115,11 @@ class ScanFollower:
 
         Before the axis is known, the middle of the detector is used as axis.
         """
-        if isinstance(self.state, WaitsForAxis):
-            self._slices.draw_about_middle(self.state.correction.renewed, pause)
-        elif isinstance(self.state, Feeds):
-            self._slices.draw(self.state.corrected, self.state.axis_col, pause)
+        state = self.state
+        if isinstance(state, WaitsForAxis):
+            self._slices.draw_about_middle(lambda frames: corrected_alone(self._live, state, frames), pause)
+        elif isinstance(state, Feeds):
+            self._slices.draw(state.corrected, state.axis_col, pause)
 
     def write_snapshot(self) -> None:
         """Write the current volume and its picture, replacing the last ones; nothing before the fit has begun."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Warnings
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.growing import FedCorrection
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
@@ -118,7 +118,7 @@ class WaitsForAxis:
         search: the search so far.
     """
 
-    correction: ScanCorrection
+    correction: FedCorrection
     search: AxisSearch
 
 
@@ -126,11 +126,11 @@ class WaitsForAxis:
 class Feeds:
     """The fit takes the projections as they come.
 
-    `correction`, `fit` and `batches` change in place, the last one so that a scan is in memory only once. So only the
+    `fit` and `batches` change in place, the last one so that a scan is in memory only once. So only the
     newest `Feeds` is valid.
 
     Attributes:
-        correction: corrects the next projections; it remembers those before.
+        correction: corrects the next projections; it knows those before.
         axis_col: the rotation axis in pixels of the file.
         search: how the axis was found. While it is not settled, a better axis may be found.
         fit: has the projections of `batches` and the newest one.
@@ -142,7 +142,7 @@ class Feeds:
         told_behind: it was reported that the fit is slower than the scan.
     """
 
-    correction: ScanCorrection
+    correction: FedCorrection
     axis_col: float
     search: AxisSearch
     fit: StreamingFit

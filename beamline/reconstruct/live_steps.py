@@ -9,18 +9,19 @@ from numpy.typing import NDArray
 
 from beamline.core.recon_events import ReconStarted
 from beamline.core.text import count
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import NO_VIEWS, apply, survey
+from beamline.projections.growing import FedCorrection, feed, ignores_shadow, newest_lines, outdated
 from beamline.projections.selection import check_axis
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import refuse
 from beamline.reconstruct.followed_views import AxisSearch
 from beamline.reconstruct.live_states import Cursor, Feeds, Following, LiveScan, WaitsForAxis, WaitsForReferences
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from recon.base.method import Progress
 from recon.prep.projections import Projections, merge_and_empty
 from recon.splatting.stream import StreamingFit
 
-NO_VIEWS = np.empty(0, np.int64)  # rows of the file
 _ONE_VIEW = np.zeros(1)  # rad
 BATCH_VIEWS = 32  # projections that are corrected before the fit continues
 _BEHIND = (
@@ -83,7 +84,7 @@ def with_references(live: LiveScan, state: WaitsForReferences, ended: bool) -> F
             )
         return replace(state, evidence=evidence, come_last=True)
     refuse(live.source, blockers)
-    correction = ScanCorrection(evidence, live.selection, live.warn)
+    correction = new_correction(live, evidence)
     live.tell_done(correction.plan.done)
     if state.axis_col is None:
         return WaitsForAxis(correction, AxisSearch())
@@ -96,7 +97,7 @@ def with_axis(live: LiveScan, state: WaitsForAxis, file: Cursor) -> WaitsForAxis
     Raises:
         DataError: the scan has ended, and no axis is found.
     """
-    search, axis_col = state.search.look(live.views, state.correction, file.views, None, file.ended, live.warn)
+    search, axis_col = state.search.look(live.views, state.correction.plan, file.views, None, file.ended, live.warn)
     if axis_col is None:
         return replace(state, search=search)
     return _begun(live, state.correction, axis_col, search)
@@ -105,7 +106,7 @@ def with_axis(live: LiveScan, state: WaitsForAxis, file: Cursor) -> WaitsForAxis
 def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
     """After a large move of the axis the fit begins again with all projections; after a small one it continues."""
     before = state.axis_col
-    search, axis_col = state.search.look(live.views, state.correction, file.views, before, file.ended, live.warn)
+    search, axis_col = state.search.look(live.views, state.correction.plan, file.views, before, file.ended, live.warn)
     if axis_col is None or axis_col == before:
         return replace(state, search=search)
     if abs(axis_col - before) <= _AXIS_MOVES:
@@ -118,7 +119,20 @@ def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
     return replace(state, search=search, axis_col=axis_col, fit=fit, newest=None)  # the next views bring it again
 
 
-def _begun(live: LiveScan, correction: ScanCorrection, axis_col: float, search: AxisSearch) -> Feeds:
+def new_correction(live: LiveScan, evidence: ScanEvidence, views: NDArray[np.int64] = NO_VIEWS) -> FedCorrection:
+    """A correction with these references, which has corrected no projection yet; `views` as in `survey`."""
+    plan = survey(evidence, live.selection, views)
+    for sentence in plan.warnings:
+        live.warn(sentence)
+    return FedCorrection(plan)
+
+
+def corrected_alone(live: LiveScan, state: WaitsForAxis, frames: NDArray[np.int64]) -> Projections:
+    """Line integrals of frames with all references recorded by now, without feeding anything."""
+    return apply(new_correction(live, state.correction.plan.scan.renewed()).plan, frames, warn=live.warn)
+
+
+def _begun(live: LiveScan, correction: FedCorrection, axis_col: float, search: AxisSearch) -> Feeds:
     return Feeds(correction, axis_col, search, _new_fit(live, axis_col, again=False))
 
 
@@ -154,7 +168,7 @@ def _in_part(live: LiveScan, state: Feeds, part: int) -> Feeds:
     state = settled(live, replace(state, part=part))
     if state.batches:
         return corrected_again(live, state, live.views.usable(), _NEXT_PART)
-    return replace(state, correction=state.correction.renewed())
+    return replace(state, correction=new_correction(live, state.correction.plan.scan.renewed()))
 
 
 def settled(live: LiveScan, state: Feeds) -> Feeds:
@@ -164,7 +178,8 @@ def settled(live: LiveScan, state: Feeds) -> Feeds:
 
 def _with_frames(live: LiveScan, state: Feeds, frames: NDArray[np.int64], last: bool) -> Feeds:
     """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
-    newest, batch = state.newest, state.correction.feed(frames, last=last)
+    newest = state.newest
+    batch, correction = feed(state.correction, frames, last=last, warn=live.warn)
     if batch is not None:
         data, views = batch.measured, batch.view_ids
         if newest is not None:
@@ -174,9 +189,9 @@ def _with_frames(live: LiveScan, state: Feeds, frames: NDArray[np.int64], last: 
         state.batches.append(batch)
         if views.size:
             state.fit.add_views(data, live.views.angles(state.axis_col, views))
-    if newest is None and (newest := state.correction.newest()) is not None:
+    if newest is None and (newest := newest_lines(correction)) is not None:
         state.fit.add_views(newest.measured, live.views.angles(state.axis_col, newest.view_ids))
-    return replace(state, newest=newest)
+    return replace(state, correction=correction, newest=newest)
 
 
 def corrected_again(
@@ -197,8 +212,8 @@ def corrected_again(
     kept = np.flatnonzero(np.isin(ids, usable.frames))
     frames = ids[kept]
     gone = ids.size - frames.size
-    shaded = correction.finds_shadow(frames)
-    if not (gone or shaded or wide.size or correction.outdated or source.table.part_starts.size > 1):
+    shaded = ignores_shadow(correction, frames)
+    if not (gone or shaded or wide.size or outdated(correction) or source.table.part_starts.size > 1):
         return state
     if shaded:
         why = _SHADED
@@ -209,8 +224,8 @@ def corrected_again(
         )
     live.enter("correcting", why)
     state.batches.clear()  # not both in memory
-    correction = correction.renewed(every := np.union1d(frames, wide))
-    again = correction.at_once(every)
+    correction = new_correction(live, correction.plan.scan.renewed(), every := np.union1d(frames, wide))
+    again = apply(correction.plan, every, warn=live.warn)
     state.batches.append(again)
     ordinary = again.measured[~np.isin(again.view_ids, wide)] if wide.size else again.measured
     state.fit.replace_views(ordinary, kept if gone else None)

@@ -11,6 +11,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Sink
 from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
+from beamline.projections.correction import flats_as_projections
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.live_states import Cursor, Feeds, Following, WaitsForAxis, WaitsForReferences
 from drivers.base.clock import Clock
@@ -64,7 +65,7 @@ class PassLaws:
         views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
         try:
             geometry, _ = self._views.geometry(state.axis_col, rows)
-            open_beam = state.correction.open_beam(_NOISE_FLATS)
+            open_beam = flats_as_projections(state.correction.plan, _NOISE_FLATS)
             law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
             self._no_law(ends.size, rows.size, str(error) or "there is not enough memory")

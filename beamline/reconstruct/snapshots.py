@@ -16,7 +16,6 @@ from beamline.core.files import write_whole
 from beamline.core.recon_events import SlicesDrawn, SnapshotWritten
 from beamline.core.sinks import Warnings
 from beamline.plan.plan import one_way
-from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.live_picture import PictureRow, live_picture, slice_panels, volume_rows
@@ -167,14 +166,16 @@ class LiveSlices:
         end = self._clock.now()
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
-    def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float | None) -> None:
-        """Draw slices before the axis is known, from some projections that are corrected only for this."""
+    def draw_about_middle(self, lines_of: Callable[[NDArray[np.int64]], Projections], pause: float | None) -> None:
+        """Draw slices before the axis is known, from some projections (rows of the file) that `lines_of` corrects only
+        for this.
+        """
         views = self._views.chosen(self._views.usable().frames)
         early = pause is not None and self._clock.now() < self._next
         if views.size < _FEWEST or early or int(views[-1]) == self._newest:
             return
         with suppress(DataError):  # for example projections without beam; the scan and the fit continue
-            self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
+            self.draw([lines_of(spread(views, _BEFORE_AXIS))], None, pause, views.size)
 
 
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:

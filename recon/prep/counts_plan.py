@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,7 +254,9 @@ def survey(
     settings: CorrectionSettings | None = None,
     masked: Mask | None = None,
     standing: Mask | None = None,
-    **known: Any,
+    photons: Photons | None = None,
+    foreign: Mask | None = None,
+    light: F64 | None = None,
 ) -> CorrectionPlan:
     """The correction plan for these flats and darks.
 
@@ -262,7 +264,7 @@ def survey(
         references: darks and flats of the same detector area as the projections.
         masked: bool [row, col], pixels to fill; None: `dead_pixels` of the darks and flats.
         standing: bool [row, col], further pixels to fill, in the shadow of a fixed object; None: none.
-        known: values for `photons`, `foreign` and `light` of the plan.
+        photons, foreign, light: those of the plan.
 
     Raises:
         ValueError: shapes do not match, there are no flats, or the flats show no beam.
@@ -286,7 +288,7 @@ def survey(
     spots = SpotFilter(settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
     starts, hidden, filling = references.part_starts, areas(masked), plan_fill(masked)
     return CorrectionPlan(
-        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, **known
+        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, photons, foreign, light
     )  # fmt: skip
 
 

@@ -7,8 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from beamline.core.sinks import Warn
+from beamline.projections.correction import ScanCorrectionPlan
+from beamline.projections.growing import FedCorrection, feed
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
@@ -17,7 +21,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.geometry import Geometry
-from recon.prep.projections import Projections
+from recon.prep.projections import Projections, merge_and_empty
 
 
 def prepare(
@@ -33,6 +37,21 @@ def prepare(
 def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
     """The evidence of a scan as a reconstruction of `selection` uses it."""
     return ScanEvidence(source, evidence_request(source, selection))
+
+
+def feed_batches(
+    plan: ScanCorrectionPlan, batches: list[NDArray[np.int64]], *, ended: bool = True, warn: Warn = pytest.fail
+) -> tuple[Projections, FedCorrection]:
+    """Line integrals of batches of frames that are fed one after the other, and the state after them.
+
+    Args:
+        ended: the last batch is fed as the last one; otherwise the end comes later.
+    """
+    state, parts = FedCorrection(plan), list[Projections]()
+    for n, batch in enumerate(batches if ended else [*batches, np.arange(0)], 1):
+        lines, state = feed(state, batch, last=n == len(batches) + (not ended), warn=warn)
+        parts += [] if lines is None else [lines]
+    return merge_and_empty(parts), state
 
 
 def prepared_views(

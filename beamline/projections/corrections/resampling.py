@@ -224,16 +224,14 @@ def _refined(
     Raises:
         ValueError: see `find_tilt`.
     """
-    from beamline.projections.correction import ScanCorrection
+    from beamline.projections.correction import survey
     from beamline.projections.tilt import shown_tilt
 
     plain, step = _without_blur(selection), selection.step(TiltAndLens)
     rows = scan.source.shape[0] / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = ScanCorrection(
-            scan, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None, frames
-        )  # fmt: skip
+        levelled = survey(scan, plain.with_steps(replace(step, tilt=math.degrees(tilt))), frames)
         residual = shown_tilt(levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress))
         tilt += residual.tilt
         if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey
 from beamline.projections.corrections.air import Air
+from beamline.projections.growing import ignores_shadow, outdated
 from beamline.projections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import references_usable
-from recon.prep.projections import merge_and_empty
 from tests.beamline.array_source import ArraySource, counted, scan_of
-from tests.beamline.prepared_views import evidence_of
+from tests.beamline.prepared_views import evidence_of, feed_batches
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
 
@@ -26,26 +26,23 @@ SCAN = TwoCylinders()
 PLAIN = Selection(steps=(Air("none"),))
 
 
-def correction_of(source: Any, selection: Selection, warn: Callable[[str], None] = pytest.fail) -> ScanCorrection:
-    return ScanCorrection(evidence_of(source, selection), selection.of(source), warn)
+def plan_of(source: Any, selection: Selection) -> ScanCorrectionPlan:
+    return survey(evidence_of(source, selection), selection.of(source))
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
 @pytest.mark.parametrize("sizes", others_slow([[45], [7, 20, 18], [1] * 45], 2))
 @pytest.mark.parametrize("ended", ["with the last batch", "later"])
 def test_batches_are_the_views_at_once_also_where_the_end_comes_later(sizes: list[int], air: str, ended: str) -> None:
-    correction = correction_of(counted(SCAN.counts(), SCAN.angles), Selection(steps=(Air(air),)))
+    plan = plan_of(counted(SCAN.counts(), SCAN.angles), Selection(steps=(Air(air),)))
     ends = np.cumsum([2, *sizes])
     batches = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
-    fed = [correction.feed(batch, last=ended != "later" and batch[-1] == 46) for batch in batches]
-    if ended == "later":
-        fed.append(correction.feed(np.arange(0), last=True))
-    parts = merge_and_empty([part for part in fed if part is not None])
-    whole = correction.renewed().at_once(np.arange(2, 47))
-    if not correction.outdated:
-        np.testing.assert_array_equal(parts.data, whole.data)
-    assert correction.outdated <= (air == "auto" and len(sizes) > 1)
-    np.testing.assert_array_equal(parts.view_ids, whole.view_ids)
+    fed, state = feed_batches(plan, batches, ended=ended != "later")
+    whole = apply(plan, np.arange(2, 47), warn=pytest.fail)
+    if not outdated(state):
+        np.testing.assert_array_equal(fed.data, whole.data)
+    assert outdated(state) <= (air == "auto" and len(sizes) > 1)
+    np.testing.assert_array_equal(fed.view_ids, whole.view_ids)
 
 
 def test_at_once_in_batches_and_as_they_come_are_loops_over_one_plan(rng: np.random.Generator) -> None:
@@ -54,18 +51,19 @@ def test_at_once_in_batches_and_as_they_come_are_loops_over_one_plan(rng: np.ran
     counts[:, :, :5] = DARK + rng.integers(-3, 4, (45, 4, 5))
     counts[rng.random(counts.shape) < 4e-3] += np.uint16(BEAM // 8)
     source, frames = counted(counts, SCAN.angles), np.arange(2, 47)
-    scan, said, out = evidence_of(source, PLAIN), list[str](), np.empty((45, 4, 40), np.float32)
-    correction = ScanCorrection(scan, PLAIN.of(source), said.append, frames)
-    whole, plan = correction.at_once(frames), correction.plan
-    batches = correction.in_batches(frames, out, 7, lambda n, of: None)
-    fed = [correction.feed(part, last=part[-1] == 46) for part in np.array_split(frames, 6)]
-    parts = merge_and_empty([part for part in fed if part is not None])
-    assert plan is correction.plan and plan.shadow is not None
+    out = np.empty((45, 4, 40), np.float32)
+    plan = survey(evidence_of(source, PLAIN), PLAIN.of(source), frames)
+    whole = apply(plan, frames)
+    batches = apply_in_batches(plan, frames, out, 7, None, lambda n, of: None)
+    fed, state = feed_batches(plan, np.array_split(frames, 6), warn=lambda sentence: None)
+    assert plan.shadow is not None
     assert plan.shadow[0][:, :5].all() and not plan.shadow[0][:, 8:].any() and whole.replaced > 0
-    for found in (batches, parts):
+    for found in (batches, fed):
         np.testing.assert_array_equal(found.data, whole.data)
         np.testing.assert_array_equal(found.masked, whole.masked)
-    assert not correction.finds_shadow(frames) and not correction.outdated
+    assert not ignores_shadow(state, frames) and not outdated(state)
+    unaware = replace(state, plan=survey(evidence_of(source, PLAIN), PLAIN.of(source)))
+    assert ignores_shadow(unaware, frames)
 
 
 PARTS = {  # image keys of two parts
@@ -84,17 +82,18 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     keys, beam = np.array(first + second), np.repeat([BEAM, left * BEAM], [len(first), len(second)])
     light = beam * np.choose(keys, [0.5, 1.0, 0.0])
     data = rng.poisson(DARK + light[:, None, None] * np.ones((1, 20, 80))).astype(np.uint16)
-    source, said = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size)), list[str]()
+    source = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size))
     source.state(part_starts=np.array([0, len(first)]))
     views = np.flatnonzero(keys == 0)
-    found = correction_of(source, PLAIN, said.append).at_once(views)
+    plan = plan_of(source, PLAIN)
+    found = apply(plan, views, warn=pytest.fail)
     truth = np.full(views.size, 0.5)
     if flats == "the second without flats":
         truth[9:] *= left  # by the beam of the first
-        (warning,) = said
+        (warning,) = plan.warnings
         assert f"Frames {len(first)}-{keys.size - 1}, a part of the scan, have no usable flats" in warning
     else:
-        assert said == []
+        assert plan.warnings == ()
     np.testing.assert_allclose(np.exp(-found.data).mean(axis=(1, 2)), truth, rtol=3e-3)  # 5 sigma of 1600 pixels
 
 
@@ -108,14 +107,14 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     source = scan_of(data[:1], data[1:13], data[13:], SCAN.angles, np.float32)
     errors = []
     for way in ("groups", "dynamic"):
-        correction = correction_of(source, Selection(steps=(Preparation(flat_fields=way),)))
-        assert bool(correction.plan.done["flats"].sentence) is (way == "dynamic")
-        errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
+        plan = plan_of(source, Selection(steps=(Preparation(flat_fields=way),)))
+        assert bool(plan.done["flats"].sentence) is (way == "dynamic")
+        errors.append(float(np.std(apply(plan, np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "principal components of the flats" in correction.plan.done["flats"].sentence
+    assert "principal components of the flats" in plan.done["flats"].sentence
     few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
-        correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
+        plan_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)))
 
 
 def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
@@ -126,21 +125,21 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     source = scan_of(data[:1], data[1:3], data[3:], SCAN.angles, np.float32)
     used = PLAIN.with_steps(Preparation(ring_current="use"))
     with pytest.raises(ConfigError, match="no ring current"):
-        correction_of(source, used)
+        plan_of(source, used)
     source.state(currents=current)
     off = []
     for selection in (PLAIN, used):
-        correction = correction_of(source, selection)
-        off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
+        plan = plan_of(source, selection)
+        off.append(float(np.abs(apply(plan, np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
     assert (
-        correction.plan.done["flats"].sentence
+        plan.done["flats"].sentence
         == "The ring current of the projections varies from 0.857 to 1.143 times its median; this was corrected."
     )
     current[2] = np.nan
     source.state(currents=current)
     with pytest.raises(ConfigError, match="projections or flats"):
-        correction_of(source, used)
+        plan_of(source, used)
 
 
 BIAS, GLOW = 100.0, 20_000.0  # counts, and counts a second of dark current
@@ -166,9 +165,9 @@ def _exposed(dark: list[float], flat: float, views: np.ndarray, glow: float = GL
 )
 def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
     source = _exposed(dark, flat, np.full(45, 0.2))
-    frames, correction = np.flatnonzero(source.table.kinds == 0), correction_of(source, PLAIN)
-    batches = correction.in_batches(frames, np.empty((45, 4, 40), np.float32), 7, lambda n, of: None)
-    for found in (correction.at_once(frames), batches):
+    frames, plan = np.flatnonzero(source.table.kinds == 0), plan_of(source, PLAIN)
+    batches = apply_in_batches(plan, frames, np.empty((45, 4, 40), np.float32), 7, pytest.fail, lambda n, of: None)
+    for found in (apply(plan, frames, warn=pytest.fail), batches):
         np.testing.assert_allclose(found.data, SCAN.line_integrals(), atol=3e-3)
     assert not list(references_usable(ScanEvidence(source)))
 
@@ -177,10 +176,10 @@ def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
 def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     views = 0.2 + 0.1 * np.sin(2 * SCAN.angles)
     source = _exposed([0.2], flat, views, glow=0.0)
-    correction = correction_of(source, PLAIN)
-    found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
+    plan = plan_of(source, PLAIN)
+    found = apply(plan, np.flatnonzero(source.table.kinds == 0), warn=pytest.fail).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
-    assert correction.plan.done["flats"].sentence.startswith("Exposure times of the projections vary from 0.1")
+    assert plan.done["flats"].sentence.startswith("Exposure times of the projections vary from 0.1")
     assert not list(references_usable(ScanEvidence(source)))
 
 
@@ -191,7 +190,7 @@ def test_spots_are_sought_beside_views_with_the_sample_at_the_same_place(rng: np
     views[rng.random(views.shape) < 1e-3] += np.uint16(BEAM // 10)
     source = counted(np.concatenate([views, wide]), np.r_[angles, angles[::3]])
     source.state(aside=np.r_[np.zeros(2 + len(views)), np.full(len(wide), 0.5)])
-    both = correction_of(source, PLAIN, lambda sentence: None).at_once(np.arange(2, len(source.table)))
-    alone = correction_of(counted(views, angles), PLAIN, lambda sentence: None).at_once(np.arange(2, 2 + len(views)))
+    both = apply(plan_of(source, PLAIN), np.arange(2, len(source.table)))
+    alone = apply(plan_of(counted(views, angles), PLAIN), np.arange(2, 2 + len(views)))
     assert alone.replaced > 0
     np.testing.assert_array_equal(both.data[: len(views) - 1], alone.data[:-1])  # the last is beside a wide one

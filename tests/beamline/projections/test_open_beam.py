@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.correction import survey
+from beamline.projections.correction import ScanCorrectionPlan, survey
 from beamline.projections.corrections.air import Air
-from beamline.projections.open_beam import OpenBeam
 from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
@@ -36,11 +35,11 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
     return scan_of(darks, flats, views, SCAN.angles, np.float32)
 
 
-def beam_of(source: Any, *steps: PrepStep, **chosen: Any) -> OpenBeam:
+def plan_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrectionPlan:
     selection = replace(PLAIN, **chosen).with_steps(*steps)
-    beam = survey(evidence_of(source, selection), selection.of(source), pytest.fail).beam
-    assert beam is not None
-    return beam
+    plan = survey(evidence_of(source, selection), selection.of(source))
+    assert plan.references is not None and not plan.warnings
+    return plan
 
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:
@@ -70,7 +69,7 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     (30, "auto", True), (1000, "auto", False), (1000, "counts", True), (30, "log", False)
 ])  # fmt: skip
 def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, counted: bool) -> None:
-    found = beam_of(scan(photons), Preparation(noise=noise))
+    found = plan_of(scan(photons), Preparation(noise=noise))
     assert (found.photons is not None) == counted
     if found.photons is not None:
         assert found.photons.gain == pytest.approx(GAIN, rel=0.1)
@@ -85,7 +84,7 @@ def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
     """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
     source = scan(20)
     source.frames_per_view = frames
-    found = beam_of(source, Preparation(noise="counts", gain=gain), binning=binning)
+    found = plan_of(source, Preparation(noise="counts", gain=gain), binning=binning)
     assert found.photons is not None
     assert found.photons.gain == pytest.approx(GAIN / of, rel=0.1)
     assert found.photons.variance == pytest.approx(READOUT**2 / of, rel=0.2)
@@ -131,5 +130,5 @@ def test_dark_corners_of_the_frame_are_no_lack_of_photons(gain: float) -> None:
     counts = (DARK + gain * rng.poisson(2000.0 * window * light) for light in np.exp(-np.r_[[0 * EXACT[0]] * 6, EXACT]))
     frames = np.stack([*counts])
     darks = rng.normal(DARK, 2, (6, rows, cols)).round()
-    found = beam_of(scan_of(darks, frames[:6], frames[6:], SCAN.angles, np.float32))
+    found = plan_of(scan_of(darks, frames[:6], frames[6:], SCAN.angles, np.float32))
     assert window.mean() < 0.5 and found.photons is None

@@ -56,7 +56,7 @@ def test_flats_are_grouped_by_the_views_between_them() -> None:
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
     source = ArraySource(data, keys, np.zeros(12))
     accepting = Selection(steps=(Preparation(references="accept"),))
-    references = read_references(evidence_of(source, accepting), slice(0, 2), accepting.of(source))
+    references, _ = read_references(evidence_of(source, accepting), slice(0, 2), accepting.of(source))
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

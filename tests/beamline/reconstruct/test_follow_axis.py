@@ -12,6 +12,7 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.core.sinks import Warnings
+from beamline.projections.axis import LocatedAxis
 from beamline.projections.selection import Selection
 from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -63,7 +64,7 @@ def test_a_post_that_shows_itself_at_the_end_does_not_draw_the_axis_away(tmp_pat
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def locate(corrector: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         value = 18.0 if frames.size < 20 else 20.7
-        return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
+        return LocatedAxis(value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair"))
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
@@ -94,7 +95,7 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     def locate(correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         looks.append(frames.size)
         sure = source.table.angles[frames[-1]] > np.radians(175)
-        return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
+        return LocatedAxis(20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn"))
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
     followed = followed_views.FollowedViews(source, selected)

@@ -13,7 +13,8 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.sinks import Warnings
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.axis import LocatedAxis
+from beamline.projections.correction import apply, survey
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import checked_views, evidence_request
@@ -27,6 +28,7 @@ from beamline.reconstruct.live_steps import (
     fed,
     first_state,
     joined,
+    new_correction,
     next_state,
     settled,
     with_axis,
@@ -77,7 +79,7 @@ def axis_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, bool], None]:
 
     def answer(column: float, clear: bool) -> None:
         estimate = AxisEstimate(column, np.arange(3.0), np.arange(3.0), clear, "pair")
-        monkeypatch.setattr(followed_views, "locate_axis", lambda *_, **__: (column, estimate))
+        monkeypatch.setattr(followed_views, "locate_axis", lambda *_, **__: LocatedAxis(column, estimate))
 
     return answer
 
@@ -136,7 +138,7 @@ class TestWaitsForAxis:
     @pytest.fixture
     def waits(self, live: Callable[..., Any]) -> tuple[LiveScan, WaitsForAxis]:
         scan, _ = live(selection=UNKNOWN)
-        return scan, WaitsForAxis(ScanCorrection(scan.evidence, scan.selection, scan.warn), AxisSearch())
+        return scan, WaitsForAxis(new_correction(scan, scan.evidence), AxisSearch())
 
     def test_an_unclear_axis_is_searched_again_with_half_as_many_projections_again(
         self, waits: tuple[LiveScan, WaitsForAxis], axis_at: Callable[[float, bool], None]
@@ -176,7 +178,7 @@ class TestFeeds:
             state, file = fed(scan, state, _file(n, ended=n == 30, taken=file.taken))
             assert (state.n_views, state.fit.n_views, file.behind) == (n, n, False)
         assert state.newest is None
-        whole = ScanCorrection(scan.evidence, scan.selection, scan.warn).at_once(ROWS)
+        whole = apply(survey(scan.evidence, scan.selection), ROWS)
         np.testing.assert_array_equal(joined(state).data, whole.data)
         assert len(state.batches) == 1
 

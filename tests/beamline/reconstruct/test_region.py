@@ -90,8 +90,8 @@ def test_fbp_of_a_region_reports_no_residual() -> None:
 @pytest.mark.parametrize(
     ("options", "step", "said"),
     [
-        ("38:60,10:40,4:49 --axis 23.2", "ScanCorrection", "x 4:49 does not lie"),
-        ("38:60,10:97,4:29", "ScanCorrection", "y 10:97 does not lie within the widest volume's range 0:96"),
+        ("38:60,10:40,4:49 --axis 23.2", "survey", "x 4:49 does not lie"),
+        ("38:60,10:97,4:29", "survey", "y 10:97 does not lie within the widest volume's range 0:96"),
         ("38:60,10:40,4:49", "assemble", "x 4:49 does not lie within the volume's range 0:48"),
     ],
     ids=["by the axis given", "by the detector", "by the axis found"],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import apply, apply_in_batches, survey
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.preparation import Preparation
@@ -105,14 +105,15 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
     plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
-    correction = ScanCorrection(evidence_of(source, selection), selection.of(source), pytest.fail)
-    whole = correction.at_once(frames).data
-    np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
+    plan = survey(evidence_of(source, selection), selection.of(source))
+    whole = apply(plan, frames, warn=pytest.fail).data
+    np.testing.assert_array_equal(apply(plan, frames, slice(9, 12), pytest.fail).data, whole[:, 9:12])
     rows = replace(selection, rows=(8 * binning, 14 * binning))
-    band = ScanCorrection(evidence_of(source, rows), rows.of(source), pytest.fail).at_once(frames).data
+    band = apply(survey(evidence_of(source, rows), rows.of(source)), frames, warn=pytest.fail).data
     np.testing.assert_array_equal(band, whole[:, 8:14])
     out = np.empty(whole.shape, np.float32)
-    np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)
+    batches = apply_in_batches(plan, frames, out, 9, pytest.fail, lambda *_: None)
+    np.testing.assert_array_equal(batches.data, whole)
 
 
 def test_what_cannot_be_levelled_is_refused() -> None:

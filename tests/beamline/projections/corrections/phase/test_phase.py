@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.preparation import Preparation
@@ -18,9 +18,9 @@ from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
 from recon.features.phase import FilterLength
-from recon.prep.projections import Projections, merge_and_empty
+from recon.prep.projections import Projections
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import evidence_of
+from tests.beamline.prepared_views import evidence_of, feed_batches
 from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.rims import views_of_can
@@ -34,31 +34,30 @@ def _source() -> ArraySource:
     return counted(DARK + BEAM * np.exp(-rng.uniform(0, 1, (8, 48, 40))), np.radians(np.arange(0, 180, 22.5)))
 
 
-def _correction(selection: Selection) -> ScanCorrection:
-    return ScanCorrection(evidence_of(_source(), selection), selection.of(_source()), pytest.fail)
+def _plan(selection: Selection) -> ScanCorrectionPlan:
+    return survey(evidence_of(_source(), selection), selection.of(_source()))
 
 
 def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
-    correction, frames = _correction(SELECTION), np.arange(2, 10)
-    whole = correction.at_once(frames)
-    fed = [correction.feed(frames[:3], last=False), correction.feed(frames[3:], last=True)]
-    parts = merge_and_empty([part for part in fed if part is not None])
-    np.testing.assert_array_equal(parts.data, whole.data)
+    plan, frames = _plan(SELECTION), np.arange(2, 10)
+    whole = apply(plan, frames, warn=pytest.fail)
+    fed, _ = feed_batches(plan, [frames[:3], frames[3:]])
+    np.testing.assert_array_equal(fed.data, whole.data)
     out = np.empty(whole.data.shape, np.float32)
-    np.testing.assert_array_equal(correction.in_batches(frames, out, 3, lambda *_: None).data, whole.data)
+    np.testing.assert_array_equal(apply_in_batches(plan, frames, out, 3, pytest.fail, lambda *_: None).data, whole.data)
 
 
 @pytest.mark.parametrize("binning", [1, 2])
 def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
     """Rows around those chosen are read as far as the filter reaches, so that a band has no mirrors of its own."""
     frames, selection = np.arange(2, 10), replace(SELECTION, binning=binning)
-    whole = _correction(selection).at_once(frames).data
-    band = _correction(replace(selection, rows=(20, 28))).at_once(frames).data
+    whole = apply(_plan(selection), frames, warn=pytest.fail).data
+    band = apply(_plan(replace(selection, rows=(20, 28))), frames, warn=pytest.fail).data
     assert band.shape[1] == 8 // binning
     np.testing.assert_allclose(band, whole[:, 20 // binning : 28 // binning], atol=0.01)
-    narrow = _correction(selection).at_once(frames, slice(4, 6)).data
+    narrow = apply(_plan(selection), frames, slice(4, 6), pytest.fail).data
     np.testing.assert_allclose(narrow, whole[:, 4:6], atol=0.01)
-    assert whole.std() < 0.5 * _correction(selection.with_steps(Phase())).at_once(frames).data.std()
+    assert whole.std() < 0.5 * apply(_plan(selection.with_steps(Phase())), frames).data.std()
 
 
 def test_what_the_file_does_not_say_is_asked_for() -> None:
@@ -72,7 +71,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     with pytest.raises(ConfigError, match=r"has only 48 x 40"):
         replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION.of(source))
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
-        _correction(SELECTION.with_steps(Preparation(noise="counts")))
+        _plan(SELECTION.with_steps(Preparation(noise="counts")))
 
 
 def test_a_cone_is_scaled_to_the_sample() -> None:
