@@ -260,13 +260,14 @@ from beamline.projections.selection import Selection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.lift import Lift
 from beamline.projections.registry import in_order, recorded
+from beamline.projections.views import select
 from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 path = write_exchange(Path("lift.h5"), TwoCylinders(shape=(2, 40)))
 with open_scan(SourceOptions(path)) as source:
     chosen = [Selection(axis_col=20.7, steps=(Air("none"), *steps)) for steps in ((), (Lift(0.5),))]
-    plain, lifted = (prepare_projections(source, each, print) for each in chosen)
+    plain, lifted = (prepare_projections(select(source, each), print) for each in chosen)
 np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
 assert lifted.done["lift"].sentence == "Lifted by 0.5."
 found = recorded(in_order(chosen[1]), lifted.done)

@@ -18,8 +18,8 @@ from beamline.page.volume import ShownVolume, VolumeTile
 from beamline.projections.correction import ScanCorrectionPlan, apply, survey
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.volumes.base import bare_record
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -86,6 +86,7 @@ class ShownScan:
 
     def __init__(self, source: ScanSource) -> None:
         self._source, self._views = source, _OverFlats(source)
+        self._scan = select(source, Selection())
         self._degrees = np.degrees(source.table.angles[self._views.frames])
         record = bare_record(source.path, self._views)
         self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
@@ -149,7 +150,7 @@ class ShownScan:
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
         data, angles = self._lines[::every], self._source.table.angles[self._ids[::every]]
-        geometry = Selection(rows=(self._band.start, self._band.stop)).of(self._source).geometry(axis_col, angles)
+        geometry = self._scan.part(rows=(self._band.start, self._band.stop)).selection.geometry(axis_col, angles)
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
         centred = abs(axis_col - (cols - 1) / 2) < _CENTRED * cols
@@ -207,7 +208,7 @@ class ShownScan:
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._plan = self._plan or survey(ScanEvidence(self._source), Selection().of(self._source), some)
+            self._plan = self._plan or survey(self._scan, some)
             corrected = apply(self._plan, some, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The projections cannot be corrected: {error}.") from error
@@ -218,7 +219,7 @@ class ShownScan:
         """The row [view, col] of projections that are turned by the tilt, linear between pixels."""
         if not tilt_deg:
             return data[:, row - self._band.start]
-        turned = TiltAndLens(tilt_deg).of(self._source, Selection().of(self._source))
+        turned = TiltAndLens(tilt_deg).of(self._scan)
         assert turned is not None
         (rows,), (cols,) = turned.places((1, data.shape[2]), row)
         rows, cols = np.clip(rows - self._band.start, 0, data.shape[1] - 1), np.clip(cols, 0, data.shape[2] - 1)

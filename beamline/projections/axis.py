@@ -13,10 +13,9 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrectionPlan, apply, line_integrals_of, survey
 from beamline.projections.corrections.poses import ScanPoses
-from beamline.projections.selection import ScanSelection, check_axis, unbinned
+from beamline.projections.selection import SelectedScan, check_axis, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
@@ -68,11 +67,11 @@ def rotation_axis(
     """
     if poses is not None and poses.vectors is not None:
         return poses.axis_col, None
-    scan, selection, axis = plan.scan, plan.selection, None
+    scan, selection, axis = plan.scan, plan.scan.selection, None
     axis_col = selection.axis_col
     straight = poses is None and selection.cone is None
     if axis_col is None and not straight:
-        axis_col, axis = _axis_by_views(scan, selection, usable.frames, poses, warn, progress)
+        axis_col, axis = _axis_by_views(scan, usable.frames, poses, warn, progress)
     elif axis_col is None:
         located = _axis_beside_jumps(plan, usable, warn, progress)
         axis_col, axis = located.col, located.estimate
@@ -89,7 +88,7 @@ def _compare_with_views(given: float, plan: ScanCorrectionPlan, frames: NDArray[
     with suppress(DataError):
         some = spread(frames, _COMPARED)
         shown = locate_axis(plan, some, all_there=False)
-        if shown.estimate.confident and abs(shown.col - given) > AGREE * plan.selection.binning:
+        if shown.estimate.confident and abs(shown.col - given) > AGREE * plan.scan.selection.binning:
             warn(
                 f"Check --axis: the projections show the rotation axis at column {shown.col:.2f}, but "
                 f"{given:g} was given. Columns are counted from 0 at the centre of the first column. "
@@ -99,8 +98,7 @@ def _compare_with_views(given: float, plan: ScanCorrectionPlan, frames: NDArray[
 
 
 def _axis_by_views(
-    scan: ScanEvidence,
-    selection: ScanSelection,
+    scan: SelectedScan,
     frames: NDArray[np.int64],
     poses: ScanPoses | None,
     warn: Warn,
@@ -108,19 +106,20 @@ def _axis_by_views(
 ) -> tuple[float, AxisEstimate | None]:
     """The axis found with held-out projections. The file's axis is kept unless they agree better with another one."""
     source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
-    if selection.axis_rows is not None:
-        selection = replace(selection, rows=selection.axis_rows)
+    if scan.selection.axis_rows is not None:
+        scan = scan.part(rows=scan.selection.axis_rows)
+    selection = scan.selection
     rows = selection.detector_rows
     # With few rows, columns would not be binned and volumes would take minutes, so more rows around them are read.
     height = max(rows.stop - rows.start, min(cols // COLS, source.shape[0]))
     first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
     binning = max(selection.binning, min(cols // COLS, height))
-    coarse = replace(selection, binning=binning, rows=(first, first + height))
+    coarse = scan.part(binning=binning, rows=(first, first + height))
     if poses is not None:
-        poses, frames = replace(poses, pivot=coarse.pivot, binning=binning), frames[poses.stated(frames)]
-    views = line_integrals_of(scan, coarse, spread(frames, VIEWS))
+        poses, frames = replace(poses, pivot=coarse.selection.pivot, binning=binning), frames[poses.stated(frames)]
+    views = line_integrals_of(coarse, spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
-    geometry = coarse.geometry(begin, source.table.angles[views.view_ids])
+    geometry = coarse.selection.geometry(begin, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
@@ -160,9 +159,8 @@ def _axis_beside_jumps(
     """The rotation axis from the longest part between jumps of the sample, if that part shows it clearly, otherwise
     from all projections.
     """
-    if plan.selection.axis_rows is not None:
-        other_rows = replace(plan.selection, rows=plan.selection.axis_rows)
-        plan, warn = survey(plan.scan, other_rows, usable.frames), None
+    if (rows := plan.scan.selection.axis_rows) is not None:
+        plan, warn = survey(plan.scan.part(rows=rows), usable.frames), None
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
@@ -189,7 +187,7 @@ def locate_axis(
     Raises:
         DataError: no axis in the search range explains the projections.
     """
-    rows, binning = plan.selection.detector_rows, plan.selection.binning
+    rows, binning = plan.scan.selection.detector_rows, plan.scan.selection.binning
     height = (rows.stop - rows.start) // binning
     start, source = max(0, (height - _AXIS_ROWS) // 2), plan.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)

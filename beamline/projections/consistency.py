@@ -16,10 +16,9 @@ from beamline.core.sinks import Warn
 from beamline.core.text import count, frames_text
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import ScanSelection, SelectedScan
 from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
-from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import WARN, check_air_level
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
@@ -162,7 +161,7 @@ def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np
 
 
 def compare_with_flats(
-    scan: ScanEvidence, selection: ScanSelection, projections: Projections, warn: Warn, *, refused: bool = True
+    scan: SelectedScan, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
     """Warn of projections whose intensity does not match their flats. Returns in words how bright their air is
     relative to the flats.
@@ -173,9 +172,10 @@ def compare_with_flats(
     Raises:
         DataError: the difference is larger than any beam's, and the flats and darks are checked.
     """
-    if scan.beam is None or not len(projections.data):
+    evidence = scan.evidence
+    if evidence.beam is None or not len(projections.data):
         return {}
-    said = selection.step(Air).model != "auto"  # the user states which columns are air
+    said = scan.selection.step(Air).model != "auto"  # the user states which columns are air
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
@@ -185,7 +185,7 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in check_air_level(scan, level, air, scan.asked.accepted or said or not refused):
+    for finding in check_air_level(evidence, level, air, evidence.asked.accepted or said or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}

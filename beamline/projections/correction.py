@@ -33,11 +33,10 @@ from beamline.projections.references import (
     with_dynamic_flats,
 )
 from beamline.projections.registry import in_order
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import F64
 from recon.prep import correct, counts_plan
@@ -59,7 +58,6 @@ class ScanCorrectionPlan:
     """How the frames of one scan are converted to line integrals, for the rows and the binning of a selection.
 
     Attributes:
-        scan: the evidence from which the plan was made.
         filters: filters of projections, with the rows and the binning.
         settings: of the conversion of counts.
         references: darks and flats of the rows that are read, binned; None: the frames are line integrals already.
@@ -71,7 +69,6 @@ class ScanCorrectionPlan:
         warnings: sentences on damaged references, on zingers in them, and on parts of the scan without flats.
     """
 
-    scan: ScanEvidence
     filters: ViewFilters
     settings: CorrectionSettings
     references: References | None = None
@@ -82,19 +79,19 @@ class ScanCorrectionPlan:
     warnings: tuple[str, ...] = ()
 
     @property
+    def scan(self) -> SelectedScan:
+        """The scan, as it was when the plan was made, with the rows, the binning and the steps."""
+        return self.filters.scan
+
+    @property
     def source(self) -> ScanSource:
         """Reads the frames."""
         return self.scan.source
 
     @property
-    def selection(self) -> ScanSelection:
-        """The rows, the binning and the steps."""
-        return self.filters.selection
-
-    @property
     def done(self) -> dict[str, StepDone]:
         """What each correction step did, by the name of the step."""
-        asked = self.selection.step(Preparation)
+        asked = self.scan.selection.step(Preparation)
         return {asked.name: asked.done, **self.beam_done, **self.filters.done}
 
     def of_rows(self, rows: slice | None) -> Plan:
@@ -117,7 +114,7 @@ class ScanCorrectionPlan:
         )
 
 
-def survey(scan: ScanEvidence, selection: ScanSelection, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrectionPlan:
+def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrectionPlan:
     """Read the reference frames that the scan has, and some projections of a finished scan.
 
     Groups of references with a fault are used only if no other group is left.
@@ -132,32 +129,32 @@ def survey(scan: ScanEvidence, selection: ScanSelection, views: NDArray[np.int64
         DataError: references that cannot be used.
     """
     source, settings = scan.source, CorrectionSettings()
-    for step in in_order(selection):
+    for step in in_order(scan.selection):
         settings = step.settings(settings) if isinstance(step, CountsStep) else settings
     altered = (altered_sentence(source),) if source.table.altered.any() else ()
-    plan = ScanCorrectionPlan(scan, ViewFilters.of(source, selection), settings, warnings=altered)
-    asked = selection.step(Preparation)
+    plan = ScanCorrectionPlan(ViewFilters.of(scan), settings, warnings=altered)
+    asked = scan.selection.step(Preparation)
     if plan.filters.filters:  # they mix pixels, whose counts then have no known likelihood
         asked = replace(asked, noise="log", gain=None)
     if source.quantity == "counts":
-        plan = _with_references(plan, selection.with_steps(asked))
+        plan = _with_references(plan, scan.with_steps(asked))
     elif asked.noise == "counts":
         raise ConfigError(f"Omit --noise counts: {source.path} contains line integrals, not counts.")
     elif asked.by_current:
-        current_scale(scan)  # raises an error if the file has no ring current
+        current_scale(scan.evidence)  # raises an error if the file has no ring current
     return in_shadow(plan, views) if views.size else plan
 
 
-def _with_references(plan: ScanCorrectionPlan, selection: ScanSelection) -> ScanCorrectionPlan:
-    """The plan with the darks and flats in the file, and what they show of the beam."""
-    scan, read, asked = plan.scan, plan.filters.read(None), selection.step(Preparation)
-    light = light_scale(scan, asked.by_current) if asked.by_current or scan.views_differ else None
-    references, note = read_references(scan, read, selection)
+def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrectionPlan:
+    """The plan with the darks and flats in the file, and what they show of the beam; `scan` with the noise model."""
+    read, asked, evidence = plan.filters.read(None), scan.selection.step(Preparation), scan.evidence
+    light = light_scale(evidence, asked.by_current) if asked.by_current or evidence.views_differ else None
+    references, note = read_references(scan, read)
     if asked.flat_fields == "dynamic":
-        references = with_dynamic_flats(scan, references, read, selection)
-    _, damaged = damaged_frames(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]))
-    photons = photons_of(scan, references, selection)
-    flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
+        references = with_dynamic_flats(scan, references, read)
+    _, damaged = damaged_frames(scan, np.concatenate([*evidence.used.darks, *evidence.used.flats]))
+    photons = photons_of(scan, references)
+    flats, noise = flats_sentence(evidence, references, asked.by_current), noise_sentence(references, photons)
     recorded = {name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()}
     del recorded["sample_from"]  # follows from --air
     done = {
@@ -165,7 +162,7 @@ def _with_references(plan: ScanCorrectionPlan, selection: ScanSelection) -> Scan
         "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
         "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
     }
-    warnings = (*plan.warnings, *([note] if note else []), *damaged, *parts_without_flats(scan, references))
+    warnings = (*plan.warnings, *([note] if note else []), *damaged, *parts_without_flats(evidence, references))
     return replace(plan, references=references, photons=photons, light=light, beam_done=done, warnings=warnings)
 
 
@@ -173,7 +170,7 @@ def in_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrect
     """The plan with the objects that stand in the beam of all projections of a finished scan, found in some of these
     (rows of the file).
     """
-    where = plan.source, views, plan.filters.read(None), plan.selection.binning
+    where = plan.source, views, plan.filters.read(None), plan.scan.selection.binning
     if not plan.source.finished:
         return plan
     if plan.references is None:
@@ -182,15 +179,15 @@ def in_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrect
         return replace(plan, shadow=shadow_on_counts(*where, plan.references, plan.settings))
 
 
-def with_filters_of(plan: ScanCorrectionPlan, selection: ScanSelection, views: NDArray[np.int64]) -> ScanCorrectionPlan:
-    """The plan with the filters of another selection of the same rows.
+def with_filters_of(plan: ScanCorrectionPlan, scan: SelectedScan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
+    """The plan with the filters of another selection of the same rows, of the same scan.
 
     Frames are read again only if the filters need other rows than before, or mix pixels whose photons were counted.
     """
-    filters, before = ViewFilters.of(plan.source, selection), plan.filters
+    filters, before = ViewFilters.of(scan), plan.filters
     if filters.read(None) == before.read(None) and not (filters.filters and plan.photons):
         return replace(plan, filters=filters)
-    return survey(plan.scan, selection, views)
+    return survey(scan, views)
 
 
 @contextmanager
@@ -199,7 +196,7 @@ def refused(plan: ScanCorrectionPlan) -> Iterator[None]:
     try:
         yield
     except UnlitViewsError as error:
-        judged = plan.selection.step(Preparation).judged
+        judged = plan.scan.selection.step(Preparation).judged
         advice = "" if judged else " (--flags judge leaves out frames that the monitor finds dark)"
         raise DataError(
             f"{plan.source.path} cannot be corrected: {error}{advice}. If the sample covers these columns, give "
@@ -231,7 +228,7 @@ def apply(
     steps = 1 if plan.references is None else _STEPS
     data, usable = read_usable(plan, frames, rows, warn, lambda n, of: progress(n // steps, of))
     if not (n := usable.size):
-        raise no_view(plan.scan, plan.references)
+        raise no_view(plan.scan.evidence, plan.references)
     with refused(plan):
         order, at = by_angle(plan.source.table, usable), usable.astype(np.float64)
         lines, _ = correct.apply(
@@ -259,7 +256,7 @@ def apply_in_batches(
     if plan.photons is not None:
         raise DataError(
             f"{plan.source.path}: --noise counts needs all projections in memory. Give --noise log, "
-            f"or --bin {2 * plan.selection.binning}."
+            f"or --bin {2 * plan.scan.selection.binning}."
         )
     in_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
     parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
@@ -273,17 +270,17 @@ def apply_in_batches(
         if isinstance(of_rows, CorrectionPlan):
             parts, of_rows = _with_air_found(plan, parts, of_rows, warn, lambda n: done(n, 0))
         for n, part in enumerate(parts, 1):
-            pixels = read_views(plan.scan, plan.filters, plan.references, part, None, warn_again)
+            pixels = read_views(plan.filters, plan.references, part, None, warn_again)
             lines, of_rows = apply_next(plan, *pixels, of_rows, last=n == len(parts))
             if lines is not None:
                 out[np.searchsorted(in_time, lines.view_ids)] = lines.data
                 kept.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
                 done(n, passes - 1)
     ids = np.sort(np.concatenate([part.view_ids for part in kept])) if kept else frames[:0]
-    if warn is not None and (sentence := unlit_sentence(plan.scan, in_time, ids)):
+    if warn is not None and (sentence := unlit_sentence(plan.scan.evidence, in_time, ids)):
         warn(sentence)
     if not ids.size:
-        raise no_view(plan.scan, plan.references)
+        raise no_view(plan.scan.evidence, plan.references)
     for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
         if at != place:
             out[at] = out[place]
@@ -302,7 +299,7 @@ def _with_air_found(
     """The frames of each part that can be used, and the plan for counts with the air columns of all of them."""
     usable = []
     for n, part in enumerate(parts, 1):
-        data, some = read_views(plan.scan, plan.filters, plan.references, part, None, warn)
+        data, some = read_views(plan.filters, plan.references, part, None, warn)
         if some.size:
             usable.append(some)
             counts = counts.surveyed(counts.transmission(data, some.astype(np.float64), some))
@@ -320,9 +317,9 @@ def read_usable(
     """Pixels of the frames that can be used, and these frames, see `read_views`; `warn` also gets a sentence on
     projections without beam.
     """
-    data, usable = read_views(plan.scan, plan.filters, plan.references, frames, rows, warn, progress)
+    data, usable = read_views(plan.filters, plan.references, frames, rows, warn, progress)
     # a band of rows does not show whether a projection is usable
-    if warn is not None and rows is None and (sentence := unlit_sentence(plan.scan, frames, usable)):
+    if warn is not None and rows is None and (sentence := unlit_sentence(plan.scan.evidence, frames, usable)):
         warn(sentence)
     return data, usable
 
@@ -341,13 +338,13 @@ def apply_next(
     return plan.filters.apply(lines, None), state
 
 
-def line_integrals_of(scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64]) -> Projections:
+def line_integrals_of(scan: SelectedScan, frames: NDArray[np.int64]) -> Projections:
     """Line integrals of some frames of a finished scan, corrected on their own.
 
     Raises:
         ConfigError, DataError: as in `survey` and `apply`.
     """
-    return apply(survey(scan, selection, frames), frames)
+    return apply(survey(scan, frames), frames)
 
 
 def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.float32]:
@@ -361,8 +358,9 @@ def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.floa
     """
     if plan.references is None:
         return np.zeros((0, 0, 0), np.float32)
-    flats = plan.scan.used.flats[-1][:most]
-    exposures = float(np.median(plan.source.table.exposures[flats])) / plan.scan.usual_exposure
+    evidence = plan.scan.evidence
+    flats = evidence.used.flats[-1][:most]
+    exposures = float(np.median(plan.source.table.exposures[flats])) / evidence.usual_exposure
     return apply(plan, flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
 
@@ -380,12 +378,12 @@ def by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
     return np.arange(frames.size) if in_time else np.lexsort((angles, places))
 
 
-def at_once_memory(source: ScanSource, selection: ScanSelection, frames: int, rows: slice | None = None) -> int:
+def at_once_memory(scan: SelectedScan, frames: int, rows: slice | None = None) -> int:
     """Memory in bytes that `apply` needs for N frames, including the line integrals; `rows` as there.
 
     Raises:
         ConfigError: the selection does not fit the scan.
     """
-    read = ViewFilters.of(source, selection).read(rows)
+    source, selection, read = scan.source, scan.selection, ViewFilters.of(scan).read(rows)
     pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
     return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels

@@ -11,9 +11,8 @@ from beamline.core.errors import ConfigError
 from beamline.monitor.evidence import lit_places
 from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
@@ -75,7 +74,7 @@ _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's 
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not make the gain more accurate, they only take time to read
 
 
-def photons_of(scan: ScanEvidence, references: References, selection: ScanSelection) -> Photons | None:
+def photons_of(scan: SelectedScan, references: References) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or from the photon transfer of the largest group of flats. The readout noise
@@ -85,6 +84,7 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
         ConfigError: photon statistics were requested but the flats do not determine the gain; or the given gain means a
             number of photons in the open beam that is too large or too small for any detector.
     """
+    selection = scan.selection
     model = selection.step(Preparation)
     if model.noise == "log":
         return None
@@ -94,7 +94,7 @@ def photons_of(scan: ScanEvidence, references: References, selection: ScanSelect
     spoilt = spoilt_frames(source, not model.uses_flags)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
-        for groups in (scan.used.flats, scan.used.darks)
+        for groups in (scan.evidence.used.flats, scan.evidence.used.darks)
     )
     if model.gain is not None:  # a mean of n pixels has n times as many photons per count
         light = _counts_of_light(references) * binning**2 / model.gain

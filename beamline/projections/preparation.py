@@ -129,5 +129,5 @@ class Preparation:
             return StepMemory()
         from recon.prep.dynamic_flats import search_memory, view_memory
 
-        pixels, flats = part.view_bytes() // 4, part.source.table.flats.size
+        pixels, flats = part.view_bytes() // 4, part.scan.source.table.flats.size
         return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))

@@ -29,12 +29,11 @@ from beamline.projections.scan_warnings import (
     warn_of_the_field,
     warn_of_units,
 )
-from beamline.projections.selection import ScanSelection, Selection, choose_views
+from beamline.projections.selection import SelectedScan, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, evidence_request
+from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
@@ -62,18 +61,16 @@ class DiskBuffer:
 
 
 def prepare_projections(
-    source: ScanSource,
-    selection: Selection,
+    scan: SelectedScan,
     warn: Warn,
     buffer: DiskBuffer | None = None,
     check: Callable[[Geometry], object] = lambda geometry: None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
-    """Read, correct and align the projections of `selection`.
+    """Read, correct and align the selected projections.
 
     Args:
-        source: a finished scan.
-        selection: what to use.
+        scan: a finished scan.
         warn: function that gets a sentence on everything that is unusual but does not stop the work.
         buffer: takes the line integrals on disk, with missing rays and rays of weight 0 (because of flags)
             interpolated, and no `shares`; None: they stay in memory.
@@ -86,12 +83,10 @@ def prepare_projections(
     """
     phases = phases or Phases()
     phases.enter("flags and references")
-    selection = selection.of(source)
-    scan = ScanEvidence(source, evidence_request(source, selection))
-    usable, poses, wide = _usable(scan, selection, warn)
+    usable, poses, wide = _usable(scan, warn)
     phases.enter("tilt and references", "bands")
-    selection, tilt = with_tilt(scan, selection, usable.frames, warn, phases.progress)
-    plan = survey(scan, selection, usable.frames)
+    scan, tilt = with_tilt(scan, usable.frames, warn, phases.progress)
+    selection, plan = scan.selection, survey(scan, usable.frames)
     for sentence in plan.warnings:
         warn(sentence)
     if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
@@ -100,7 +95,7 @@ def prepare_projections(
     axis_col, axis = rotation_axis(plan, usable, poses, warn, phases.progress)
     warn_of_other_axis(poses, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
-    view_geometry = ViewGeometry(scan, selection, axis_col)
+    view_geometry = ViewGeometry(scan, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
     used, others = _chosen(view_geometry, usable, poses)
     view_geometry.calibrate(np.union1d(used, others), phases)
@@ -109,28 +104,26 @@ def prepare_projections(
     used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(plan, used, buffer, phases, warn)
     geometry = view_geometry.of(projections.view_ids)
-    if estimated := _estimated(source, selection, projections, geometry):
-        selection = selection.with_steps(*estimated)
-        plan = with_filters_of(plan, selection, usable.frames)
-        if any(step.on(source, selection)[0] is not None for step in estimated):
+    if estimated := _estimated(scan, projections, geometry):
+        scan = scan.with_steps(*estimated)
+        plan = with_filters_of(plan, scan, usable.frames)
+        if any(step.on(scan)[0] is not None for step in estimated):
             projections = _corrected(plan, used, buffer, phases)  # whatever is unusual in the frames was reported
-    light = compare_with_flats(scan, selection, projections, warn)
+    light = compare_with_flats(scan, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
-    prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
+    prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, plan, view_geometry, others, warn)
     prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
-    prepared = _after_scan_steps(source, selection, prepared, phases)
-    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, selection, warn)})
+    prepared = _after_scan_steps(scan, prepared, phases)
+    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
-def _estimated(
-    source: ScanSource, selection: ScanSelection, projections: Projections, geometry: Geometry
-) -> list[ViewStep]:
+def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry) -> list[ViewStep]:
     """The steps whose settings follow from the corrected projections, with these settings."""
-    steps = [step for step in in_order(selection) if isinstance(step, EstimatedStep)]
-    found = [step.estimated(source, selection, projections, geometry) for step in steps]
+    steps = [step for step in in_order(scan.selection) if isinstance(step, EstimatedStep)]
+    found = [step.estimated(scan, projections, geometry) for step in steps]
     return [step for step in found if step is not None]
 
 
@@ -156,23 +149,22 @@ def _with_held_out(
     return prepared
 
 
-def require_usable(source: ScanSource, selection: Selection) -> None:
+def require_usable(scan: SelectedScan) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    scan = ScanEvidence(source, evidence_request(source, selection))
-    _usable(scan, selection.of(source), lambda sentence: None)
+    _usable(scan, lambda sentence: None)
 
 
-def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
+def _usable(scan: SelectedScan, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable projections, their stated poses, and rows of offset projections; raises errors for faults before
     any frame is read.
     """
-    source = scan.source
-    usable = checked_views(scan, selection, warn)
-    warn_of_units(source, selection, warn)
-    first = choose_views(source, usable.frames, selection)
+    source, selection = scan.source, scan.selection
+    usable = checked_views(scan, warn)
+    warn_of_units(scan, warn)
+    first = choose_views(scan, usable.frames)
     for step in geometry_steps(selection):
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
-    poses = poses_of(source, selection, usable.frames)
+    poses = poses_of(scan, usable.frames)
     if poses is not None:
         require_stated(poses, source, usable.frames[first])
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
@@ -184,11 +176,11 @@ def _chosen(
     view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the file of the projections that are used, and of some others that are held out."""
-    source, selection, frames = view_geometry.scan.source, view_geometry.selection, usable.frames
-    chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
+    scan, frames = view_geometry.scan, usable.frames
+    chosen = choose_views(scan, frames, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
-        require_stated(poses, source, used)
+        require_stated(poses, scan.source, used)
         rest = rest[poses.stated(rest)]
     return used, spread(rest, _HELD_OUT_VIEWS)
 
@@ -214,14 +206,12 @@ def _corrected(
     return projections
 
 
-def _after_scan_steps(
-    source: ScanSource, selection: ScanSelection, prepared: PreparedProjections, phases: Phases
-) -> PreparedProjections:
+def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases: Phases) -> PreparedProjections:
     """The projections after the steps on all of them, which change line integrals in place."""
-    done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
+    done, steps = dict(prepared.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
     prepared = replace(prepared, done=done)  # a step has access to what the steps before it did
     for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(prepared, source.table.angles[prepared.projections.view_ids], phases.progress)
+        done[step.name] = step.apply(prepared, scan.source.table.angles[prepared.projections.view_ids], phases.progress)
         phases.progress(n, len(steps))
     return prepared
 
@@ -247,8 +237,7 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
 
 
 def assemble(
-    scan: ScanEvidence,
-    selection: ScanSelection,
+    scan: SelectedScan,
     projections: Projections,
     geometry: Geometry,
     axis: tuple[float, AxisEstimate | None],
@@ -267,9 +256,9 @@ def assemble(
     Raises:
         DataError: fewer than two projections, or nothing in the beam.
     """
-    source, (height, width) = scan.source, geometry.detector_shape
+    source, selection, (height, width) = scan.source, scan.selection, geometry.detector_shape
     rows = selection.detector_rows
-    binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
+    binning, first = selection.binning, ViewFilters.of(scan).read(None).start
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen projections can be used; at least 2 are needed.")
@@ -278,7 +267,7 @@ def assemble(
             f"{source.path}: there is no sample in the beam: the line integrals of the chosen projections are "
             "zero everywhere."
         )
-    unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
+    unknown, resampling = projections.masked, selection.step(TiltAndLens).of(scan)
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
     unknown = areas(unknown)
@@ -307,7 +296,7 @@ def assemble(
         sample_radius=None if selection.sample_width is None else selection.sample_width / 2,
     )
     report_defects(prepared, first, binning, warn)
-    warn_of_the_field(scan, selection, prepared.centred, warn)
+    warn_of_the_field(scan, prepared.centred, warn)
     return prepared
 
 

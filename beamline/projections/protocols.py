@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.projections.prepared import PreparedProjections
-    from beamline.projections.selection import ScanSelection
+    from beamline.projections.selection import SelectedScan
     from beamline.projections.usable_views import UsableViews
-    from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.geometry import Geometry
     from recon.prep.counts_plan import CorrectionSettings
     from recon.prep.projections import Projections
@@ -35,14 +33,13 @@ class ScanPart:
         geometry: of as many projections as are used, of the same size, binned.
     """
 
-    source: ScanSource
-    selection: ScanSelection
+    scan: SelectedScan
     geometry: Geometry
 
     def view_bytes(self, reach: int = 0) -> int:
         """Bytes of a float32 projection with this many more rows on either side, as far as the detector has them."""
         rows, cols = self.geometry.detector_shape
-        return 4 * min(rows + 2 * reach, self.source.shape[0] // self.selection.binning) * cols
+        return 4 * min(rows + 2 * reach, self.scan.source.shape[0] // self.scan.selection.binning) * cols
 
 
 class PrepStep(NamedStep, Protocol):
@@ -90,7 +87,7 @@ class ViewFilter:
 class ViewStep(PrepStep, Protocol):
     """A step on each projection alone, also of a scan that is still running."""
 
-    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
+    def on(self, scan: SelectedScan) -> tuple[ViewFilter | None, StepDone]:
         """The filter of a scan, None if there is nothing to do; and what it does.
 
         Raises:
@@ -102,9 +99,7 @@ class ViewStep(PrepStep, Protocol):
 class EstimatedStep(Protocol):
     """A step whose settings may be estimated from the corrected projections of a finished scan."""
 
-    def estimated(
-        self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
-    ) -> ViewStep | None:
+    def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> ViewStep | None:
         """The step with the settings that these projections, corrected without it, determine; None if they determine
         none.
         """
@@ -149,8 +144,7 @@ class PlaceStep(PrepStep, Protocol):
 
     def place(
         self,
-        source: ScanSource,
-        selection: ScanSelection,
+        scan: SelectedScan,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
@@ -207,10 +201,9 @@ class GeometryStep(PrepStep, Protocol):
 
     def learn(
         self,
-        scan: ScanEvidence,
-        selection: ScanSelection,
+        scan: SelectedScan,
         frames: NDArray[np.int64],
-        geometry_before: Callable[[ScanSelection, NDArray[np.int64]], Geometry],
+        geometry_before: Callable[[SelectedScan, NDArray[np.int64]], Geometry],
         progress: Callable[[int, int], None],
     ) -> GeometryLearnt:
         """The geometry of these frames, from projections whose geometry is otherwise known.

@@ -18,7 +18,7 @@ from beamline.core.text import count, frames_text, spans
 from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
@@ -88,12 +88,11 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def damaged_frames(
-    source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], list[str]]:
+def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArray[np.bool_], list[str]]:
     """Which of these frames, which were read, are left out: unreadable frames and, unless the selection uses all,
     frames that differ from their checksum. And sentences that list them.
     """
+    source = scan.source
     lost, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
     if lost.any():
         first = int(frames[lost].min())
@@ -102,7 +101,7 @@ def damaged_frames(
             f"left out: {spans(np.sort(frames[lost]).tolist())}. {source.unreadable[first]}"
         )
     damaged = np.isin(frames, sorted(source.damaged)) & ~lost
-    used = selection.step(Preparation).uses_flags
+    used = scan.selection.step(Preparation).uses_flags
     if damaged.any():
         taken = "left out" if used else "used anyway (--flags ignore)"
         sentences.append(
@@ -124,21 +123,22 @@ class ViewFilters:
     Attributes:
         filters: in their order.
         done: what each step on projections does, by name.
-        selection: the rows asked for, and binning.
+        scan: with the rows asked for, and binning.
     """
 
     filters: tuple[ViewFilter, ...]
     done: dict[str, StepDone]
-    selection: ScanSelection
+    scan: SelectedScan
 
     @classmethod
-    def of(cls, source: ScanSource, selection: ScanSelection) -> ViewFilters:
+    def of(cls, scan: SelectedScan) -> ViewFilters:
         """The filters of a selection.
 
         Raises:
             ConfigError: filters of counted photons.
         """
-        outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
+        selection = scan.selection
+        outcomes = {step.name: step.on(scan) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
             raise ConfigError(
@@ -146,7 +146,7 @@ class ViewFilters:
                 "counts of mixed pixels have no known likelihood."
             )
         done = {name: each for name, (_, each) in outcomes.items()}
-        return cls(filters, done, selection)
+        return cls(filters, done, scan)
 
     def read(self, rows: slice | None) -> slice:
         """Detector rows to read for some binned rows (None: all), with the margin that filters need."""
@@ -155,7 +155,7 @@ class ViewFilters:
     def within(self, rows: slice | None) -> slice:
         """The same rows, binned, as a slice of what is read for all rows."""
         first, part = self.read(None).start, self.read(rows)
-        return slice(*((edge - first) // self.selection.binning for edge in (part.start, part.stop)))
+        return slice(*((edge - first) // self.scan.selection.binning for edge in (part.start, part.stop)))
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
         """Apply all filters to the projections, and return the requested rows."""
@@ -168,13 +168,13 @@ class ViewFilters:
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
         """Detector rows to read, and which of them were asked for, in binned rows."""
-        n, reach = self.selection.binning, sum(each.reach for each in self.filters)
-        first, end = self.selection.detector_rows.start, self.selection.detector_rows.stop
+        n, reach = self.scan.selection.binning, sum(each.reach for each in self.filters)
+        first, end = self.scan.selection.detector_rows.start, self.scan.selection.detector_rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // n)
             first, end = first + start * n, first + stop * n
         above = min(reach, first // n)
-        below = min(reach, (self.selection.shape[0] - end) // n)
+        below = min(reach, (self.scan.selection.shape[0] - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
 
 
@@ -183,7 +183,6 @@ class NoViewError(DataError):
 
 
 def read_views(
-    scan: ScanEvidence,
     filters: ViewFilters,
     references: References | None,
     frames: NDArray[np.int64],
@@ -199,9 +198,9 @@ def read_views(
         warn: function that gets sentences on frames that are left out for another reason than a lack of beam (see
             `unlit_sentence`), and on copies.
     """
-    source = scan.source
-    data = read_binned(source, frames, filters.read(rows), filters.selection.binning, progress)
-    lost, reported = damaged_frames(source, filters.selection, frames)
+    scan, source = filters.scan.evidence, filters.scan.source
+    data = read_binned(source, frames, filters.read(rows), filters.scan.selection.binning, progress)
+    lost, reported = damaged_frames(filters.scan, frames)
     data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
     alive = np.isfinite(data).any(axis=(1, 2))
     if not alive.all():

@@ -15,7 +15,7 @@ from beamline.core.text import count, spans
 from beamline.monitor.evidence import BRIGHT
 from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from recon.prep.dynamic_flats import find_dynamic_flats
@@ -34,7 +34,7 @@ class _Reading:
         spots: pixels of zingers, by frame.
     """
 
-    scan: ScanEvidence
+    evidence: ScanEvidence
     rows: slice
     binning: int
     use_damaged: bool
@@ -42,11 +42,11 @@ class _Reading:
     spots: dict[int, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scan: ScanEvidence, rows: slice, selection: ScanSelection) -> _Reading:
-        binning = selection.binning
-        flat = read_binned(scan.source, scan.used.flats[0][:1], rows, binning)
+    def of(cls, scan: SelectedScan, rows: slice) -> _Reading:
+        binning = scan.selection.binning
+        flat = read_binned(scan.source, scan.evidence.used.flats[0][:1], rows, binning)
         light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
-        return cls(scan, rows, binning, not selection.step(Preparation).uses_flags, light)
+        return cls(scan.evidence, rows, binning, not scan.selection.step(Preparation).uses_flags, light)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
         """The frames [row, col] that may be used, one by one, without zingers."""
@@ -54,8 +54,8 @@ class _Reading:
 
         def good() -> Iterator[NDArray[Any]]:
             for frame in frames.tolist():
-                image = read_binned(self.scan.source, np.array([frame]), self.rows, self.binning)[0]
-                if frame not in spoilt_frames(self.scan.source, self.use_damaged):
+                image = read_binned(self.evidence.source, np.array([frame]), self.rows, self.binning)[0]
+                if frame not in spoilt_frames(self.evidence.source, self.use_damaged):
                     used.append(frame)
                     yield image
 
@@ -77,11 +77,11 @@ class _Reading:
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
         """(exposure in s, mean dark) of each exposure; (NaN, mean of all) if exposures are equal or unknown."""
-        means = [(seconds, self.mean(some)) for seconds, some in self.scan.by_exposure(frames)]
+        means = [(seconds, self.mean(some)) for seconds, some in self.evidence.by_exposure(frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
-def read_references(scan: ScanEvidence, rows: slice, selection: ScanSelection) -> tuple[References, str]:
+def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are
     required. Also returns a note on zingers, empty if there are none.
 
@@ -93,12 +93,12 @@ def read_references(scan: ScanEvidence, rows: slice, selection: ScanSelection) -
     Raises:
         DataError: all frames of a kind are damaged.
     """
-    reading = _Reading.of(scan, rows, selection)
-    darks = reading.darks(np.concatenate(scan.used.darks))
-    dark = _dark_of(scan.usual_exposure, darks)
-    scale = light_scale(scan, selection.step(Preparation).by_current)
+    reading, evidence = _Reading.of(scan, rows), scan.evidence
+    darks = reading.darks(np.concatenate(evidence.used.darks))
+    dark = _dark_of(evidence.usual_exposure, darks)
+    scale = light_scale(evidence, scan.selection.step(Preparation).by_current)
     flats = []
-    for group in scan.used.flats:
+    for group in evidence.used.flats:
         mean = reading.mean(group, scale)
         if dark is not None and mean is not None:
             used = np.setdiff1d(group, spoilt_frames(scan.source, reading.use_damaged))
@@ -127,18 +127,18 @@ def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) ->
     return dark_at(exposure, darks) if exposure > 0 else np.asarray(np.mean([dark for _, dark in darks], axis=0))
 
 
-def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, selection: ScanSelection) -> References:
+def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) -> References:
     """The same references with the principal components of all flats that are used, which are read three times.
 
     Raises:
         ConfigError: there are too few flats.
     """
 
-    asked = selection.step(Preparation)
-    frames = np.setdiff1d(np.concatenate(scan.used.flats), spoilt_frames(scan.source, not asked.uses_flags))
-    scale = light_scale(scan, asked.by_current)
-    reading = _Reading.of(scan, rows, selection)
-    darks = reading.darks(np.concatenate(scan.used.darks))
+    asked, used = scan.selection.step(Preparation), scan.evidence.used
+    frames = np.setdiff1d(np.concatenate(used.flats), spoilt_frames(scan.source, not asked.uses_flags))
+    scale = light_scale(scan.evidence, asked.by_current)
+    reading = _Reading.of(scan, rows)
+    darks = reading.darks(np.concatenate(used.darks))
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame, image in reading.images(frames):
@@ -147,7 +147,7 @@ def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, 
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
     try:
-        dynamic = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
+        dynamic = find_dynamic_flats(flats, np.random.default_rng(scan.selection.seed), masked)
     except ValueError as error:
         raise ConfigError(f"Omit --flat-fields dynamic: {scan.source.path}: {error}.") from error
     return replace(references, dynamic=dynamic)
@@ -182,12 +182,12 @@ def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
     return _to_median(currents, scan.table.views)
 
 
-def uncorrected_current(scan: ScanEvidence, selection: ScanSelection) -> str:
+def uncorrected_current(scan: SelectedScan) -> str:
     """The warning that the ring current changed between flats and projections and is not corrected; "" if it did not
     change.
     """
     known = scan.table.currents
-    if not scan.in_counts or selection.step(Preparation).by_current or known is None:
+    if not scan.evidence.in_counts or scan.selection.step(Preparation).by_current or known is None:
         return ""
     currents = known[scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():

@@ -17,9 +17,7 @@ from beamline.projections.corrections.poses import ScanPoses
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.references import uncorrected_current
 from beamline.projections.registry import in_order
-from beamline.projections.selection import ScanSelection
-from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
+from beamline.projections.selection import ScanSelection, SelectedScan
 from beamline.storage.rules.light import without_air
 from recon.base.masks import areas
 from recon.voxels.direct import has_direct_method
@@ -29,9 +27,9 @@ _LEAST_MAGNIFICATION = 1.02
 _SAME_AXIS = 0.05  # columns
 
 
-def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> None:
+def warn_of_units(scan: SelectedScan, warn: Warn) -> None:
     """Warn of a pixel size, an energy or a distance that no instrument has, probably because of a wrong unit."""
-    size_mm = selection.pixel_size_mm
+    source, selection, size_mm = scan.source, scan.selection, scan.selection.pixel_size_mm
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
         stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
@@ -59,7 +57,7 @@ def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_c
         )
 
 
-def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: PreparedProjections, warn: Warn) -> None:
+def warn_of_the_field(scan: SelectedScan, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of a sample beyond the field of view. If no air corrects the intensity, also warn of its changes and of
     the ring current.
     """
@@ -68,12 +66,12 @@ def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: Pr
     unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""
-        if unlevelled and scan.in_counts and selection.step(Air).model != "none":
-            light = without_air(scan, edges.mean)
+        if unlevelled and scan.evidence.in_counts and scan.selection.step(Air).model != "none":
+            light = without_air(scan.evidence, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
         wide = not geometry.is_centred.all() or bool(scan.table.offset_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
-        if unlevelled and (change := uncorrected_current(scan, selection)):
+        if unlevelled and (change := uncorrected_current(scan)):
             warn(change)
     elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from recon.base.geometry import Geometry, unseen_axis
 from recon.base.views import parse_views
 
 if TYPE_CHECKING:
+    from beamline.storage.frame_table import FrameTable
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
 
 S = TypeVar("S", bound=NamedStep)
 
@@ -169,9 +171,50 @@ class ScanSelection(Selection):
         return Geometry.parallel(angles, full, pixel_pitch=pitch, axis_col=axis_col).binned(self.binning)
 
 
-def choose_views(
-    source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
-) -> NDArray[np.int64]:
+@dataclass(frozen=True, eq=False)
+class SelectedScan:
+    """A scan and what is selected of it, made once per job by `beamline.projections.views.select`.
+
+    Attributes:
+        evidence: what darks, flats and some projections of the scan show.
+        selection: of this scan.
+    """
+
+    evidence: ScanEvidence
+    selection: ScanSelection
+
+    @property
+    def source(self) -> ScanSource:
+        """Reads the frames."""
+        return self.evidence.source
+
+    @property
+    def table(self) -> FrameTable:
+        """What each frame was when the evidence was taken."""
+        return self.evidence.table
+
+    def part(self, **changes: Any) -> SelectedScan:
+        """The same scan with another selection: fields of it by name."""
+        return replace(self, selection=replace(self.selection, **changes))
+
+    def with_steps(self, *steps: NamedStep) -> SelectedScan:
+        """The same scan with these steps; each replaces the step of the same class."""
+        return replace(self, selection=self.selection.with_steps(*steps))
+
+    def selecting(self, selection: Selection) -> SelectedScan:
+        """The same scan with another selection of the user, whose settings of references and flags are the same.
+
+        Raises:
+            ConfigError: as `Selection.of`.
+        """
+        return replace(self, selection=selection.of(self.source))
+
+    def renewed(self) -> SelectedScan:
+        """The scan with the frames that are recorded by now."""
+        return replace(self, evidence=self.evidence.renewed())
+
+
+def choose_views(scan: SelectedScan, frames: NDArray[np.int64], period: float = math.pi) -> NDArray[np.int64]:
     """Rows in `frames` of the projections that the selection names; at least two.
 
     Args:
@@ -180,6 +223,7 @@ def choose_views(
     Raises:
         ConfigError: the selection is wrong, or leaves fewer than two projections.
     """
+    source, selection = scan.source, scan.selection
     try:
         chosen = parse_views(selection.views, source.table.angles[frames], selection.seed, period=period)
     except ValueError as error:

@@ -48,8 +48,8 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
 
 def _rows_of(plan: ScanCorrectionPlan) -> int:
     """Number of binned rows."""
-    rows = plan.selection.detector_rows
-    return (rows.stop - rows.start) // plan.selection.binning
+    selection = plan.scan.selection
+    return (selection.detector_rows.stop - selection.detector_rows.start) // selection.binning
 
 
 def shown_tilt(

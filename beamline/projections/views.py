@@ -17,7 +17,7 @@ from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import GeometryLearnt, PlaceStep, ViewMotion
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.replay import judged_flags
-from beamline.projections.selection import ScanSelection, Selection, choose_views
+from beamline.projections.selection import SelectedScan, Selection, choose_views
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
@@ -30,7 +30,7 @@ from beamline.storage.rules.stored_order import SINOGRAM
 from recon.base.geometry import Geometry
 
 
-def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
+def stated_geometry(scan: SelectedScan) -> Geometry:
     """The geometry of the selected projections, as scan and options state it, before any frame is read.
 
     An axis that is to be found is assumed in the middle; projections without an angle or a pose are left out.
@@ -39,17 +39,17 @@ def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not fit the scan.
     """
-    frames = source.table.views_with_angles
-    poses = poses_of(source, selection, frames)
+    source, selection, frames = scan.source, scan.selection, scan.source.table.views_with_angles
+    poses = poses_of(scan, frames)
     if poses is not None:
         frames = frames[poses.stated(frames)]
-    frames = frames[choose_views(source, frames, selection)]
+    frames = frames[choose_views(scan, frames)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
     geometry = selection.geometry(axis_col, source.table.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
-    return selection.step(Width).rays(source, selection, geometry)[0]
+    return selection.step(Width).rays(scan, geometry)[0]
 
 
 @dataclass(eq=False)
@@ -63,8 +63,7 @@ class ViewGeometry:
         learnt: what was calibrated, by the name of the step.
     """
 
-    scan: ScanEvidence
-    selection: ScanSelection
+    scan: SelectedScan
     stated_axis: float
     moved: dict[str, ViewMotion] = field(default_factory=dict)
     width: StepDone = field(default_factory=StepDone)
@@ -83,8 +82,8 @@ class ViewGeometry:
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
         """Let each step find the sample position; returns the `usable` projections that remain usable."""
-        for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
-            motion = step.place(self.scan.source, self.selection, usable, self.stated_axis, phases.progress)
+        for step in (step for step in in_order(self.scan.selection) if isinstance(step, PlaceStep)):
+            motion = step.place(self.scan, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
             if motion.done.sentence:
                 warn(motion.done.sentence)
@@ -93,26 +92,26 @@ class ViewGeometry:
 
     def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
         """Calibrate the geometry from these projections, if that is requested."""
-        for step in geometry_steps(self.selection):
+        for step in geometry_steps(self.scan.selection):
             if step.geometry:
                 phases.enter("calibration", "steps")
-                learnt = step.learn(self.scan, self.selection, view_ids, self.uncalibrated, phases.progress)
+                learnt = step.learn(self.scan, view_ids, self.uncalibrated, phases.progress)
                 self.learnt[step.name] = learnt
 
-    def uncalibrated(self, part: ScanSelection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of projections without calibration."""
-        source = self.scan.source
-        geometry = part.geometry(self.stated_axis, source.table.angles[view_ids])
+    def uncalibrated(self, part: SelectedScan, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of projections of a part of the scan without calibration."""
+        source = part.source
+        geometry = part.selection.geometry(self.stated_axis, source.table.angles[view_ids])
         if (aside := source.table.aside) is not None:
             geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
-        geometry, self.width = part.step(Width).rays(source, part, geometry)
+        geometry, self.width = part.selection.step(Width).rays(part, geometry)
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of projections."""
-        geometry = self.uncalibrated(self.selection, view_ids)
+        geometry = self.uncalibrated(self.scan, view_ids)
         for learnt in self.learnt.values():
             geometry = learnt.corrected(geometry, view_ids)
         return geometry
@@ -121,16 +120,20 @@ class ViewGeometry:
 _OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules that do not apply if vectors state the pose of each projection
 
 
-def evidence_request(source: ScanSource, selection: Selection) -> EvidenceRequest:
-    """What a reconstruction of `selection` requests from the evidence; the monitor checks the frames if that is
-    requested.
+def select(source: ScanSource, selection: Selection) -> SelectedScan:
+    """The scan with a selection, once per job: the monitor checks the frames, if that is requested, when their flags
+    are first used.
+
+    Raises:
+        ConfigError: as `Selection.of`.
     """
     asked = selection.step(Preparation)
-    judged = judged_flags(source) if asked.judged and source.finished else None
-    return EvidenceRequest(asked.accepted, selection.cone, judged)
+    judge = judged_flags if asked.judged and source.finished else None
+    evidence = ScanEvidence(source, EvidenceRequest(asked.accepted, selection.cone, judge))
+    return SelectedScan(evidence, selection.of(source))
 
 
-def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:
+def checked_views(scan: SelectedScan, warn: Warn) -> UsableViews:
     """The usable projections of a finished scan, according to the flags of the monitor.
 
     Faults of the file that do not prevent a reconstruction become warnings, and so does the effect of the flags.
@@ -138,18 +141,18 @@ def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> U
     Raises:
         DataError: the scan cannot be reconstructed; the message lists every reason and what to do about it.
     """
-    asked = selection.step(Preparation)
+    selection, asked = scan.selection, scan.selection.step(Preparation)
     by_option = {
         "central-column": selection.axis_col,
         "central-row": selection.central_row,
         VARYING: selection.asked.pixel_size_mm if selection.asked.cone is None else selection.asked.cone,
     }
-    findings = [hit for hit in findings_of(scan) if by_option.get(hit.rule) is None]
+    findings = [hit for hit in findings_of(scan.evidence) if by_option.get(hit.rule) is None]
     findings = [hit for hit in findings if hit.rule != FLAGS or (asked.uses_flags and hit.severity == "error")]
-    if (poses := stated_poses(scan.source, selection)) is not None and poses.vectors is not None:
+    if (poses := stated_poses(scan)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(scan.source, findings)
-    usable = usable_views(scan, asked.uses_flags)
+    usable = usable_views(scan.evidence, asked.uses_flags)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:

@@ -11,12 +11,12 @@ from beamline.core.errors import DataError
 from beamline.core.machine import Need
 from beamline.core.text import count, size
 from beamline.projections.prepare import require_usable
-from beamline.projections.selection import check_axis
+from beamline.projections.selection import SelectedScan, check_axis
+from beamline.projections.views import select
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.plan import planned, refuse_before_reading
 from beamline.reconstruct.truth import fit_truth
-from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method
@@ -84,12 +84,12 @@ def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
     """
     truth = refuse_before_reading(options)
     with options.source.open() as source:
-        options = options.around_region(source)
-        _refuse_scan(source, options)
-        needs = recon_memory_of(source, options)
+        options, scan = options.around_region(select(source, options.selection))
+        _refuse_scan(scan)
+        needs = recon_memory_of(scan, options)
         if truth is not None:
             fit_truth(truth, Grid.matching(needs.geometry), options.selection.binning)
-        plan = planned(source, options, needs)
+        plan = planned(scan, options, needs)
     method, geometry = plan.needs.method, plan.needs.geometry
     options.target.require_room(plan.output, plan.scratch)
     shape, several = Grid.matching(geometry).shape, method.volumes
@@ -138,10 +138,9 @@ def _seconds(
     return least, most
 
 
-def _refuse_scan(source: ScanSource, options: ReconOptions) -> None:
+def _refuse_scan(scan: SelectedScan) -> None:
     """Raise ConfigError and DataError as the reconstruction, before it reads a frame."""
-    selection = options.selection
-    require_usable(source, selection)
-    for axis in (selection.axis_col, source.axis_col if selection.of(source).cone is None else None):
+    require_usable(scan)
+    for axis in (scan.selection.axis_col, scan.source.axis_col if scan.selection.cone is None else None):
         if axis is not None:
-            check_axis(source, axis)
+            check_axis(scan.source, axis)

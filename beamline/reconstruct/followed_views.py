@@ -13,11 +13,10 @@ from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrectionPlan
 from beamline.projections.corrections.width import Width
 from beamline.projections.preparation import Preparation
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
@@ -26,10 +25,18 @@ from recon.prep.align import AxisEstimate
 
 @dataclass(frozen=True, eq=False)
 class FollowedViews:
-    """The selected projections of a scan file that is still growing."""
+    """The selected projections of a scan file that is still growing.
 
-    source: ScanSource
-    selection: ScanSelection
+    Attributes:
+        scan: as it was when the live fit began; `renewed` has the frames recorded since then.
+    """
+
+    scan: SelectedScan
+
+    @property
+    def source(self) -> ScanSource:
+        """Reads the frames."""
+        return self.scan.source
 
     @property
     def n(self) -> int:
@@ -38,20 +45,20 @@ class FollowedViews:
 
     def usable(self) -> UsableViews:
         """The projections in the file that may be used."""
-        return usable_views(ScanEvidence(self.source), self.selection.step(Preparation).uses_flags)
+        return usable_views(self.scan.renewed().evidence, self.scan.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of these frames that the selection uses. It selects by the index among all projections so far, which
         does not change when later ones arrive.
         """
         taken = self.source.table.of_kind(FrameKind.PROJECTION, FrameKind.INVALID)
-        chosen = parse_views(self.selection.views, np.zeros(taken.size))
+        chosen = parse_views(self.scan.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
         """The geometry of these projections with the width of their rays, and what the step for it did."""
-        geometry = self.selection.geometry(axis_col, self.source.table.angles[view_ids])
-        return self.selection.step(Width).rays(self.source, self.selection, geometry)
+        geometry = self.scan.selection.geometry(axis_col, self.source.table.angles[view_ids])
+        return self.scan.selection.step(Width).rays(self.scan, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Angles for the fit [view] in radians, at mid-exposure and for the middle row. The fit ignores motion."""
@@ -109,7 +116,7 @@ class AxisSearch:
         Raises:
             DataError: the scan has ended, and no axis is found.
         """
-        if followed.selection.cone is not None:
+        if followed.scan.selection.cone is not None:
             return replace(self, settled=True), stated_axis(followed.source)
         turned = float(np.ptp(followed.source.table.angles[views])) * (1 + 1.5 / views.size)
         passed = any(self.turned < turn <= turned for turn in (np.pi / 2, np.pi)) and views.size > _FIRST_VIEWS

@@ -14,12 +14,12 @@ from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PlaceStep, ScanStep
 from beamline.projections.registry import in_order
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry
 from beamline.reconstruct.live_states import Feeds, LastFit, LiveScan
 from beamline.reconstruct.live_steps import corrected_again, joined, settled
-from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.method import Progress
 from recon.splatting.time_limit import FinalFit
 
@@ -32,11 +32,11 @@ _SEVERAL_PARTS = "Correcting all projections again at the end of the run, becaus
 _OFFSET = "Correcting all projections again, now together with the laterally offset projections"
 
 
-def ended(live: LiveScan, state: Feeds, scan: ScanEvidence, usable: UsableViews) -> LastFit:
+def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews) -> LastFit:
     """The end of a scan, or of its reading: no projection comes any more.
 
     Args:
-        scan: evidence of all that is recorded.
+        scan: with all that is recorded.
         usable: its projections that may be used.
 
     Raises:
@@ -54,15 +54,14 @@ def ended(live: LiveScan, state: Feeds, scan: ScanEvidence, usable: UsableViews)
     return LastFit(_prepared(live, state, scan, usable), state.fit, state.axis_col, state.history)
 
 
-def _prepared(live: LiveScan, state: Feeds, scan: ScanEvidence, usable: UsableViews) -> PreparedProjections:
+def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews) -> PreparedProjections:
     """All projections, once recorded, after the steps that need all of them."""
-    selection, projections = live.selection, joined(state)
-    places = ViewGeometry(scan, selection, state.axis_col)
+    projections, places = joined(state), ViewGeometry(scan, state.axis_col)
     geometry, axis = places.of(projections.view_ids), (state.axis_col, state.search.estimate)
-    compare_with_flats(scan, selection, projections, live.warn, refused=False)
-    prepared = assemble(scan, selection, projections, geometry, axis, usable, live.warn)
+    compare_with_flats(scan, projections, live.warn, refused=False)
+    prepared = assemble(scan, projections, geometry, axis, usable, live.warn)
     done = {**state.correction.plan.done, **places.done}
-    for step in in_order(selection):
+    for step in in_order(scan.selection):
         if isinstance(step, PlaceStep):
             done[step.name] = StepDone(parameters={})  # projections are taken as if the sample had not moved
         if isinstance(step, ScanStep):

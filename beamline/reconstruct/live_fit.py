@@ -11,7 +11,7 @@ from dataclasses import replace
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
 from beamline.core.sinks import Warnings
-from beamline.projections.views import checked_views, evidence_request
+from beamline.projections.views import checked_views, select
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.job import progress_events
 from beamline.reconstruct.live_end import ended, final_fit
@@ -21,7 +21,6 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.pass_laws import PassLaws
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.clock import Clock
 from recon.splatting.time_limit import FinalFit
 
@@ -37,9 +36,8 @@ class ScanFollower:
     """
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        views = FollowedViews(source, options.selection.of(source))
-        evidence = ScanEvidence(source, evidence_request(source, views.selection))
-        self._live = LiveScan(options, views, evidence, sink, clock, warn, begin=clock.now())
+        views = FollowedViews(select(source, options.selection))
+        self._live = LiveScan(options, views, sink, clock, warn, begin=clock.now())
         self.state: Following = first_state(self._live)
         self._cursor = Cursor()
         self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
@@ -133,8 +131,8 @@ class ScanFollower:
             DataError: fewer than two projections of the scan can be used.
         """
         live = self._live
-        scan = live.evidence.renewed()
-        usable = checked_views(scan, live.selection, live.warn)
+        scan = live.views.scan.renewed()
+        usable = checked_views(scan, live.warn)
         if not isinstance(self.state, Feeds):
             raise DataError(
                 f"{live.source.path}: the live fit has taken none of the {usable.frames.size} projections that can be "

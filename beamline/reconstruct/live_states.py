@@ -20,13 +20,12 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.projections.growing import FedCorrection
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import ScanSelection, SelectedScan
 from beamline.projections.step import StepDone
 from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
 from beamline.reconstruct.job import corrections_done
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.projections import Projections
@@ -38,13 +37,11 @@ class LiveScan:
     """A running scan, and how its volume is made. Nothing of it changes; only the file of `views` grows.
 
     Attributes:
-        evidence: what the scan showed when the live fit began; `renewed` has the frames recorded since then.
         begin: time at which the live fit began to wait for projections.
     """
 
     options: ReconOptions
     views: FollowedViews
-    evidence: ScanEvidence
     sink: Sink
     clock: Clock
     warn: Warnings
@@ -56,7 +53,7 @@ class LiveScan:
 
     @property
     def selection(self) -> ScanSelection:
-        return self.views.selection
+        return self.views.scan.selection
 
     def enter(self, state: str, message: str) -> None:
         """Report what the live fit does now, and why."""
@@ -99,12 +96,12 @@ class WaitsForReferences:
     """The correction cannot begin: no projection is there, or darks or flats are missing.
 
     Attributes:
-        evidence: what the scan showed when it was last looked at.
+        scan: as it was when it was last looked at.
         axis_col: the rotation axis in pixels of the file, as it is stated; None: it must be found.
         come_last: darks or flats come after the projections, which was reported; so the fit waits for the end.
     """
 
-    evidence: ScanEvidence
+    scan: SelectedScan
     axis_col: float | None
     come_last: bool = False
 

@@ -11,12 +11,11 @@ from beamline.core.recon_events import ReconStarted
 from beamline.core.text import count
 from beamline.projections.correction import NO_VIEWS, apply, survey
 from beamline.projections.growing import FedCorrection, feed, ignores_shadow, newest_lines, outdated
-from beamline.projections.selection import check_axis
+from beamline.projections.selection import SelectedScan, check_axis
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import refuse
 from beamline.reconstruct.followed_views import AxisSearch
 from beamline.reconstruct.live_states import Cursor, Feeds, Following, LiveScan, WaitsForAxis, WaitsForReferences
-from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from recon.base.method import Progress
 from recon.prep.projections import Projections, merge_and_empty
@@ -43,7 +42,7 @@ _SHADED = (
 def first_state(live: LiveScan) -> WaitsForReferences:
     """The state before any frame is read."""
     stated = live.selection.axis_col
-    return WaitsForReferences(live.evidence, live.source.axis_col if stated is None else stated)
+    return WaitsForReferences(live.views.scan, live.source.axis_col if stated is None else stated)
 
 
 def next_state(live: LiveScan, state: Following, file: Cursor) -> tuple[Following, Cursor]:
@@ -73,8 +72,8 @@ def with_references(live: LiveScan, state: WaitsForReferences, ended: bool) -> F
     Raises:
         DataError: the scan has ended, or something else is missing, and nothing will come.
     """
-    evidence = state.evidence.renewed()
-    blockers = findings_of(evidence, BEFORE_VIEWS)
+    scan = state.scan.renewed()
+    blockers = findings_of(scan.evidence, BEFORE_VIEWS)
     if not ended and (state.come_last or any(finding.rule == "references" for finding in blockers)):
         if not state.come_last:
             live.enter(
@@ -82,9 +81,9 @@ def with_references(live: LiveScan, state: WaitsForReferences, ended: bool) -> F
                 "No live volume during this scan, because no darks or no flats were taken before the projections. "
                 "The reconstruction starts after the scan",
             )
-        return replace(state, evidence=evidence, come_last=True)
+        return replace(state, scan=scan, come_last=True)
     refuse(live.source, blockers)
-    correction = new_correction(live, evidence)
+    correction = new_correction(live, scan)
     live.tell_done(correction.plan.done)
     if state.axis_col is None:
         return WaitsForAxis(correction, AxisSearch())
@@ -119,9 +118,9 @@ def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
     return replace(state, search=search, axis_col=axis_col, fit=fit, newest=None)  # the next views bring it again
 
 
-def new_correction(live: LiveScan, evidence: ScanEvidence, views: NDArray[np.int64] = NO_VIEWS) -> FedCorrection:
-    """A correction with these references, which has corrected no projection yet; `views` as in `survey`."""
-    plan = survey(evidence, live.selection, views)
+def new_correction(live: LiveScan, scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> FedCorrection:
+    """A correction with the references of `scan`, which has corrected no projection yet; `views` as in `survey`."""
+    plan = survey(scan, views)
     for sentence in plan.warnings:
         live.warn(sentence)
     return FedCorrection(plan)

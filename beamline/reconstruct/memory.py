@@ -13,6 +13,7 @@ from beamline.core.text import count, size
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepMemory
 from beamline.projections.views import stated_geometry
 from beamline.reconstruct.options import ReconOptions
@@ -141,18 +142,17 @@ class ReconMemory:
         return grid.as_tall_as_rays(self.geometry) if self.taller else grid
 
 
-def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
+def recon_memory_of(scan: SelectedScan, options: ReconOptions) -> ReconMemory:
     """Memory for reconstructing the selected projections of a scan, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not fit the scan.
     """
-    selection, method = options.selection.of(source), options.method
-    geometry = stated_geometry(source, selection)
-    pixel = source.dtype.itemsize if selection.binning == 1 else 4
-    part = ScanPart(source, selection, geometry)
-    stated = {step.name: step.memory(part) for step in in_order(selection)}
+    method, geometry = options.method, stated_geometry(scan)
+    pixel = scan.source.dtype.itemsize if scan.selection.binning == 1 else 4
+    part = ScanPart(scan, geometry)
+    stated = {step.name: step.memory(part) for step in in_order(scan.selection)}
     return ReconMemory(
         options.method_for(geometry),
         geometry,
@@ -172,7 +172,7 @@ def memory_of(options: ReconOptions) -> int:
     return round(SHARE * free / (1 + local_workers(options.cluster)))
 
 
-def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
+def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
     """Raise ConfigError for methods and options that need everything in memory."""
     if options.method.volumes > 1:
         fewer = int(needs.rows * memory / needs.at_once)
@@ -182,7 +182,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
             f"volumes, each of {Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of "
             f"memory, but {size(memory)} is allowed. Nothing was written."
         )
-    poses = stated_poses(source, options.selection)
+    poses = stated_poses(scan)
     whole = {
         **{f"{step.asked_by} with roll or tilt": step.may_lean for step in geometry_steps(options.selection)},
         "--poses with roll, tilt or vectors": poses is not None and poses.leans,
@@ -192,7 +192,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
     for option, given in whole.items():
         if given:
             raise ConfigError(
-                f"{option} needs the whole scan in memory: {source.path} needs {size(needs.at_once)}, but "
+                f"{option} needs the whole scan in memory: {scan.source.path} needs {size(needs.at_once)}, but "
                 f"{size(memory)} is allowed. Leave out this option, or use --bin {2 * options.selection.binning} "
                 "or --rows."
             )

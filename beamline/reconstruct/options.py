@@ -11,10 +11,9 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
-from beamline.projections.selection import Selection
+from beamline.projections.selection import SelectedScan, Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.region import AroundSample, Region, box_around_sample, selection_around
-from beamline.storage.readers.base import ScanSource
+from beamline.reconstruct.region import AroundSample, Region, box_around_sample, rows_around
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
 from recon.base.choices import Quality
@@ -165,20 +164,20 @@ class ReconOptions:
             return 0, (slabs + compared + bars) * volume
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
-    def around_region(self, source: ScanSource) -> ReconOptions:
-        """The options with the detector rows that show the region; unchanged if the whole volume is wanted. If the
-        region is the one around the sample, it is found first.
+    def around_region(self, scan: SelectedScan) -> tuple[ReconOptions, SelectedScan]:
+        """The options and the scan with the detector rows that show the region; unchanged if the whole volume is
+        wanted. If the region is the one around the sample, it is found first.
 
         Raises:
-            ConfigError, DataError: see `region.selection_around` and `region.box_around_sample`.
+            ConfigError, DataError: see `region.rows_around` and `region.box_around_sample`.
         """
         region = self.region
         if region is None:
-            return self
+            return self, scan
         if isinstance(region, AroundSample):
-            region = box_around_sample(source, self.selection)
-        selection = selection_around(source, self.selection, region, self.method.halo)
-        return replace(self, selection=selection, region=region)
+            region = box_around_sample(scan)
+        scan = rows_around(scan, region, self.method.halo)
+        return replace(self, selection=scan.selection.asked, region=region), scan
 
     @property
     def partial_path(self) -> Path:

@@ -18,6 +18,7 @@ from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.replayed_frames import awaited, growing
+from beamline.projections.views import select
 from beamline.reconstruct.job import (
     Channels,
     Job,
@@ -196,11 +197,12 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     sink, clock, warn, phases = channels.sink, channels.clock, channels.warn, channels.phases
     phases.enter("opening the scan")
     with options.source.open() as source:
-        facts, options = facts_of(source), options.around_region(source)
+        facts = facts_of(source)
+        options, scan = options.around_region(select(source, options.selection))
         box = options.region if isinstance(options.region, Region) else None
         if box is not None and box.reason:
             sink(StateEntered("roi", box.reason, time=clock.now()))
-        prepared, plan = prepare_within(source, options, sink, clock, warn, phases)
+        prepared, plan = prepare_within(scan, options, sink, clock, warn, phases)
     prepared = _for_method(options, prepared, plan, channels)
     _announce(options, prepared, channels)
     if few := partly_seen_warning(prepared.geometry):

@@ -22,7 +22,7 @@ from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import check_axis
+from beamline.projections.selection import SelectedScan, check_axis
 from beamline.reconstruct.memory import (
     ReconMemory,
     cluster,
@@ -79,7 +79,7 @@ class ReconPlan(Need):
         return self.needs.line_integrals if self.slabs else 0
 
 
-def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> ReconPlan:
+def planned(scan: SelectedScan, options: ReconOptions, needs: ReconMemory) -> ReconPlan:
     """The plan before any frame is read.
 
     Args:
@@ -90,7 +90,7 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
             an earlier call.
     """
-    allowed, at_once = memory_of(options), needs.at_once
+    allowed, at_once, source = memory_of(options), needs.at_once, scan.source
     _refuse_views(source, options, needs.geometry)
     if options.selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
         _refuse_region(options, needs.geometry)
@@ -98,13 +98,13 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if options.method.volumes == 1 and options.selection.of(source).cone is not None:
+    if options.method.volumes == 1 and scan.selection.cone is not None:
         raise DataError(
             f"{source.path}: {options.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
             "allowed, and a cone-beam volume cannot be made in slabs. Use more --memory, --bin 2, or fewer --rows."
         )
-    refuse_whole(source, options, needs, allowed)
-    turned = options.selection.step(TiltAndLens).of(source, options.selection.of(source)) is not None
+    refuse_whole(scan, options, needs, allowed)
+    turned = scan.selection.step(TiltAndLens).of(scan) is not None
     needs = replace(needs, weighted=turned and options.method.weighs)  # other weights are not known yet
     return _in_slabs(source, options, needs, allowed)
 
@@ -147,20 +147,20 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     return _plan(options, needs, plan.allowed)
 
 
-def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
+def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
     """Raise DataError or ConfigError if the geometry of all projections does not allow the reconstruction, once the
     axis is known."""
-    _refuse_views(source, options, geometry)
+    _refuse_views(scan.source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.volumes > 1:
         needs = ReconMemory(options.method, geometry, 0, True)
         if needs.at_once > plan.allowed:
-            refuse_whole(source, options, needs, plan.allowed)
+            refuse_whole(scan, options, needs, plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
-            f"{source.path}: use more --memory, --bin 2, or fewer --rows. The whole scan must be in memory, because "
-            "its projections are rolled or tilted, and a volume in slabs needs slices that are aligned with the "
-            "detector rows."
+            f"{scan.source.path}: use more --memory, --bin 2, or fewer --rows. The whole scan must be in memory, "
+            "because its projections are rolled or tilted, and a volume in slabs needs slices that are aligned with "
+            "the detector rows."
         )
 
 
@@ -224,16 +224,15 @@ def _plan(
 
 
 def prepare_within(
-    source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
+    scan: SelectedScan, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
     """`prepare_projections`, and the plan: for a volume made in slabs, line integrals are stored on disk."""
-    selection = options.selection
     try:
-        needs = recon_memory_of(source, options)
+        needs = recon_memory_of(scan, options)
     except (ConfigError, DataError):
-        prepare_projections(source, selection, warn)  # faults of the views come first: this says them
+        prepare_projections(scan, warn)  # faults of the views come first: this says them
         raise
-    plan, buffer = planned(source, options, needs), None
+    plan, buffer = planned(scan, options, needs), None
     options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
         sentence = (
@@ -247,14 +246,14 @@ def prepare_within(
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
 
     prepared = prepare_projections(
-        source, selection, warn, buffer, lambda geometry: refuse_geometry(source, options, plan, geometry), phases
+        scan, warn, buffer, lambda geometry: refuse_geometry(scan, options, plan, geometry), phases
     )
     if "times" in options.method.takes:
-        prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
+        prepared = replace(prepared, times=times_of(scan.source, prepared.projections.view_ids, warn))
     if options.method.knows_outside:
         radius = sample_radius(prepared.views, prepared.sample_radius) or 0.0  # it is not searched again
         prepared = replace(prepared, sample_radius=radius)
-    return prepared, of_views(source, options, plan, prepared)
+    return prepared, of_views(scan.source, options, plan, prepared)
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:

@@ -14,8 +14,7 @@ from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import Selection
-from beamline.storage.readers.base import ScanSource
+from beamline.projections.selection import SelectedScan, Selection
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -87,20 +86,20 @@ class RegionOfRows:
         return Volume(data, replace(grid, centre=(z + self.z_offset, y, x)))
 
 
-def selection_around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
-    """The selection with only the rows that show the region and a margin of `halo` slices; the axis is that of all
+def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
+    """The scan with only the rows that show the region and a margin of `halo` slices; the axis is that of all
     rows.
 
     Raises:
         ConfigError: a cone beam, a region beyond the rows or the widest volume, or options that may tilt projections or
             move them along the axis. `locate` raises the errors that only the projections show.
     """
-    part = selection.of(source)
-    if part.cone is not None:
+    selection = scan.selection
+    if selection.cone is not None:
         raise ConfigError(
-            f"--roi works only with a parallel beam, but {source.path} is a cone-beam scan. Use --rows instead."
+            f"--roi works only with a parallel beam, but {scan.source.path} is a cone-beam scan. Use --rows instead."
         )
-    poses = stated_poses(source, part)
+    poses = stated_poses(scan)
     moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
     given = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
     if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
@@ -110,19 +109,19 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
             f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Use --rows "
             "instead of --roi, or leave out the other option. Nothing was read."
         )
-    rows, side, (first, end) = part.detector_rows, selection.binning, region.z
+    rows, side, (first, end) = selection.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side
     if end > slices:
         raise ConfigError(f"--roi {region}: slices {first}:{end} are out of range: the volume has slices 0:{slices}.")
     if region.requested:
-        _refuse_beyond(region, _widest(source, selection), "the widest volume's")
+        _refuse_beyond(region, _widest(scan), "the widest volume's")
     low, high = max(first - halo, 0), min(end + halo, slices)
     near = rows.start + low * side, rows.start + high * side
-    return replace(selection, rows=near, axis_rows=(rows.start, rows.stop))
+    return scan.selecting(replace(selection.asked, rows=near, axis_rows=(rows.start, rows.stop)))
 
 
 def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
-    """The position of the region in the volume of `geometry`, the geometry of the selection from `selection_around`.
+    """The position of the region in the volume of `geometry`, the geometry of the rows from `rows_around`.
 
     Raises:
         ConfigError: the region lies outside the volume.
@@ -152,16 +151,16 @@ def _refuse_beyond(region: Region, width: int, whose: str) -> None:
             raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie within {whose} range 0:{width}.")
 
 
-def _widest(source: ScanSource, selection: Selection) -> int:
+def _widest(scan: SelectedScan) -> int:
     """Largest width of the volume in voxels, before anything is read.
 
     An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
     """
-    flags = source.table.flags
+    source, selection, flags = scan.source, scan.selection, scan.source.table.flags
     moved = selection.step(Preparation).judged or (flags is not None and bool(flags.flagged.any()))
     if selection.axis_col is None or moved:
         return 2 * (source.shape[1] // selection.binning)
-    return Grid.matching(selection.of(source).geometry(selection.axis_col, np.zeros(1))).shape[2]
+    return Grid.matching(selection.geometry(selection.axis_col, np.zeros(1))).shape[2]
 
 
 _VIEWS = 72  # looked at, or up to twice as many
@@ -175,7 +174,7 @@ _BANDS = 24  # of rows, whose shadows are taken together
 _MARGIN, _COARSE = 0.04, 2  # of the volume's side; coarse voxels
 
 
-def box_around_sample(source: ScanSource, selection: Selection) -> Region:
+def box_around_sample(scan: SelectedScan) -> Region:
     """The box around everything that absorbs, in voxels of the volume of this selection, and a sentence that reports
     it.
 
@@ -187,21 +186,21 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     Raises:
         ConfigError: the scan has a cone beam. DataError: no projection shows a sample.
     """
-    part = selection.of(source)
-    if part.cone is not None:
+    source, selection = scan.source, scan.selection
+    if selection.cone is not None:
         raise ConfigError(
             f"--roi auto works only with a parallel beam, but {source.path} is a cone-beam scan. Use --rows instead."
         )
-    rows, side = part.detector_rows, selection.binning
+    rows, side = selection.detector_rows, selection.binning
     height, width = (rows.stop - rows.start) // side, source.shape[1] // side
     coarse = max(1, min(width // _COLUMNS, height))
     every = max(1, source.table.views.size // _VIEWS)
     views = f"every:{every}" if selection.views == "all" else selection.views
     unlearnt = (type(step)() for step in geometry_steps(selection))
-    look = replace(selection, views=views, binning=side * coarse).with_steps(*unlearnt)
-    prepared = prepare_projections(source, look, lambda warning: None)  # they come again, of the views used
+    look = scan.selecting(replace(selection.asked, views=views, binning=side * coarse).with_steps(*unlearnt))
+    prepared = prepare_projections(look, lambda warning: None)  # they come again, of the views used
     data, geometry = prepared.projections.data, prepared.geometry
-    grid = Grid.matching(part.geometry(prepared.axis_col, geometry.angles))
+    grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
     if cut := FieldEdges.of(data, geometry).beyond():

@@ -16,10 +16,8 @@ from beamline.projections.growing import FedCorrection, feed
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_request
-from beamline.storage.readers.base import ScanSource
+from beamline.projections.views import select
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.geometry import Geometry
 from recon.prep.projections import Projections, merge_and_empty
 
@@ -31,12 +29,7 @@ def prepare(
     told: list[str] = []
     with ExitStack() as until:
         source = until.enter_context(SourceOptions(scan, **opened).open()) if isinstance(scan, Path) else scan
-        return prepare_projections(source, selection, told.append, buffer), told
-
-
-def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
-    """The evidence of a scan as a reconstruction of `selection` uses it."""
-    return ScanEvidence(source, evidence_request(source, selection))
+        return prepare_projections(select(source, selection), told.append, buffer), told
 
 
 def feed_batches(

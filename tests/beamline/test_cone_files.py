@@ -14,6 +14,7 @@ from beamline.page.tiles import TileRegion
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct import estimate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -70,7 +71,7 @@ def _never(message: str) -> None:
 def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> None:
     with open_scan(scan) as source:
         assert source.cone == (SOD, SDD)
-        prepared = prepare_projections(source, replace(PLAIN, axis_col=AXIS), _never)
+        prepared = prepare_projections(select(source, replace(PLAIN, axis_col=AXIS)), _never)
     geometry = prepared.geometry
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     assert geometry.period == pytest.approx(2 * np.pi)
@@ -93,8 +94,8 @@ def test_an_axis_is_found_or_kept_by_views_held_out(tmp_path: Path, stated: floa
     path, warnings = tmp_path / "axis.h5", list[str]()
     _write(path, replace(INFO, axis_col=stated), views=24)
     with open_scan(path) as source:
-        prepared = prepare_projections(source, PLAIN, warnings.append)
-        given = prepare_projections(source, replace(PLAIN, axis_col=20.2), _never)
+        prepared = prepare_projections(select(source, PLAIN), warnings.append)
+        given = prepare_projections(select(source, replace(PLAIN, axis_col=20.2)), _never)
     assert prepared.axis_col == pytest.approx(AXIS, abs=0.05)
     assert stated == AXIS or (prepared.axis is not None and prepared.axis.confident)
     assert given.axis_col == 20.2
@@ -104,8 +105,8 @@ def test_an_axis_is_found_or_kept_by_views_held_out(tmp_path: Path, stated: floa
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
     with open_scan(scan) as source:
         given = replace(PLAIN, axis_col=AXIS)  # it is not searched for
-        whole = prepare_projections(source, given, _never).geometry
-        rows = prepare_projections(source, replace(given, rows=(10, 30), binning=2), _never).geometry
+        whole = prepare_projections(select(source, given), _never).geometry
+        rows = prepare_projections(select(source, replace(given, rows=(10, 30), binning=2)), _never).geometry
     assert rows.detector_shape == (10, 24)
     # The central ray met row 19.5 of the detector: 9.5 of the rows that are read, 4.5 of these in pairs.
     assert (whole.axis_row, rows.axis_row) == (19.5, pytest.approx(4.5))
@@ -118,7 +119,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
     with open_scan(path) as source:
         assert source.cone is None  # a detector's distance alone is propagation in a parallel beam
         told = replace(PLAIN, cone=(SOD, SDD))
-        assert prepare_projections(source, told, _never).geometry.is_cone
+        assert prepare_projections(select(source, told), _never).geometry.is_cone
 
 
 def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path) -> None:

@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter, zoom
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from beamline.projections.views import select
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
@@ -153,7 +154,7 @@ def diamond(folder: Path, views: int) -> Case:
     from beamline.storage.readers.open import SourceOptions
 
     with SourceOptions(folder / "diamond_24737_parallel_91x135x160.h5").open() as source:
-        prepared = prepare_projections(source, Selection(rows=(65, 97), axis_col=85.75), lambda _: None)
+        prepared = prepare_projections(select(source, Selection(rows=(65, 97), axis_col=85.75)), lambda _: None)
     data, rays = np.asarray(prepared.projections.data), prepared.without_warnings.ray_weights()
     rays = np.ones_like(data) if rays is None else np.broadcast_to(rays, data.shape)
     judges = np.arange(3, 91, 6)

@@ -18,6 +18,7 @@ import pytest
 import recon
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
@@ -37,7 +38,7 @@ Views = tuple[F32, Geometry]
 def _scan(name: str, quantity: str | None = None, **chosen: object) -> Views:
     """Corrected views of a scan file."""
     with SourceOptions(_DATA / name, quantity=quantity).open() as source:  # type: ignore[arg-type]
-        prepared = prepare_projections(source, Selection(**chosen), lambda warning: None)  # type: ignore[arg-type]
+        prepared = prepare_projections(select(source, Selection(**chosen)), lambda warning: None)  # type: ignore[arg-type]
     return np.ascontiguousarray(prepared.projections.data, np.float32), prepared.geometry
 
 

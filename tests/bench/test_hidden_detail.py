@@ -16,6 +16,7 @@ import recon
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan
 from recon.base import choices
 from tests.bench.quality_cases import F32
@@ -43,7 +44,7 @@ def _volume(path: Path, rows: slice, name: str) -> F32:
     method, rings = METHODS[name]
     with warnings.catch_warnings(), open_scan(path) as scan:
         warnings.simplefilter("ignore")
-        prepared = prepare_projections(scan, Selection(steps=(Rings(rings),)), lambda _: None)
+        prepared = prepare_projections(select(scan, Selection(steps=(Rings(rings),))), lambda _: None)
     data = np.ascontiguousarray(prepared.projections.data[:, rows])
     geometry = prepared.geometry.rows(rows.start, rows.start + data.shape[1])
     return recon.reconstruct(data, geometry, method, grid=recon.Grid.matching(geometry)).volume.data

@@ -17,6 +17,7 @@ import recon
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan
 from recon.assess import metrics
 from simulators.frame.shot import Detector
@@ -30,7 +31,7 @@ METHODS = {"FISTA-TV": recon.FistaTv(), "r2": recon.R2(), "SIRT": recon.Sirt()}
 
 def _volume(shared_data: Path, method: recon.Method, air: str) -> NDArray[np.float32]:
     with open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as scan:
-        prepared = prepare_projections(scan, Selection(steps=(Air(air),)), lambda _: None)
+        prepared = prepare_projections(select(scan, Selection(steps=(Air(air),))), lambda _: None)
     return recon.reconstruct(prepared.projections.data, prepared.geometry, method).volume.data
 
 

@@ -134,6 +134,7 @@ def _compare(
     from beamline.gaussians import read_model
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
+    from beamline.projections.views import select
     from beamline.reconstruct.options import OutputPaths, report_beside
     from beamline.reconstruct.record import axis_of, write_result
     from beamline.reconstruct.scan_facts import ReportContext, facts_of
@@ -148,7 +149,8 @@ def _compare(
     with open_scan(scan) as source:
         facts = facts_of(source)
         selection = Selection(axis_col=float(str(record.parameters["axis_col"])))
-        prepared = replace(prepare_projections(source, selection, warnings.append), axis=axis_of(record.parameters))
+        prepared = prepare_projections(select(source, selection), warnings.append)
+        prepared = replace(prepared, axis=axis_of(record.parameters))
     grid = Grid.matching(prepared.geometry)
     ideal = truth(grid)
     made = Reconstruction(

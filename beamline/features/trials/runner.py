@@ -22,6 +22,7 @@ from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, Trial
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct.scan_facts import facts_of
 from beamline.reconstruct.truth import fit_truth, read_truth
 from beamline.report.sheets import SliceSheet
@@ -93,7 +94,7 @@ def opened_scan(
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         facts = dict(facts_of(source).table)
-        prepared = prepare_projections(source, asked.selection, Warnings(sink, clock)).without_warnings
+        prepared = prepare_projections(select(source, asked.selection), Warnings(sink, clock)).without_warnings
     if held_out and truth_given is None:
         prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     truth = None

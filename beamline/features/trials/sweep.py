@@ -22,6 +22,7 @@ from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, Trial
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct.job import compile_kernels
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.scan_facts import facts_of
@@ -110,7 +111,7 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
 def _middle(trial: ReconOptions, halo: int) -> Selection:
     selection = trial.selection
     with trial.source.open() as source:
-        part, n = selection.of(source), selection.binning
+        part, n = select(source, selection).selection, selection.binning
     if selection.rows is not None or part.cone is not None:
         return selection
     rows = part.detector_rows
@@ -154,7 +155,7 @@ class SweptScan(TrialScan):
         wanted = asked if its_own else replace(asked, axis_col=self._axis)
         if self._views is None or self._views[:2] != (source_words, wanted):
             with options.source.open() as source:
-                views = prepare_projections(source, wanted, Warnings(self._sink, self._clock))
+                views = prepare_projections(select(source, wanted), Warnings(self._sink, self._clock))
             views = hold_out(views, ONE_IN, advice="take a scan with more projections")
             if wanted.axis_col is None and source_words == self._first:
                 self._axis = views.axis_col

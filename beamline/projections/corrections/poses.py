@@ -15,7 +15,7 @@ from beamline.core.text import count
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import ScanSelection, Selection, with_pivot
+from beamline.projections.selection import SelectedScan, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -69,20 +69,20 @@ class PosesOfFile:
 
     def place(
         self,
-        source: ScanSource,
-        selection: ScanSelection,
+        scan: SelectedScan,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        return poses_of(source, selection, usable.frames) or Unmoved(usable.frames)
+        return poses_of(scan, usable.frames) or Unmoved(usable.frames)
 
 
-def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
+def stated_poses(scan: SelectedScan) -> PoseTable | None:
     """The poses in the option's file, or else the shifts stated by the scan file."""
     from beamline.storage.pose_table import PoseTable
 
-    table, shifts = selection.step(PosesOfFile).table, source.table.shifts
+    source = scan.source
+    table, shifts = scan.selection.step(PosesOfFile).table, source.table.shifts
     if table is not None:
         return table if table.keys.size else None
     if shifts is None:
@@ -149,14 +149,14 @@ class ScanPoses:
         return with_pivot(posed, self.pivot)
 
 
-def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanPoses | None:
+def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
     """The poses of `frames` from the selection's file, or else from the scan file; None if neither states any.
 
     Raises:
         ConfigError: options that exclude each other.
         DataError: the file does not fit the scan; the message says why.
     """
-    table = stated_poses(source, selection)
+    table, source, selection = stated_poses(scan), scan.source, scan.selection
     if table is None:
         return None
     tilt = selection.step(TiltAndLens)
@@ -170,7 +170,7 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
             f"{learns} determines from the projections what {table.path} already states. Give either {learns} or "
             "--poses. To omit the shifts that the scan states, add --poses ignore."
         )
-    shifts = table.shifts * _pixels(table, source, selection)
+    shifts = table.shifts * _pixels(table, scan)
     rows = _rows(table, source, frames)
     height, width = source.shape
     # offset projections are displaced by a few fields of view
@@ -188,14 +188,15 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
     poses = ScanPoses(table, every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
     if table.vectors is None:
         return poses
-    return replace(poses, vectors=_of_vectors(table, source, selection), view_of=rows)
+    return replace(poses, vectors=_of_vectors(table, scan), view_of=rows)
 
 
-def _of_vectors(table: PoseTable, source: ScanSource, selection: ScanSelection) -> Geometry:
+def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
     """The projections of a table of vectors, in the rows and with the binning of the selection."""
     from recon.base.vectors import geometry_of_vectors
 
     assert table.vectors is not None
+    source, selection = scan.source, scan.selection
     if selection.axis_col is not None:
         raise ConfigError(f"Omit --axis: the vectors of {table.path} already determine the axis.")
     try:
@@ -217,20 +218,20 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: ScanSelection) 
     return views.rows(rows.start, rows.stop).binned(selection.binning)
 
 
-def _pixels(table: PoseTable, source: ScanSource, selection: ScanSelection) -> float:
+def _pixels(table: PoseTable, scan: SelectedScan) -> float:
     """Pixels of the unbinned detector in the table's unit."""
     if table.unit == "px":
         return 1.0
-    if selection.cone is not None:
+    if scan.selection.cone is not None:
         raise DataError(
             f"Give a CSV of shifts in pixels instead of {table.path}: in a cone beam, translations of the "
             "sample in mm are not shifts of the projections, because the magnification differs along the "
             "beam. Nothing was read."
         )
-    size = selection.pixel_size_mm
+    size = scan.selection.pixel_size_mm
     if size is None:
         raise DataError(
-            f"Give --pixel-size-um: {table.path} is in mm, but {source.path} does not state its pixel size."
+            f"Give --pixel-size-um: {table.path} is in mm, but {scan.source.path} does not state its pixel size."
         )
     return 1 / size
 

@@ -15,7 +15,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, ViewFilter, ViewStep
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from beamline.core.sinks import Warn
     from beamline.projections.tilt import BandsDone
-    from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.prep import resample
     from recon.prep.projections import Projections
 
@@ -110,14 +108,14 @@ class TiltAndLens:
         from recon.prep.tilt import STEEPEST
 
         steepest_step = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
-        if (steepest := steepest_step.of(part.source, part.selection)) is None:
+        if (steepest := steepest_step.of(part.scan)) is None:
             return StepMemory()
         copies = 17 if self.distortion is None else 26
-        search = _search_memory(part.source, part.selection) if self.sought else 0
+        search = _search_memory(part.scan) if self.sought else 0
         return StepMemory(copies * part.view_bytes(steepest.reach), search)
 
-    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
-        resampling = self.of(source, selection)
+    def on(self, scan: SelectedScan) -> tuple[ViewFilter | None, StepDone]:
+        resampling = self.of(scan)
         if resampling is None:
             return None, self.done("")
 
@@ -135,7 +133,7 @@ class TiltAndLens:
             parameters[f"distortion_{name}"] = value if isinstance(value, float) else str(value)
         return StepDone(sentence, parameters)
 
-    def of(self, source: ScanSource, selection: ScanSelection) -> resample.Resampling | None:
+    def of(self, scan: SelectedScan) -> resample.Resampling | None:
         """The resampling of the projections; None if they are used as recorded.
 
         Raises:
@@ -143,6 +141,7 @@ class TiltAndLens:
         """
         from recon.prep.resample import Resampling
 
+        source, selection = scan.source, scan.selection
         if (self.tilt_deg or self.sought) and selection.cone is not None:
             raise ConfigError(f"Omit --tilt: it is for a parallel beam, and {source.path} is a cone-beam scan.")
         if not self.tilt_deg and self.distortion is None:
@@ -154,9 +153,9 @@ class TiltAndLens:
 
 
 def with_tilt(
-    scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
-) -> tuple[ScanSelection, dict[str, StepDone]]:
-    """The selection with the tilt found from all detector rows, if that was asked for; and what was done, by the
+    scan: SelectedScan, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
+) -> tuple[SelectedScan, dict[str, StepDone]]:
+    """The scan with the tilt found from all detector rows, if that was asked for; and what was done, by the
     name of the step.
 
     Args:
@@ -171,14 +170,13 @@ def with_tilt(
     from recon.base.views import spread_views
     from recon.prep.tilt import STEEPEST
 
-    step = selection.step(TiltAndLens)
-    source = scan.source
-    step.of(source, selection)  # raises an error for a cone beam
+    step, source = scan.selection.step(TiltAndLens), scan.source
+    step.of(scan)  # raises an error for a cone beam
     if not step.sought:
-        return selection, {}
-    rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
+        return scan, {}
+    rows, frames = source.shape[0] // scan.selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(scan, replace(selection, rows=None), frames, progress)
+        tilt, uncertainty = _refined(scan.part(rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or omit --tilt."
@@ -198,26 +196,24 @@ def with_tilt(
     straight = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING
     step = replace(step, tilt=0.0 if straight else math.degrees(tilt))
     done = step.done(f"{lean}; not corrected." if straight else f"{lean}; the projections are rotated to correct it.")
-    return selection.with_steps(step), {step.name: done}
+    return scan.with_steps(step), {step.name: done}
 
 
-def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
+def _search_memory(scan: SelectedScan) -> int:
     """Bytes that `with_tilt` needs at most, if it searches for the tilt."""
     from beamline.projections.correction import at_once_memory
     from recon.prep.tilt import STEEPEST
 
-    step, frames = selection.step(TiltAndLens), source.table.views.size
-    steepest = replace(_without_blur(selection), rows=None).with_steps(replace(step, tilt=math.degrees(STEEPEST)))
-    n, cols = min(frames, _VIEWS), source.shape[1] // selection.binning
-    rows = source.shape[0] // selection.binning
+    source, binning, step = scan.source, scan.selection.binning, scan.selection.step(TiltAndLens)
+    steepest = _without_blur(scan).part(rows=None).with_steps(replace(step, tilt=math.degrees(STEEPEST)))
+    n, cols = min(source.table.views.size, _VIEWS), source.shape[1] // binning
+    rows = source.shape[0] // binning
     middle = max(0, rows // 2 - _BAND_ROWS)
-    band = at_once_memory(source, steepest, n, slice(middle, min(rows, middle + _BAND_ROWS)))
+    band = at_once_memory(steepest, n, slice(middle, min(rows, middle + _BAND_ROWS)))
     return 4 * n * _BANDS * cols + max(band, _COPIES * 4 * n * _BANDS * cols)
 
 
-def _refined(
-    scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], progress: BandsDone
-) -> tuple[float, float]:
+def _refined(scan: SelectedScan, frames: NDArray[np.int64], progress: BandsDone) -> tuple[float, float]:
     """The tilt, measured in projections that were corrected by the tilt of the last round, and its uncertainty;
     radians.
 
@@ -227,11 +223,11 @@ def _refined(
     from beamline.projections.correction import survey
     from beamline.projections.tilt import shown_tilt
 
-    plain, step = _without_blur(selection), selection.step(TiltAndLens)
-    rows = scan.source.shape[0] / selection.binning
+    plain, step = _without_blur(scan), scan.selection.step(TiltAndLens)
+    rows = scan.source.shape[0] / scan.selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = survey(scan, plain.with_steps(replace(step, tilt=math.degrees(tilt))), frames)
+        levelled = survey(plain.with_steps(replace(step, tilt=math.degrees(tilt))), frames)
         residual = shown_tilt(levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress))
         tilt += residual.tilt
         if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:
@@ -239,11 +235,12 @@ def _refined(
     return tilt, residual.uncertainty
 
 
-def _without_blur(selection: ScanSelection) -> ScanSelection:
-    """The selection without other filters of the projections, because each mixes neighbouring pixels."""
+def _without_blur(scan: SelectedScan) -> SelectedScan:
+    """The scan without other filters of the projections, because each mixes neighbouring pixels."""
+    selection = scan.selection
     sharp = tuple(step for step in selection.steps if isinstance(step, TiltAndLens) or not isinstance(step, ViewStep))
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)
-    return replace(selection, steps=sharp).with_steps(logarithms)
+    return scan.part(steps=sharp).with_steps(logarithms)
 
 
 def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:

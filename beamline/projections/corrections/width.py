@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.selection import ScanSelection
+    from beamline.projections.selection import SelectedScan
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.recon_record import Value
     from recon.base.geometry import Geometry
@@ -104,7 +104,7 @@ class Width:
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
 
-    def rays(self, source: ScanSource, selection: ScanSelection, geometry: Geometry) -> tuple[Geometry, StepDone]:
+    def rays(self, scan: SelectedScan, geometry: Geometry) -> tuple[Geometry, StepDone]:
         """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:
@@ -113,10 +113,11 @@ class Width:
         """
         from recon.base.ray_width import RayWidth
 
+        source, selection = scan.source, scan.selection
         blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         stated, motion = self._motion(source), _Motion(0.0, 0.0)
-        if (table := stated_poses(source, selection)) is not None and table.vectors is not None:
+        if (table := stated_poses(scan)) is not None and table.vectors is not None:
             stated = None  # vectors already are those of the middle of an exposure
             if self.arc not in ("auto", "none"):
                 raise ConfigError(

@@ -4,6 +4,7 @@ and passed on.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -52,13 +53,13 @@ class EvidenceRequest(NamedTuple):
     Attributes:
         accepted: references are used as they are: their faults are warnings.
         cone: mm from the source to the rotation axis and to the detector, instead of the values in the file.
-        judged: flags that are used instead of those in the file.
+        judge: makes flags that are used instead of those in the file; None: those in the file are used.
         limits: limits for darks and flats; None: the default limits.
     """
 
     accepted: bool = False
     cone: tuple[float, float] | None = None
-    judged: FrameFlags | None = None
+    judge: Callable[[ScanSource], FrameFlags] | None = None
     limits: ReferenceLimits | None = None
 
 
@@ -97,10 +98,10 @@ class ScanEvidence:
         """mm from the source to the rotation axis and to the detector; None for a parallel beam."""
         return self.source.cone if self.asked.cone is None else self.asked.cone
 
-    @property
+    @cached_property
     def flags(self) -> FrameFlags | None:
         """Flags of all frames, those that count; None: there are none."""
-        return self.table.flags if self.asked.judged is None else self.asked.judged
+        return self.table.flags if self.asked.judge is None else self.asked.judge(self.source)
 
     # References, by groups
 

@@ -173,6 +173,7 @@ def joined(
     """
     import recon
     from beamline.projections.prepare import prepare_projections
+    from beamline.projections.views import select
     from beamline.storage.readers.open import open_scan
 
     attenuation, parts = [], []
@@ -181,7 +182,7 @@ def joined(
             attenuation.append(spectra.at(scan.energy_kev, path))
     for path in scans:
         with open_scan(path) as scan:
-            parts.append(prepare_projections(scan, selection, warn))
+            parts.append(prepare_projections(select(scan, selection), warn))
         selection = replace(selection, axis_col=parts[0].axis_col)
     if parts[0].length_unit != "mm":
         raise ConfigError("The scans must state the pixel size, because the spectra are in 1/mm. Nothing was written.")

@@ -20,6 +20,7 @@ from beamline.api import Selection
 from beamline.core.errors import DataError
 from beamline.core.text import rounded, size
 from beamline.projections.prepare import prepare_projections
+from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan, scan_format
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
@@ -280,7 +281,8 @@ def parts_of(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
     )  # fmt: skip
     with open_scan(scan) as source:
-        selected = selection.of(source)
+        picked = select(source, selection)
+        selected = picked.selection
         first, end, side = selected.detector_rows.start, selected.detector_rows.stop, selected.binning
         if selected.cone is None:
             if (end - first) // side != read.n_slices:
@@ -290,7 +292,7 @@ def parts_of(
                     f"scan give {(end - first) // side}"
                 )
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
-            selection = replace(selection, rows=(first + low * side, first + high * side))
+            picked = picked.selecting(replace(selection, rows=(first + low * side, first + high * side)))
             at = slice(at.start - low, at.stop - low)
         elif read.limit_sentence:
             raise ValueError(
@@ -298,7 +300,7 @@ def parts_of(
                 "not fit "
                 "the memory"
             )
-        prepared = prepare_projections(source, selection, warn)
+        prepared = prepare_projections(picked, warn)
     views, order = prepared.views, np.argsort(np.mod(prepared.geometry.angles, prepared.geometry.period), kind="stable")
     in_pixels = facts.get("pixel_pitch_unit") == "px"
     scale = 1.0 if in_pixels else prepared.geometry.sample_pitch / record.grid.voxel_size  # to the volume's unit

@@ -13,6 +13,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.slow]
@@ -50,7 +51,8 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @cache
 def _prepared(path: Path, model: str = "auto", buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
-        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer)
+        scan = select(source, Selection(axis_col=27.5, steps=(Air(model),)))
+        return prepare_projections(scan, lambda said: None, buffer)
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:

@@ -10,6 +10,7 @@ import pytest
 
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.report.metrics import METRICS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -31,7 +32,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     trial = pytest.importorskip("beamline.features.trials.trial").MethodTrial("method", "fbp", 10)
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"
-    prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)
+    prepared = prepare_projections(select(source, Selection(views="every:3", axis_col=20.7)), lambda _: None)
     prepared = replace(prepared, view_weights=None)
     grid = Grid.matching(prepared.geometry)
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)

@@ -13,6 +13,7 @@ from beamline.core.stop import StopRequest
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
@@ -108,7 +109,7 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
     with open_scan(result.path) as source:
         assert (source.cone, source.attributes["distance_mm"]) == ((SOD, SDD), SDD - SOD)
         assert source.pixel_size_mm == pytest.approx(4.6e-3 * SDD / SOD)  # NXtomo's is that on the detector
-        prepared = prepare_projections(source, Selection(steps=(Air("none"),)), said.append)
+        prepared = prepare_projections(select(source, Selection(steps=(Air("none"),))), said.append)
     geometry = prepared.geometry
     assert (geometry.is_cone, geometry.axis_col, geometry.axis_row) == (True, 21.0, 15.5)
     grid = Grid.matching(geometry)

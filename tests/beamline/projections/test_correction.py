@@ -15,10 +15,11 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.growing import ignores_shadow, outdated
 from beamline.projections.preparation import Preparation
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import references_usable
 from tests.beamline.array_source import ArraySource, counted, scan_of
-from tests.beamline.prepared_views import evidence_of, feed_batches
+from tests.beamline.prepared_views import feed_batches
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
 
@@ -27,7 +28,7 @@ PLAIN = Selection(steps=(Air("none"),))
 
 
 def plan_of(source: Any, selection: Selection) -> ScanCorrectionPlan:
-    return survey(evidence_of(source, selection), selection.of(source))
+    return survey(select(source, selection))
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
@@ -52,7 +53,7 @@ def test_at_once_in_batches_and_as_they_come_are_loops_over_one_plan(rng: np.ran
     counts[rng.random(counts.shape) < 4e-3] += np.uint16(BEAM // 8)
     source, frames = counted(counts, SCAN.angles), np.arange(2, 47)
     out = np.empty((45, 4, 40), np.float32)
-    plan = survey(evidence_of(source, PLAIN), PLAIN.of(source), frames)
+    plan = survey(select(source, PLAIN), frames)
     whole = apply(plan, frames)
     batches = apply_in_batches(plan, frames, out, 7, None, lambda n, of: None)
     fed, state = feed_batches(plan, np.array_split(frames, 6), warn=lambda sentence: None)
@@ -62,7 +63,7 @@ def test_at_once_in_batches_and_as_they_come_are_loops_over_one_plan(rng: np.ran
         np.testing.assert_array_equal(found.data, whole.data)
         np.testing.assert_array_equal(found.masked, whole.masked)
     assert not ignores_shadow(state, frames) and not outdated(state)
-    unaware = replace(state, plan=survey(evidence_of(source, PLAIN), PLAIN.of(source)))
+    unaware = replace(state, plan=survey(select(source, PLAIN)))
     assert ignores_shadow(unaware, frames)
 
 

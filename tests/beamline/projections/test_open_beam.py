@@ -15,10 +15,11 @@ from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource, scan_of
-from tests.beamline.prepared_views import evidence_of, prepare
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders(shape=(16, 64), axis_col=31.7)
@@ -37,7 +38,7 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
 
 def plan_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrectionPlan:
     selection = replace(PLAIN, **chosen).with_steps(*steps)
-    plan = survey(evidence_of(source, selection), selection.of(source))
+    plan = survey(select(source, selection))
     assert plan.references is not None and not plan.warnings
     return plan
 

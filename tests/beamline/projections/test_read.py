@@ -11,8 +11,8 @@ from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned
 from beamline.projections.references import read_references
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from tests.beamline.array_source import ArraySource
-from tests.beamline.prepared_views import evidence_of
 
 
 @pytest.mark.parametrize("binning", [1, 2])
@@ -56,7 +56,7 @@ def test_flats_are_grouped_by_the_views_between_them() -> None:
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
     source = ArraySource(data, keys, np.zeros(12))
     accepting = Selection(steps=(Preparation(references="accept"),))
-    references, _ = read_references(evidence_of(source, accepting), slice(0, 2), accepting.of(source))
+    references, _ = read_references(select(source, accepting), slice(0, 2))
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import ConfigError
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection, unbinned
+from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import scan_of
@@ -39,7 +40,7 @@ def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> 
 def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: str) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
     with open_scan(path) as source, pytest.raises(ConfigError, match=said):
-        prepare_projections(source, selection, pytest.fail)
+        prepare_projections(select(source, selection), pytest.fail)
 
 
 def test_the_central_ray_meets_the_row_that_is_given_whatever_rows_are_read() -> None:

@@ -12,9 +12,10 @@ from beamline.projections.correction import apply, line_integrals_of, survey
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import evidence_of, feed_batches, prepare
+from tests.beamline.prepared_views import feed_batches, prepare
 from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 
@@ -53,11 +54,11 @@ def test_more_than_half_of_the_views_are_refused() -> None:
 def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     unlit, frames = [3, 30, 31], FIRST + np.arange(VIEWS)
     source = scan(unlit, 0.0)
-    at_once = line_integrals_of(evidence_of(source, SELECTION), SELECTION.of(source), frames)
+    at_once = line_integrals_of(select(source, SELECTION), frames)
     in_slabs, told = prepare(source, SELECTION, DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7))
     np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)
     assert len([line for line in told if "3 projections of 45 (frames 9, 36-37) had no beam" in line]) == 1
-    plan = survey(evidence_of(source, SELECTION), SELECTION.of(source).with_steps(Air("none")))
+    plan = survey(select(source, SELECTION).with_steps(Air("none")))
     fed, _ = feed_batches(plan, np.array_split(frames, 5), warn=told.append)
     np.testing.assert_array_equal(fed.view_ids, at_once.view_ids)
 
@@ -78,5 +79,5 @@ def test_a_band_in_which_the_sample_is_opaque_has_views_with_light() -> None:
     counts[:, 4:] = DARK + 2
     selection = Selection(rows=(4, 8), axis_col=scene.axis_col, steps=(Air("none"),))
     source = counted(counts, scene.angles)
-    plan = survey(evidence_of(source, selection), selection.of(source))
+    plan = survey(select(source, selection))
     assert apply(plan, np.arange(2, 47), warn=pytest.fail).view_ids.size == 45

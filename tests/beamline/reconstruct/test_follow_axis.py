@@ -87,7 +87,6 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     looks, told = list[int](), list[str]()
     warn = Warnings(lambda event: told.append(event.data["message"]), SystemClock())
     correction: Any = None
-    selected: Any = Selection()
     source: Any = SimpleNamespace(
         table=SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8))), axis_col=None, cone=None
     )
@@ -98,7 +97,8 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         return LocatedAxis(20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn"))
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
-    followed = followed_views.FollowedViews(source, selected)
+    scan: Any = SimpleNamespace(source=source, selection=Selection())
+    followed = followed_views.FollowedViews(scan)
     search, col = followed_views.AxisSearch(), None
     for n in range(1, 101):
         search, col = search.look(followed, correction, np.arange(n), col, ended=False, warn=warn)

@@ -16,6 +16,7 @@ from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct import live_end, live_steps, pipeline
 from beamline.reconstruct.live_states import Feeds, LiveScan
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -149,7 +150,7 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
 
     told = list[str]()
     with open_scan(tmp_path / "scan.h5") as source:
-        whole = prepare_projections(source, selection, told.append)
+        whole = prepare_projections(select(source, selection), told.append)
     # Flats of another light that no air corrects are told of.
     assert not told or ((air, gain) == ("none", 1.3) and all("in line integral" in each for each in told))
     np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
@@ -197,7 +198,7 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
 
     join([tmp_path / "scan.h5", tmp_path / "rest.h5"], tmp_path / "joined.h5")
     with open_scan(tmp_path / "joined.h5") as joined:
-        whole = prepare_projections(joined, selection, lambda said: None)
+        whole = prepare_projections(select(joined, selection), lambda said: None)
     assert whole.projections.view_ids.size == 30
     np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
     np.testing.assert_array_equal(judged[0].projections.view_ids, whole.projections.view_ids)

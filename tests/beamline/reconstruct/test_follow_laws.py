@@ -15,6 +15,7 @@ from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct import live_steps
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.live_states import Cursor
@@ -123,7 +124,7 @@ def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[
     assert isinstance(scan.events[-1], LawMeasured)
     close(scan.clock)
     with open_scan(tmp_path / "scan.h5") as source:
-        whole = prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda sentence: None)
+        whole = prepare_projections(select(source, Selection(axis_col=SCAN.axis_col)), lambda sentence: None)
     for n, (data, geometry, _) in zip((10, 20, 30), laws.asked, strict=True):
         np.testing.assert_allclose(data[: n - 1], whole.projections.data[: n - 1], atol=1e-6)
         assert data[n - 1] == pytest.approx(whole.projections.data[n - 1], abs=0.1)  # provisional

@@ -17,7 +17,7 @@ from beamline.projections.axis import LocatedAxis
 from beamline.projections.correction import apply, survey
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import checked_views, evidence_request
+from beamline.projections.views import checked_views, select
 from beamline.reconstruct import followed_views
 from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
 from beamline.reconstruct.live_end import ended, final_fit
@@ -37,7 +37,6 @@ from beamline.reconstruct.live_steps import (
 )
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import Frame, FrameKind
 from recon.base.method import Progress
 from recon.prep.align import AxisEstimate
@@ -62,11 +61,10 @@ def live(tmp_path: Path) -> Iterator[Callable[..., tuple[LiveScan, list[Event]]]
     def make(frames: Sequence[Frame] = FRAMES, selection: Selection = KNOWN) -> tuple[LiveScan, list[Event]]:
         events, clock = list[Event](), SteppedClock(tick=0.01)
         opened.append(open_scan(write_flagged(tmp_path / "scan.h5", list(frames), {})))
-        views = FollowedViews(opened[-1], selection.of(opened[-1]))
-        evidence = ScanEvidence(views.source, evidence_request(views.source, views.selection))
+        views = FollowedViews(select(opened[-1], selection))
         wanted = options(tmp_path, selection=selection, method=BRIEF)
         warn = Warnings(events.append, clock)
-        return LiveScan(wanted, views, evidence, events.append, clock, warn, clock.now()), events
+        return LiveScan(wanted, views, events.append, clock, warn, clock.now()), events
 
     yield make
     for source in opened:
@@ -138,7 +136,7 @@ class TestWaitsForAxis:
     @pytest.fixture
     def waits(self, live: Callable[..., Any]) -> tuple[LiveScan, WaitsForAxis]:
         scan, _ = live(selection=UNKNOWN)
-        return scan, WaitsForAxis(new_correction(scan, scan.evidence), AxisSearch())
+        return scan, WaitsForAxis(new_correction(scan, scan.views.scan), AxisSearch())
 
     def test_an_unclear_axis_is_searched_again_with_half_as_many_projections_again(
         self, waits: tuple[LiveScan, WaitsForAxis], axis_at: Callable[[float, bool], None]
@@ -178,7 +176,7 @@ class TestFeeds:
             state, file = fed(scan, state, _file(n, ended=n == 30, taken=file.taken))
             assert (state.n_views, state.fit.n_views, file.behind) == (n, n, False)
         assert state.newest is None
-        whole = apply(survey(scan.evidence, scan.selection), ROWS)
+        whole = apply(survey(scan.views.scan), ROWS)
         np.testing.assert_array_equal(joined(state).data, whole.data)
         assert len(state.batches) == 1
 
@@ -264,7 +262,7 @@ def test_the_last_fit_has_all_projections_and_knows_what_the_live_fit_reported(l
     scan, events = live()
     before = Progress(3, 0, 1.0, 0.1, 0.1, 100, 20)
     state = replace(_feeds(scan, 20), history=(before,))
-    last = ended(scan, state, scan.evidence, checked_views(scan.evidence, scan.selection, scan.warn))
+    last = ended(scan, state, scan.views.scan, checked_views(scan.views.scan, scan.warn))
     assert (last.fit, last.axis_col, last.history) == (state.fit, SCAN.axis_col, (before,))
     assert last.fit.n_views == last.prepared.geometry.n_views == 20
     written: list[float] = []

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct.region import box_around_sample
 from tests.beamline.array_source import scan_of
 from tests.slow_cases import others_slow
@@ -43,7 +44,7 @@ def scan(depth: NDArray[np.float64], cone: tuple[float, float] | None = None) ->
 def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> None:
     """A dense body, and one in other rows that absorbs as much or a twentieth of it."""
     bodies = (10.0, -12.0, 8.0, 0.1, slice(6, 15)), (-14.0, 5.0, 6.0, faint, slice(12, 18))
-    region = box_around_sample(scan(cylinders(*bodies)), replace(PLAIN, binning=binning))
+    region = box_around_sample(select(scan(cylinders(*bodies)), replace(PLAIN, binning=binning)))
     middle = (COLS + 2 * abs(AXIS - (COLS - 1) / 2) - 1) / 2  # of the widest volume that the axis may ask for
     for low, high, span in ((6, 18, region.z), (-20, 11, region.y), (-20, 18, region.x)):
         offset = 0 if span is region.z else middle
@@ -56,6 +57,6 @@ def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [slice(8, 16), slice(0, ROWS)])
 def test_of_a_sample_beyond_the_field_all_is_made(rows: slice) -> None:
-    region = box_around_sample(scan(cylinders((0, 0, 70.0, 0.01, rows))), PLAIN)
+    region = box_around_sample(select(scan(cylinders((0, 0, 70.0, 0.01, rows))), PLAIN))
     assert region.z == (0, ROWS) and region.y == region.x and region.x[0] == 0 and region.x[1] >= COLS
     assert "the sample extends beyond the field of view at the left and the right" in region.reason

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.plan import prepare_within
@@ -85,9 +86,10 @@ def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path)
             SourceOptions(tmp_path / name), OutputPaths(tmp_path / "v.h5", None), Selection(axis_col=23.7), Fbp()
         )
         with open_scan(tmp_path / name) as source:
-            needs = recon_memory_of(source, options)
+            scan = select(source, options.selection)
+            needs = recon_memory_of(scan, options)
             limited = replace(options, memory=needs.at_once + views)
-            _, plan = prepare_within(source, limited, lambda _: None, ScanClock(), lambda _: None)
+            _, plan = prepare_within(scan, limited, lambda _: None, ScanClock(), lambda _: None)
         slabs[name] = len(plan.slabs), plan.needs.weights
     assert slabs["whole.h5"] == (0, 0) and slabs["scan.h5"][0] > 1 and slabs["scan.h5"][1] == 2 * views
 

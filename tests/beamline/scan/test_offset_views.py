@@ -19,6 +19,7 @@ from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
@@ -85,7 +86,7 @@ def asked(*words: str) -> Config:
 def prepared(path: Path) -> tuple[PreparedProjections, list[str]]:
     told: list[str] = []
     with open_scan(path) as source:
-        return prepare_projections(source, Selection(axis_col=(COLS - 1) / 2), told.append), told
+        return prepare_projections(select(source, Selection(axis_col=(COLS - 1) / 2)), told.append), told
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,7 @@ def test_stepped_views_of_another_program_come_by_poses(wide_scan: Path, tmp_pat
     poses.write_text("\n".join(["frame,shift_col_px,shift_row_px", *rows]), encoding="utf-8")
     selection = Selection(axis_col=19.5).with_steps(PosesOfFile(read_poses(str(poses))))
     with open_scan(tmp_path / "other.nxs") as source:
-        other = prepare_projections(source, selection, lambda sentence: None)
+        other = prepare_projections(select(source, selection), lambda sentence: None)
     views, _ = prepared(wide_scan)
     assert other.geometry.shifts == pytest.approx(views.geometry.shifts)
     assert other.centred.geometry.n_views == VIEWS

@@ -24,7 +24,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, select
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, tell
 from beamline.scan.resume import open_for_resume
@@ -37,7 +37,6 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true
-from tests.beamline.prepared_views import evidence_of
 from tests.beamline.ran import Ran, ended_run, small
 from tests.slow_cases import others_slow
 
@@ -84,7 +83,7 @@ def _assert_told_of_parts(run: Path) -> None:
         assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1
         with open_scan(part) as source, pytest.raises(DataError, match=re.escape(line)):
             accepting = Selection(steps=(Preparation(references="accept"),))
-            checked_views(evidence_of(source, accepting), accepting.of(source), lambda _: None)
+            checked_views(select(source, accepting), lambda _: None)
         assert whole_scan(part) == run / "joined.h5" == watched(part).scan
     with closing(Reader(watched(run))) as reader:
         assert reader.state()["frames"] == open_scan(run / "joined.h5").table.kinds.size
@@ -110,7 +109,7 @@ def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path
             assert overlaid(source, flats=images).table.part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
         selection = Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore")))
-        prepared = prepare_projections(source, selection, lambda said: None)
+        prepared = prepare_projections(select(source, selection), lambda said: None)
     assert len(prepared.projections.data) == VIEWS
 
 
@@ -150,11 +149,8 @@ def test_references_of_the_end_alone_are_taken(
     assert [finding for finding in validate(run / "joined.h5") if finding.severity == "error"] == []
     assert describe(run / "joined.h5")["missing_triggers"] == 0
     with open_scan(run / "joined.h5") as source:
-        prepared = prepare_projections(
-            source,
-            Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore", "accept"))),
-            lambda said: None,
-        )
+        scan = select(source, Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore", "accept"))))
+        prepared = prepare_projections(scan, lambda said: None)
     assert len(prepared.projections.data) == VIEWS
     with pytest.raises(ConfigError, match="all projections, darks and flats that were planned"):
         go_on(run)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.projections.selection import ScanSelection, with_pivot
+from beamline.projections.selection import SelectedScan, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 from recon.base.registry import unknown
 
@@ -19,15 +19,13 @@ if TYPE_CHECKING:
 
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
-    from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
     from recon.features.calibration.joint import GeometryChange
     from recon.features.calibration.learn import LearntGeometry
 
     Progress = Callable[[int, int], None]
-    GeometryOf = Callable[[ScanSelection, I64], Geometry]
+    GeometryOf = Callable[[SelectedScan, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
 GAINS = "gains"  # the one term that changes line integrals, not the geometry
@@ -110,14 +108,13 @@ class Calibrate:
 
     def learn(
         self,
-        scan: ScanEvidence,
-        selection: ScanSelection,
+        scan: SelectedScan,
         frames: NDArray[np.int64],
         geometry_before: GeometryOf,
         progress: Callable[[int, int], None],
     ) -> Calibrated:
         """Calibrate the geometry of these frames with the terms of this step."""
-        return calibrated(scan, selection, frames, geometry_before, self.geometry, progress)
+        return calibrated(scan, frames, geometry_before, self.geometry, progress)
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
@@ -172,8 +169,7 @@ class Calibrated:
 
 
 def calibrated(
-    scan: ScanEvidence,
-    selection: ScanSelection,
+    scan: SelectedScan,
     frames: I64,
     geometry_before: GeometryOf,
     terms: frozenset[str],
@@ -183,7 +179,7 @@ def calibrated(
 
     Args:
         frames: rows of the file, in order.
-        geometry_before: the geometry of frames in the rows and with the binning of a selection, before calibration.
+        geometry_before: the geometry of frames of a part of the scan, with its rows and binning, before calibration.
         progress: how many steps are done, of how many at most.
 
     Raises:
@@ -193,8 +189,8 @@ def calibrated(
     from recon.base.masks import areas
     from recon.features.calibration.learn import learn_geometry
 
-    source, band = scan.source, _band(scan.source, selection)
-    views = line_integrals_of(scan, band, frames)
+    source, selection, band = scan.source, scan.selection, _band(scan)
+    views = line_integrals_of(band, frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
     lit = ~areas(views.masked)
@@ -204,11 +200,11 @@ def calibrated(
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry could not be calibrated: {error}. Omit --calibrate.") from error
-    looked, middle = band.detector_rows, (source.shape[0] - 1) / 2
+    looked, middle = band.selection.detector_rows, (source.shape[0] - 1) / 2
     whole = replace(selection, binning=1, rows=None).geometry(0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
-    change = learnt.change.scaled(band.binning)
-    return Calibrated(ids, change, whole.pixel_pitch, off, selection.pivot, band.binning, learnt)
+    change = learnt.change.scaled(band.selection.binning)
+    return Calibrated(ids, change, whole.pixel_pitch, off, selection.pivot, band.selection.binning, learnt)
 
 
 def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
@@ -217,25 +213,26 @@ def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
         return 0
     from beamline.projections.correction import at_once_memory
 
-    band = _band(part.source, part.selection)
-    rows, frames = band.detector_rows, part.geometry.n_views
-    pixels = (rows.stop - rows.start) * part.source.shape[1] // band.binning**2
-    return at_once_memory(part.source, band, frames) + 4 * _COPIES * frames * pixels
+    band = _band(part.scan)
+    rows, frames = band.selection.detector_rows, part.geometry.n_views
+    pixels = (rows.stop - rows.start) * band.source.shape[1] // band.selection.binning**2
+    return at_once_memory(band, frames) + 4 * _COPIES * frames * pixels
 
 
-def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
+def _band(scan: SelectedScan) -> SelectedScan:
     """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
 
     For a region of interest, the rows around it are those of the whole volume, and the region is cut out.
     """
     from recon.features.calibration.learn import COLS, ROWS
 
+    selection = scan.selection
     used = replace(selection, rows=selection.axis_rows or selection.rows).detector_rows
     height = used.stop - used.start
-    binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
+    binning = max(selection.binning, min(math.ceil(scan.source.shape[1] / COLS), height))
     n = min(height, ROWS * binning)
     first = (used.start + used.stop - n) // 2
-    return replace(selection, rows=(first, first + n), binning=binning)
+    return scan.part(rows=(first, first + n), binning=binning)
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:

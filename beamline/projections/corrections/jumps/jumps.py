@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -16,14 +16,12 @@ from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import ScanSelection
+from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone, StepMemory
 from beamline.projections.usable_views import UsableViews, usable_views
 from recon.base.volume import Grid
 
 if TYPE_CHECKING:
-    from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
@@ -50,20 +48,19 @@ class Jumps:
     needs_finished: ClassVar[str] = ""
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=_search_memory(part.source, part.selection))
+        return StepMemory(alone=_search_memory(part.scan))
 
     def place(
         self,
-        source: ScanSource,
-        selection: ScanSelection,
+        scan: SelectedScan,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        learnt = any("shifts" in step.geometry for step in geometry_steps(selection))
-        if learnt or stated_poses(source, selection) is not None:
+        learnt = any("shifts" in step.geometry for step in geometry_steps(scan.selection))
+        if learnt or stated_poses(scan) is not None:
             return Unmoved(usable.frames)
-        return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
+        return find_jumps(scan, usable.frames, usable.jumps, axis_col, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +85,7 @@ class SampleJumps:
 
 
 def find_jumps(
-    scan: ScanEvidence,
-    selection: ScanSelection,
+    scan: SelectedScan,
     frames: I64,
     jumps: I64,
     axis_col: float,
@@ -109,7 +105,7 @@ def find_jumps(
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
         return SampleJumps(frames)
-    if selection.cone is not None:
+    if scan.selection.cone is not None:
         where = frames_text(jumps)
         return SampleJumps(
             frames,
@@ -127,7 +123,7 @@ def find_jumps(
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
                 progress(n, most)
-                if (clear := _clearness(scan, selection, axis_col, run, row)) > clearest:
+                if (clear := _clearness(scan, axis_col, run, row)) > clearest:
                     clearest, best = clear, row
         if best:
             real.append(best)
@@ -158,7 +154,7 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
     return " ".join(text)
 
 
-def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, frames: I64, row: int) -> float:
+def _clearness(scan: SelectedScan, axis_col: float, frames: I64, row: int) -> float:
     """How clearly the sample was in another place from `row` on in these rows of the file; 1 is the limit."""
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
@@ -167,38 +163,39 @@ def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, fr
     step = max(1, math.ceil(frames.size / _VIEWS))
     sides = frames[frames < row], frames[frames >= row]
     looked = np.concatenate([side[:: 1 if side.size <= _SHORT else step] for side in sides])
-    band = _band(scan.source, selection)
-    views = line_integrals_of(scan, band, looked)
-    geometry = band.geometry(axis_col, scan.table.angles[views.view_ids])
+    band = _band(scan)
+    views = line_integrals_of(band, looked)
+    geometry = band.selection.geometry(axis_col, scan.table.angles[views.view_ids])
     part = (views.view_ids >= row).astype(np.int64)
     fit = judge(views.data, geometry, part, ~areas(views.masked), [Displacement()] * 2)
     return max(fit.together / fit.alone / (1 + _ADDS), fit.others[1 - fit.longest] / (ALIKE * fit.together))
 
 
-def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
-    """Binned pixels, and rows around the middle of those that are used, also beyond them."""
+def _band(scan: SelectedScan) -> SelectedScan:
+    """The scan with binned pixels, and rows around the middle of those that are used, also beyond them."""
+    source, selection = scan.source, scan.selection
     width, height = source.shape[1] // selection.binning, source.shape[0]
     binning = selection.binning * max(1, math.ceil(width / _COLS))
     used = selection.detector_rows
     n = min(_ROWS * binning, height)
     first = min(max((used.start + used.stop - n) // 2, 0), height - n)
-    return replace(selection, rows=(first, first + n), binning=min(binning, n))
+    return scan.part(rows=(first, first + n), binning=min(binning, n))
 
 
-def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
+def _search_memory(scan: SelectedScan) -> int:
     """Bytes that `find_jumps` needs at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv
 
-    asked = selection.step(Preparation)
-    jumps = usable_views(ScanEvidence(source), asked.uses_flags).jumps
-    if selection.cone is not None or not (asked.judged or jumps.size):
+    asked, source = scan.selection.step(Preparation), scan.source
+    if scan.selection.cone is not None:
+        return 0
+    if not (asked.judged or usable_views(scan.evidence, asked.uses_flags).jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
-    band = _band(source, selection)
-    views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
+    band = _band(scan)
+    views = band.selection.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS).memory(views, Grid.matching(views), weighted=True)
-    return copy + max(at_once_memory(source, band, n), work)
+    return copy + max(at_once_memory(band, n), work)

@@ -14,7 +14,7 @@ from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.step import StepDone, StepMemory, option, positive
 
 if TYPE_CHECKING:
-    from beamline.projections.selection import ScanSelection
+    from beamline.projections.selection import SelectedScan
     from beamline.storage.readers.base import ScanSource
     from recon.base.geometry import Geometry
     from recon.features.phase import Paganin
@@ -123,24 +123,22 @@ class Phase:
         if self.material is None:
             return StepMemory()
         searches, cols = self.material == _AUTO, part.geometry.detector_shape[1]
-        paganin = Paganin(1.0) if searches else self.filter_of(part.source, part.selection)[0]
+        paganin = Paganin(1.0) if searches else self.filter_of(part.scan)[0]
         search = 4 * TRIAL_ROWS * cols * TRIAL_COPIES * (part.geometry.n_views + cols) if searches else 0
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
-    def estimated(
-        self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
-    ) -> Phase | None:
+    def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> Phase | None:
         """This step with the filter that these projections show; None if the user stated the filter, or if nothing
         is certain.
         """
         from recon.features.phase import LEAST_DROP, length_by_held_out_views
         from recon.prep.overshoot import Overshoot
 
-        undistorted = geometry.is_straight and not geometry.shifts.any() and source.row_pitch_mm is None
+        undistorted = geometry.is_straight and not geometry.shifts.any() and scan.source.row_pitch_mm is None
         searches = self.material == _AUTO and self.length is None and views.weights is None and undistorted
         if not searches or not (overshoot := Overshoot.of(views.data)).certain:
             return None
-        floor = selection.step(Preparation).floor
+        floor = scan.selection.step(Preparation).floor
         filter = length_by_held_out_views(views.data, geometry, floor, ~views.masked)
         if filter is None:
             return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
@@ -159,21 +157,21 @@ class Phase:
         )
         return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
 
-    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
+    def on(self, scan: SelectedScan) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
             why = self.explanation or (
                 self.unsharp and "--unsharp has no effect without a phase filter; give --phase paganin:RATIO."
             )
             return None, StepDone(f"No phase retrieval. {why}" if why else "", {"phase": "not retrieved"})
-        paganin, sentence = self.filter_of(source, selection)
+        paganin, sentence = self.filter_of(scan)
 
         def apply(views: Projections, first: int) -> Projections:
-            paganin.retrieve(views.data, selection.step(Preparation).floor)
+            paganin.retrieve(views.data, scan.selection.step(Preparation).floor)
             return views
 
         return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})
 
-    def filter_of(self, source: ScanSource, selection: ScanSelection) -> tuple[Paganin, str]:
+    def filter_of(self, scan: SelectedScan) -> tuple[Paganin, str]:
         """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
@@ -181,6 +179,7 @@ class Phase:
         """
         from recon.features.phase import Paganin, length_of
 
+        source, selection = scan.source, scan.selection
         if source.row_pitch_mm is not None:
             raise ConfigError(f"--phase needs square pixels; the pixels of {source.path} are not square.")
         cone, pitch = selection.cone, selection.pixel_size_mm

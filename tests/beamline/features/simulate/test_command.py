@@ -18,6 +18,7 @@ from beamline.features.simulate import write
 from beamline.features.simulate.write import write_scan
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.scenes.scene_file import open_scene
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
@@ -200,9 +201,9 @@ def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: lis
     scan = Scan.of(scene.scene)
     write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
     with open_scan(tmp_path / "scan.h5") as source:
-        selection = Selection().of(source)
-        geometry = selection.geometry(7.5, source.table.angles[2:])
-        seen, done = Width(arc="auto").rays(source, selection, geometry)
+        selected = select(source, Selection())
+        geometry = selected.selection.geometry(7.5, source.table.angles[2:])
+        seen, done = Width(arc="auto").rays(selected, geometry)
         assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
     moved = math.radians(180) / 6 / scan.period * 0.012
     assert seen.width.arc == pytest.approx(moved if effects else 0)

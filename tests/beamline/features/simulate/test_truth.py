@@ -13,6 +13,7 @@ from beamline.features.simulate.write import scan_of, write_scan
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.scenes.scene_file import Truth, binning_of, open_scene, truth_of, write_truth
 from beamline.storage.readers.open import open_scan
 from drivers.base.clock import SystemClock
@@ -60,7 +61,7 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
     chosen = Selection(binning=binning, axis_col=24.0, steps=(Air("none"),))
     with open_scan(tmp_path / "scan.h5") as source:
         assert source.axis_col == 24.0
-        prepared = prepare_projections(source, chosen, _silent)
+        prepared = prepare_projections(select(source, chosen), _silent)
     grid = Grid.matching(prepared.geometry)
     assert (grid.shape, grid.centre) == (truth.grid.shape, pytest.approx(truth.grid.centre))
     volume = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")

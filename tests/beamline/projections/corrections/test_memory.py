@@ -22,6 +22,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepMemory
+from beamline.projections.views import select
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
@@ -57,15 +58,15 @@ def peak(work: Callable[[], object]) -> int:
 
 
 def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
-    selection, views = Selection(steps=steps).of(source), source.table.kinds == 0
-    return ScanPart(source, selection, selection.geometry(source.shape[1] / 2, source.table.angles[views]))
+    scan, views = select(source, Selection(steps=steps)), source.table.kinds == 0
+    return ScanPart(scan, scan.selection.geometry(source.shape[1] / 2, source.table.angles[views]))
 
 
 def needs(path: Path, *steps: PrepStep) -> ReconMemory:
     output = OutputPaths(path.with_name("out.h5"), None)
     options = ReconOptions(SourceOptions(path), output, Selection(steps=steps), Fbp())
     with open_scan(SourceOptions(path)) as source:
-        return recon_memory_of(source, options)
+        return recon_memory_of(select(source, options.selection), options)
 
 
 @pytest.mark.parametrize("step", ON_VIEWS, ids=["tilt", "lens", "phase", "unsharp"])
@@ -73,7 +74,7 @@ def test_a_step_takes_no_more_memory_than_it_states_and_the_budget_has_it(step: 
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(240, 160)))
     with open_scan(SourceOptions(path)) as source:
         part = part_of(source, step)
-        found, _ = step.on(source, part.selection)
+        found, _ = step.on(part.scan)
     assert found is not None
     for n in (2, 6):
         masked, air = np.zeros((240, 160), bool), np.zeros((n, 2), np.float32)
@@ -92,8 +93,8 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep) -> Non
     disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
     rng = np.random.default_rng(0)
     views = disc + rng.normal(0, 0.01, shape) + rng.normal(0, 0.02, (rows, cols))  # noise, and gains of pixels
-    unread: Any = None  # only its file is, and its selection
-    part = ScanPart(unread, unread, Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2))
+    unread: Any = None
+    part = ScanPart(unread, Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2))
 
     def work() -> None:
         data, ones = views.astype(np.float32), np.ones(n, np.float32)

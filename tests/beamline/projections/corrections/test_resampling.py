@@ -15,12 +15,13 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion
 from recon.voxels.fbp import fbp
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import evidence_of, prepare
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.balls import Balls
 
@@ -105,11 +106,11 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
     plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
-    plan = survey(evidence_of(source, selection), selection.of(source))
+    plan = survey(select(source, selection))
     whole = apply(plan, frames, warn=pytest.fail).data
     np.testing.assert_array_equal(apply(plan, frames, slice(9, 12), pytest.fail).data, whole[:, 9:12])
     rows = replace(selection, rows=(8 * binning, 14 * binning))
-    band = apply(survey(evidence_of(source, rows), rows.of(source)), frames, warn=pytest.fail).data
+    band = apply(survey(select(source, rows)), frames, warn=pytest.fail).data
     np.testing.assert_array_equal(band, whole[:, 8:14])
     out = np.empty(whole.shape, np.float32)
     batches = apply_in_batches(plan, frames, out, 9, pytest.fail, lambda *_: None)

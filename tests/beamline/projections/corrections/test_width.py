@@ -13,6 +13,7 @@ from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
+from beamline.projections.views import select
 from beamline.reconstruct.followed_views import FollowedViews
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import ArraySource
@@ -32,9 +33,9 @@ def _source(mode: str = "fly", sense: float = 1.0, row_period: float | None = RO
 
 
 def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple[Geometry, Geometry, StepDone]:
-    chosen = (selection or Selection()).of(source)
-    before = chosen.geometry(100.0, np.arange(0.0, 3.0, 0.1))
-    return before, *step.rays(source, chosen, before)
+    scan = select(source, selection or Selection())
+    before = scan.selection.geometry(100.0, np.arange(0.0, 3.0, 0.1))
+    return before, *step.rays(scan, before)
 
 
 def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
@@ -119,7 +120,7 @@ def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: st
 def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:
     """Else its volume is turned by half of the arc from that of the finished scan, and its finish knows no motion."""
     source, ids = _source(), np.arange(2, 40)
-    views = FollowedViews(source, Selection().of(source))
+    views = FollowedViews(select(source, Selection()))
     turned = ARC / 2 + SKEW * (SHAPE[0] - 1) / 2
     np.testing.assert_allclose(views.angles(100.0, ids), source.table.angles[ids] + turned)
     geometry, done = views.geometry(100.0, ids)

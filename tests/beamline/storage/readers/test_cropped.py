@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.transforms import cropped
@@ -73,7 +74,7 @@ def test_the_lens_keeps_its_centre() -> None:
     places = []
     for cols in ((0, 100), (30, 90)):
         source: Any = cropped(_Flagged(), cols)
-        found = TiltAndLens(distortion=lens).of(source, Selection().of(source))
+        found = TiltAndLens(distortion=lens).of(select(source, Selection()))
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])
     np.testing.assert_allclose(places[1], places[0][:, 30:90])
@@ -83,7 +84,7 @@ def _lines(path: Path, options: Selection, cols: tuple[int, int] | None = None) 
     from beamline.projections.prepare import prepare_projections
 
     with open_scan(SourceOptions(path, cols=cols)) as source:
-        return prepare_projections(source, options, lambda said: None).projections.data
+        return prepare_projections(select(source, options), lambda said: None).projections.data
 
 
 def test_line_integrals_are_those_of_a_narrower_detector(tmp_path: Path) -> None:

@@ -15,11 +15,10 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, select
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
-from tests.beamline.prepared_views import evidence_of
 from tests.beamline.storage.readers.foreign_scans import (
     COLS,
     CONE,
@@ -333,7 +332,7 @@ def _refused(path: Path, selection: Selection) -> str:
     """Why `recon` refuses a scan; "" if it does not."""
     with open_scan(path) as source:
         try:
-            checked_views(evidence_of(source, selection), selection.of(source), lambda sentence: None)
+            checked_views(select(source, selection), lambda sentence: None)
         except DataError as error:
             return str(error)
     return ""

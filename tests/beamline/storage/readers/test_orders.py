@@ -17,10 +17,9 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Note
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, select
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import SINOGRAM
-from tests.beamline.prepared_views import evidence_of
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")
@@ -82,7 +81,7 @@ def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) 
     np.save(tmp_path / "s.npy", sinogram.T if turned else sinogram)
     with open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(20) * 0.1, quantity="line_integrals")) as source:
         sentences = list[str]()
-        checked_views(evidence_of(source, Selection()), Selection().of(source), sentences.append)
+        checked_views(select(source, Selection()), sentences.append)
     (said,) = [each for each in sentences if "sinogram" in each]
     assert isinstance(said, Note) and "20 projections and 9 columns" in said and other in said
 

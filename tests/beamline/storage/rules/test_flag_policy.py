@@ -69,8 +69,8 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
     flags = [[Flag("bands", Level.ALARM, row, 0.5, 0.1, "", region)] if 6 <= row < 10 else [] for row in range(22)]
     judged = FrameFlags.of_flags(flags)
     with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
-        (finding,) = frames_flagged(ScanEvidence(source, EvidenceRequest(judged=judged)))
-        taken = usable_views(ScanEvidence(source, EvidenceRequest(judged=judged)), True)
+        (finding,) = frames_flagged(ScanEvidence(source, EvidenceRequest(judge=lambda source: judged)))
+        taken = usable_views(ScanEvidence(source, EvidenceRequest(judge=lambda source: judged)), True)
     assert finding.message.endswith(f"In a reconstruction (--flags use): {said}")
     assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)

@@ -21,6 +21,7 @@ from beamline.features.files.ingest import ingest
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover
@@ -154,7 +155,7 @@ def test_an_ingested_scan_is_taken_too(tmp_path: Path) -> None:
 def test_views_and_axis_of_nabu_are_ours(tmp_path: Path) -> None:
     path = _complete(tmp_path, HALF)
     with open_scan(path) as source:
-        ours = prepare_projections(source, Selection(), lambda _: None)
+        ours = prepare_projections(select(source, Selection()), lambda _: None)
     theirs = analyzer.analyze_dataset(str(path))
     rows = np.array(theirs.get_frames_indices("projections"))
     views = np.array([theirs.get_frame(row) for row in rows], np.float32)
@@ -170,7 +171,7 @@ def test_a_full_turn_beside_the_middle_is_half_a_field_of_view(tmp_path: Path) -
     theirs = analyzer.analyze_dataset(str(path))
     assert theirs.is_halftomo
     with open_scan(path) as source:
-        views = prepare_projections(source, Selection(), lambda _: None).projections.data
+        views = prepare_projections(select(source, Selection()), lambda _: None).projections.data
     ours = recon.find_axis(views, FULL.angles).value
     found = estimators.estimate_cor("sliding-window", theirs, cor_options={"side": "right"})
     assert abs(found - FULL.axis) < WIDE_AXIS_APART

@@ -17,10 +17,11 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
+from beamline.projections.views import select
 from recon.features.phase import FilterLength
 from recon.prep.projections import Projections
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import evidence_of, feed_batches
+from tests.beamline.prepared_views import feed_batches
 from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.rims import views_of_can
@@ -35,7 +36,7 @@ def _source() -> ArraySource:
 
 
 def _plan(selection: Selection) -> ScanCorrectionPlan:
-    return survey(evidence_of(_source(), selection), selection.of(_source()))
+    return survey(select(_source(), selection))
 
 
 def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
@@ -63,13 +64,13 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
 def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
     with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev"):
-        Phase("20").filter_of(source, SELECTION.of(source))
+        Phase("20").filter_of(select(source, SELECTION))
     source.facts, source.energy_kev = {"distance_mm": 50.0}, 20.0
-    found, said = Phase("20").filter_of(source, SELECTION.of(source))
-    assert found == PHASE.filter_of(source, SELECTION.of(source))[0]
+    found, said = Phase("20").filter_of(select(source, SELECTION))
+    assert found == PHASE.filter_of(select(source, SELECTION))[0]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
     with pytest.raises(ConfigError, match=r"has only 48 x 40"):
-        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION.of(source))
+        replace(PHASE, distance_mm=5e6).filter_of(select(source, SELECTION))
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
         _plan(SELECTION.with_steps(Preparation(noise="counts")))
 
@@ -77,9 +78,9 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
 def test_a_cone_is_scaled_to_the_sample() -> None:
     source = _source()
     source.cone = (10.0, 40.0)
-    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION.of(source))
+    found, said = replace(PHASE, distance_mm=None).filter_of(select(source, SELECTION))
     near = replace(SELECTION, pixel_size_mm=0.25e-3)
-    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near.of(_source()))
+    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(select(_source(), near))
     assert "30 mm behind" in said and found.length == pytest.approx(plane.length)
 
 
@@ -91,7 +92,7 @@ def _rimmed(fringes: float) -> ArraySource:
 
 
 def _prepared(source: ArraySource, *steps: NamedStep) -> PreparedProjections:
-    return prepare_projections(source, Selection(axis_col=source.axis_col, steps=steps), lambda _: None)
+    return prepare_projections(select(source, Selection(axis_col=source.axis_col, steps=steps)), lambda _: None)
 
 
 def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known() -> None:
@@ -141,10 +142,10 @@ def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: p
 def test_the_search_takes_no_more_memory_than_it_states() -> None:
     source = _rimmed(0.8)
     views, geometry = views_of_can(0.8)
-    part = ScanPart(source, Selection().of(source), geometry)
+    part = ScanPart(select(source, Selection()), geometry)
     masked = np.zeros(views.shape[1:], np.bool_)
     given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
-    taken = peak(lambda: Phase().estimated(source, part.selection, given, geometry))
+    taken = peak(lambda: Phase().estimated(part.scan, given, geometry))
     assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
 
 
