@@ -187,8 +187,7 @@ def locate_axis(
     Raises:
         DataError: no axis in the search range explains the projections.
     """
-    rows, binning = plan.scan.selection.detector_rows, plan.scan.selection.binning
-    height = (rows.stop - rows.start) // binning
+    height, binning = plan.scan.selection.n_rows, plan.scan.selection.binning
     start, source = max(0, (height - _AXIS_ROWS) // 2), plan.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = apply(plan, frames, slice(start, min(height, start + _AXIS_ROWS)), warn, progress)

@@ -185,7 +185,7 @@ def with_filters_of(plan: ScanCorrectionPlan, scan: SelectedScan, views: NDArray
     Frames are read again only if the filters need other rows than before, or mix pixels whose photons were counted.
     """
     filters, before = ViewFilters.of(scan), plan.filters
-    if filters.read(None) == before.read(None) and not (filters.filters and plan.photons):
+    if filters.read(None) == before.read(None) and (not filters.filters or plan.photons is None):
         return replace(plan, filters=filters)
     return survey(scan, views)
 

@@ -132,6 +132,11 @@ class ScanSelection(Selection):
         return slice(*self.rows)
 
     @property
+    def n_rows(self) -> int:
+        """Number of binned rows."""
+        return (self.detector_rows.stop - self.detector_rows.start) // self.binning
+
+    @property
     def pivot(self) -> float:
         """The middle row of the detector, binned and relative to the first row used."""
         return ((self.shape[0] - 1) / 2 - self.detector_rows.start - (self.binning - 1) / 2) / self.binning

@@ -29,7 +29,7 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
     Args:
         frames: projections that may be used.
     """
-    rows = _rows_of(plan)
+    rows = plan.scan.selection.n_rows
     if rows < _FEWEST_ROWS:
         return
     frames = spread_views(plan.source.table.angles[frames], _VIEWS, frames)
@@ -44,12 +44,6 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
             f"{abs(shown.tilt) * rows:.1f} px over {rows} rows. This doubles edges in the first and last "
             "slices."
         )
-
-
-def _rows_of(plan: ScanCorrectionPlan) -> int:
-    """Number of binned rows."""
-    selection = plan.scan.selection
-    return (selection.detector_rows.stop - selection.detector_rows.start) // selection.binning
 
 
 def shown_tilt(
@@ -68,7 +62,7 @@ def shown_tilt(
     Raises:
         ValueError: see `find_tilt`.
     """
-    rows = _rows_of(plan)
+    rows = plan.scan.selection.n_rows
     bands, thick = size
     height = max(1, min(thick, rows // bands))
     means: list[NDArray[np.float32]] = []

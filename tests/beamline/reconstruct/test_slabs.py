@@ -86,10 +86,10 @@ def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path)
             SourceOptions(tmp_path / name), OutputPaths(tmp_path / "v.h5", None), Selection(axis_col=23.7), Fbp()
         )
         with open_scan(tmp_path / name) as source:
-            scan = select(source, options.selection)
-            needs = recon_memory_of(scan, options)
+            selected = select(source, options.selection)
+            needs = recon_memory_of(selected, options)
             limited = replace(options, memory=needs.at_once + views)
-            _, plan = prepare_within(scan, limited, lambda _: None, ScanClock(), lambda _: None)
+            _, plan = prepare_within(selected, limited, lambda _: None, ScanClock(), lambda _: None)
         slabs[name] = len(plan.slabs), plan.needs.weights
     assert slabs["whole.h5"] == (0, 0) and slabs["scan.h5"][0] > 1 and slabs["scan.h5"][1] == 2 * views
 
