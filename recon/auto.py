@@ -64,8 +64,13 @@ class Auto(Method):
         """
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
-        decide.prior = choice.prior
-        chosen, result = self._run_choice(choice, problem, replace(control, decide=decide))
+        return self.run_chosen(choice, problem, replace(control, decide=decide))
+
+    def run_chosen(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        """`run` with a choice that was made before, and with `control.decide`."""
+        assert control.decide is not None
+        control.decide.prior = choice.prior
+        chosen, result = self._run_choice(choice, problem, control)
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": choice.reason}
         return replace(result, settings=settings, method=chosen.name, chosen=choice.reason)
 
@@ -88,25 +93,29 @@ class Auto(Method):
         Raises:
             ValueError: no candidate can use these projections.
         """
+        return self.tried(problem, control)[0]
+
+    def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
+        """As `choose`, and the test reconstructions; None if there were none, or if they were stopped."""
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("all projections are zero, so there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
-            return TrialChoice(f"{problem.geometry.n_views} projections are too few to hold any out")
+            return TrialChoice(f"{problem.geometry.n_views} projections are too few to hold any out"), None
         trial = _trial(problem, "", control, self.candidates)
         if trial is None and problem.geometry.is_cone:
             trial = _trial(*_coarse(problem), control, self.candidates)
         if control.stop():
-            return TrialChoice("stopped before the choice")
+            return TrialChoice("stopped before the choice"), None
         if trial is None:
-            return TrialChoice("the held-out projections have no valid rays in the rows with the most material")
+            return TrialChoice("the held-out projections have no valid rays in the rows with the most material"), None
         with threads_for(problem.grid):
             choice = trial.compare(self.candidates, self.least_gain)
         if trial.ended:
-            return TrialChoice("stopped before the choice")
+            return TrialChoice("stopped before the choice"), None
         if choice.at is None:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
-        return choice
+        return choice, trial
 
     @property
     def alternatives(self) -> tuple[Method, ...]:

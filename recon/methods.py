@@ -41,6 +41,9 @@ DEFAULT = "r2"  # The default method
 IN_TIME = next((name for name, entry in REGISTRY.items() if entry.several == "times"), None)
 """Name of the method that makes volumes at several times; None: this installation has none."""
 
+WITH_REFERENCE = next((name for name, entry in REGISTRY.items() if entry.reference), None)
+"""Name of the method that uses an earlier volume of the same sample; None: this installation has none."""
+
 BASELINE = "fbp"  # Reports compare all methods with this one
 
 

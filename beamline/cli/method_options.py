@@ -228,6 +228,21 @@ _ALLOW_NEGATIVE = option(
         "material."
     ),
 )
+_WITH_REFERENCE = option(
+    "--reference",
+    argument="reference",
+    excludes={
+        **_FINISHED,
+        **dict.fromkeys(("volumes", "spectra"), "a reference helps to reconstruct a single volume"),
+        "uncertainty": "error bars are not calibrated for it",
+        "roi": "the motion of the sample is estimated in all of the field",
+    },
+    type=click.Path(path_type=Path),
+    metavar="GOOD",
+    help="Volume of the same sample from an earlier, careful scan, or that scan itself, which is then reconstructed "
+    "first. Its motion, and the grey level of each particle, are estimated from the projections. Held-out projections "
+    "decide whether it is used; if not, the volume is that of auto.",
+)
 _IN_TIME = together(
     option(
         "--volumes",
@@ -365,6 +380,7 @@ method_options = together(
     _PATCH_THRESHOLD,
     _LEVELS,
     _ALLOW_NEGATIVE,
+    _WITH_REFERENCE,
     _IN_TIME,
     option(
         "--plain-splatting",

@@ -32,7 +32,7 @@ from beamline.core.stop import StopOnSignal
 from beamline.core.text import safe_name
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT, IN_TIME, streams
+from recon.methods import DEFAULT, IN_TIME, WITH_REFERENCE, streams
 
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
@@ -94,16 +94,17 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     values, file = dict(context.params), context.params["file"]
     method = _checked_method(context, default)
     path = values["output"] or Path(f"{safe_name(file.stem)}_{method}.h5")
-    if there and not file.exists():
-        with json_events(values["as_json"]):
-            raise DataError(f"{file} does not exist.")
+    for needed in (file, values["reference"]) if there else ():
+        if needed is not None and not needed.exists():
+            with json_events(values["as_json"]):
+                raise DataError(f"{needed} does not exist.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # imported here because help does not need it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
 
     page = report_beside(path) if values["report"] else None
     files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
     files |= {"--resume": values["resume"], "--write-config": values["write_config"]}
-    refuse_shared(files)
+    refuse_shared(files | {"--reference": values["reference"]})
     partial = slabs_resumed(values["resume"])
     source, selection = chosen(file, values["seed"], values)
     settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
@@ -134,6 +135,8 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     if slabs_resumed(values["resume"]):
         asked = asked - {"resume"} | {SLABS_RESUMED}
     method = values["method"]
+    if "reference" in asked and method in (None, AUTO):
+        method = WITH_REFERENCE
     stated = method is not None
     if method is None:
         of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.argument}

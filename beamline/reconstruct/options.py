@@ -124,6 +124,7 @@ class ReconOptions:
         cluster: workers that reconstruct slabs, in the form of `--cluster`; None: this process does it.
         region: the box of the volume to reconstruct; None: the whole volume.
         partial: partial volume whose missing slabs are reconstructed; None: start from the beginning.
+        reference: an earlier volume of the same sample, or its scan, for a method that takes one.
         uncertainty: also compute the standard deviation of each voxel, see `recon.error_bars`.
         command: the command line of this call, which the file states.
         recipe: the options that apply to any scan, as YAML, which the file states.
@@ -146,6 +147,7 @@ class ReconOptions:
     region: Region | AroundSample | None = None
     cluster: str | None = None
     partial: Path | None = None
+    reference: Path | None = None
     uncertainty: bool = False
     command: str = ""
     recipe: str = ""

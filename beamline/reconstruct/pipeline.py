@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from beamline.core.durations import Phases
@@ -33,6 +34,7 @@ from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
 from beamline.reconstruct.record import partly_seen_warning, write_result
+from beamline.reconstruct.reference import with_reference
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
 from beamline.reconstruct.scan_facts import ReportContext, ScanFacts, facts_of
@@ -292,6 +294,9 @@ def reconstruct_file(
         sink, clock, Warnings(sink, clock), Phases(sink, clock), stop_scope, clock.now(), time.process_time()
     )
     truth_given = refuse_before_reading(options)
+    if options.reference is not None:
+        first = partial(reconstruct_file, clock=clock, stop_scope=stop_scope)
+        options = with_reference(options, options.reference, first, sink, clock)
     if options.follow is not None and not options.streams:
         options = _when_it_has_ended(options, channels, options.follow)
     views_of = finished_views if options.follow is None else growing_views

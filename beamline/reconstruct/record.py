@@ -152,6 +152,8 @@ def _record(
         history=history_arrays(result.history),
         model={} if result.gaussians is None else arrays_of_model(result.gaussians, prepared.geometry),
         deviation=None if result.deviation is None else written(result.deviation).data,
+        change=None if result.change is None else written(result.change).data,
+        displacement=result.displacement,
         series=result.series,
         compared=checked.metrics.get(BASELINE) if len(checked.metrics) > 1 else None,
         warnings=tuple(checked.warnings),
@@ -180,7 +182,7 @@ def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconReco
             series = replace(series, data=VoxelsInFile(series.data.shape, partial(_dataset, target.output)))
     else:
         volume = replace(volume, data=np.array(volume.data))  # it may lie in a temporary file
-    return replace(record, volume=volume, series=series, deviation=None, model={})
+    return replace(record, volume=volume, series=series, deviation=None, change=None, displacement=None, model={})
 
 
 def _voxels(path: Path, index: int | None, part: Any) -> NDArray[np.float32]:

@@ -243,6 +243,14 @@ def _doubts(
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
+    if result.change is not None:
+        yield Picture(
+            "Change since the reference",
+            "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
+            "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
+            "motion.",
+            pictures.change(result.volume, result.change, unit, kind),
+        )
     if result.deviation is not None:
         yield Picture(
             "Error bars",

@@ -236,6 +236,22 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
     return png(figure)
 
 
+def change(volume: Volume, change: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
+    """The slice with the largest change: the reference, the volume, and the volume minus the reference."""
+    at, grid = int(np.argmax([np.square(part).sum() for part in change.data])), volume.grid
+    window, most = material_window(volume.data[at]), float(np.percentile(np.abs(change.data[at]), 99.5)) or 1.0
+    figure = new_figure((WIDTH, 3.2), dpi_for(grid.shape[2], WIDTH / 3.3))
+    panels = (
+        (volume.data[at] - change.data[at], f"Moved reference, slice {at}", window, "gray"),
+        (volume.data[at], f"Volume, slice {at}", window, "gray"),
+        (change.data[at], f"Change ({kind.unit(unit)})", (-most, most), "RdBu_r"),
+    )
+    for axes, (image, title, limits, colours) in zip(figure.subplots(1, 3), panels, strict=True):
+        drawn = draw_slice(axes, image, planes(grid, unit)[0], title, limits, colours)
+        figure.colorbar(drawn, ax=axes, shrink=0.6)
+    return png(figure)
+
+
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
     figure, ((axes,),) = panels([WIDTH - LEFT - GAP], [1.95])

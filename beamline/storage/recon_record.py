@@ -70,6 +70,9 @@ class ReconRecord:
         history: equally long arrays, by name (step, seconds, loss ...); empty if there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         series: all volumes, if `volume` is one of several; None: it is the only one.
+        change: float32 [z, y, x], the volume minus a reference that was moved to it; None: no reference was used.
+        displacement: float32 [3, z, y, x] along z, y, x in the unit of lengths: the place in the reference minus that
+            in the volume; None: as `change`.
         kind: what the voxels are.
         model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
             none.
@@ -93,6 +96,8 @@ class ReconRecord:
     history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=dict)
     deviation: NDArray[np.float32] | None = None
+    change: NDArray[np.float32] | None = None
+    displacement: NDArray[np.float32] | None = None
     kind: VoxelKind = VoxelKind.ATTENUATION
     series: VolumeSeries | None = None
     compared: Mapping[str, float] | None = None

@@ -242,6 +242,9 @@ class Reconstruction:
         ending: how the run ended; the caller fills it in.
         outside: function that returns the contribution of the sample outside the volume to the projections of a
             geometry, [view, row, col]; None: no such contribution is known.
+        change: the volume minus a reference that was moved to it; None: no reference was used.
+        displacement: [3, z, y, x] in mm along z, y, x: the place in the reference minus that in the volume; None: as
+            `change`.
     """
 
     volume: Volume
@@ -258,6 +261,8 @@ class Reconstruction:
     started_from: int = 0
     ending: Ending = Ending()
     outside: Callable[[Geometry], F32] | None = None
+    change: Volume | None = None
+    displacement: F32 | None = None
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
@@ -319,7 +324,7 @@ class Method(Checked, ABC):
         name: name in commands, files and events.
         label: name in reports.
         takes: what it accepts in addition to projections, grid and seed: device, held_out, times, checkpoints, quality,
-            budget.
+            budget, reference.
         halo: number of slices around a slab that it also reconstructs, so that the edges of the slab are not visible.
         error_bars: factors for the difference of the refits and for the gradient, see `recon.error_bars`; None: not
             calibrated.

@@ -246,6 +246,7 @@ class MethodEntry:
         compared: True if a trade-off includes it by default; False for methods that take many times as long.
         several: what distinguishes its volumes, if it makes several.
         lengths: numbers of iterations or steps that a trade-off tries; None: the default.
+        reference: True if it can use an earlier volume of the same sample.
     """
 
     module: str
@@ -254,3 +255,4 @@ class MethodEntry:
     compared: bool = True
     several: Literal["", "times"] = ""
     lengths: Lengths | None = None
+    reference: bool = False

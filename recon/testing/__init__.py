@@ -107,7 +107,7 @@ class MethodConformance:
         assert method.memory(VIEWS, GRID, False) < method.memory(VIEWS, tall, False)
 
     def test_it_takes_what_it_says(self, method: Method) -> None:
-        assert method.takes <= {"device", "held_out", "times", "checkpoints", "quality", "budget"}
+        assert method.takes <= {"device", "held_out", "times", "checkpoints", "quality", "budget", "reference"}
         assert method.halo >= 0 and method.volumes >= 1
         if "held_out" in method.takes:
             result = method.run(replace(problem(), use=DataUse(held_out=[5, 17])), RunControl())

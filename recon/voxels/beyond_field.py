@@ -76,6 +76,9 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
     field = tuple(slice(first, first + n) for first, n in zip(before, grid.shape, strict=True))
     whole = result.volume.data
     volume, radius = Volume(np.ascontiguousarray(whole[field]), grid), {} if sample is None else sample.settings
+    if result.change is not None and result.displacement is not None:
+        change = Volume(np.ascontiguousarray(result.change.data[field]), grid)
+        result = replace(result, change=change, displacement=result.displacement[(slice(None), *field)])
     return replace(result, volume=volume, settings={**result.settings, **radius}, outside=_Outside(whole, box, field))
 
 

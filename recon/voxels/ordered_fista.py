@@ -161,6 +161,16 @@ class Pull(Protocol):
         """The volume z [y, x, z] for a volume x, which is not changed."""
 
 
+class Prox(Protocol):
+    """A proximal step for a prior other than total variation, such as one that compares x with another volume."""
+
+    def __call__(self, x: Any, threshold: float) -> None:
+        """Replace x [y, x, z], an array of the device, by the proximal point of threshold times the prior."""
+
+    def turn(self) -> None:
+        """Called after each step, see `TotalVariationProx.turn`."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Part:
     """The projections that a step uses: their projector, and their numbers or all of them."""
@@ -178,10 +188,16 @@ class _Descent:
         seen: whitened residuals of some projections of the last sweep.
     """
 
-    def __init__(self, problem: VoxelProblem, x: F32, subsets: Subsets, tv_steps: int, pull: Pull | None) -> None:
+    def __init__(
+        self, problem: VoxelProblem, x: F32, subsets: Subsets, tv_steps: int | Prox, pull: Pull | None
+    ) -> None:
         device = self._device = voxel_device(problem.projector.device)
-        grid = problem.projector.grid
-        self._prox = TotalVariationProx(x.shape, difference_weights(grid), problem.nonnegative, tv_steps, device)
+        self._prox: Prox
+        if isinstance(tv_steps, int):
+            differences = difference_weights(problem.projector.grid)
+            self._prox = TotalVariationProx(x.shape, differences, problem.nonnegative, tv_steps, device)
+        else:
+            self._prox = tv_steps
         self._data, self._rays = device.array(problem.data), None
         if problem.weight is not None:
             self._rays = device.array(problem.weight)
@@ -261,7 +277,7 @@ class _Descent:
 
 
 def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int | Prox,
     pull: Pull | None = None, still: float = STANDS_STILL,
 ) -> F32:  # fmt: skip
     """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume has converged.
@@ -280,7 +296,8 @@ def ordered_fista(
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
         sweeps: largest number of sweeps.
-        tv_steps: dual steps of each proximal step, which continue from the last ones.
+        tv_steps: dual steps of each proximal step, which continue from the last ones; or the proximal step of another
+            prior.
         pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is also minimised.
         still: share of the norm of the volume; 0: all sweeps are made.
     """

@@ -28,8 +28,9 @@ from beamline.storage.writer_lock import opened_whole
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 DEFINITION = "NXtomoproc"
-DEVIATION = "data_errors"
-"""Datasets next to the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
+DEVIATION, CHANGE, DISPLACEMENT = "data_errors", "change", "displacement"
+"""Datasets next to the volume: the standard deviation of each voxel, the volume minus a moved reference, and (with _z,
+_y and _x) the displacement of that reference."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {
@@ -84,19 +85,32 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     if record.series is not None:
         data["time"] = record.series.seconds
         data["time"].attrs["units"] = "s"
-    if record.deviation is not None and not empty:
-        other = data.create_dataset(DEVIATION, shape, np.float32, chunks=(1, *shape[1:]))
+    for name, (values, what) in () if empty else _beside(record).items():
+        other = data.create_dataset(name, shape, np.float32, chunks=(1, *shape[1:]))
         for first in range(0, shape[0], _SLAB):
-            other[first : first + _SLAB] = record.deviation[first : first + _SLAB]
+            other[first : first + _SLAB] = values[first : first + _SLAB]
             file.require_taken()
-        other.attrs["units"] = record.unit
-        other.attrs["long_name"] = f"standard deviation of each voxel ({record.unit})"
+        unit = record.length_unit if name.startswith(DISPLACEMENT) else record.unit
+        other.attrs["units"], other.attrs["long_name"] = unit, f"{what} ({unit})"
     data["data"].attrs["units"] = record.unit
     what = f"{_LONG_NAMES.get(record.kind, record.kind.value)} ({record.unit})"
     data["data"].attrs["long_name"] = what.removesuffix(" ()")
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
         data[name] = centres
         data[name].attrs["units"] = record.length_unit
+
+
+def _beside(record: ReconRecord) -> dict[str, tuple[NDArray[np.float32], str]]:
+    """Arrays [z, y, x] beside the volume by the names of their datasets, and what they are."""
+    arrays = {}
+    if record.deviation is not None:
+        arrays[DEVIATION] = record.deviation, "standard deviation of each voxel"
+    if record.change is not None:
+        arrays[CHANGE] = record.change, "volume minus the moved reference"
+    if record.displacement is not None:
+        for axis, values in zip("zyx", record.displacement, strict=True):
+            arrays[f"{DISPLACEMENT}_{axis}"] = values, f"place in the reference minus place in the volume, along {axis}"
+    return arrays
 
 
 def _write_facts(entry: h5py.Group, record: ReconRecord) -> None:

@@ -1,0 +1,66 @@
+"""The reference of a reconstruction: an earlier volume of the same sample, read from its file or made from its scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.core.events import Sink, StateEntered
+from beamline.core.quantities import VoxelKind
+from beamline.core.recon_events import VolumeDone
+from beamline.core.text import safe_name
+from beamline.projections.selection import Selection
+from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.recon_record import ReconRecord
+from beamline.storage.volumes.files import opened_volume, volume_format
+from drivers.base.clock import Clock
+from recon.auto import Auto
+from recon.base.volume import Volume
+from recon.methods import with_settings
+
+
+def with_reference(
+    options: ReconOptions,
+    path: Path,
+    reconstruct: Callable[[ReconOptions, Sink], ReconRecord],
+    sink: Sink,
+    clock: Clock,
+) -> ReconOptions:
+    """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
+
+    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again.
+
+    Raises:
+        DataError: the file is neither a volume of attenuation nor a scan.
+    """
+    if volume_format(path) is None:
+        made = options.target.output.with_name(f"{safe_name(path.stem)}_reference.h5")
+        if not made.exists():
+            said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
+            sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
+            target, source = OutputPaths(made, None), SourceOptions(path)
+            first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
+            reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
+        path = _of_this_scan(made, path)
+    with opened_volume(path) as record:
+        if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
+            raise DataError(f"{path} is not a single volume of attenuation; give a volume that recon wrote.")
+        data = np.array(record.volume.data[: record.grid.shape[0]], np.float32)
+        volume = Volume(np.nan_to_num(data), record.grid)
+    return replace(options, method=with_settings(options.method, {"reference": volume}))
+
+
+def _of_this_scan(made: Path, scan: Path) -> Path:
+    """The path of a volume. Raises DataError if it was made from another scan."""
+    with opened_volume(made) as record:
+        if Path(record.raw_file) != scan.resolve():
+            raise DataError(
+                f"{made} was made from {record.raw_file}, not from {scan.resolve()}. Move it away, or give the volume "
+                "of the reference instead of its scan. Nothing was changed."
+            )
+    return made

@@ -1,0 +1,169 @@
+"""Whether a reference is used: three questions to the held-out projections of a trial.
+
+Held-out projections favour any prior over none, also a reference that is misplaced. So the reference must predict them
+better than the same total variation without it, better than what `auto` takes without it, and better than copies of
+itself that are displaced by a voxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recon.base.arrays import F64
+from recon.base.decisions import Prior
+from recon.base.empirical import ONE_IN
+from recon.base.volume import Volume
+from recon.features.reference.fit import PLAN, StateFit
+from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, affinely_moved, padded, roughly_moved
+from recon.features.reference.particles import particles_of, placed
+from recon.voxels.choice import LEAST_GAIN, TrialChoice, exceeds_standard_error, significantly_better
+from recon.voxels.trial import Trial
+from recon.voxels.voxel_problem import VoxelProblem, times_power
+
+MARGIN = 16  # voxels beyond the box up to which the reference is kept, because it may have moved
+_FIRST = 1.4  # first weight of the change, divided by the best weight of total variation
+_OCTAVES = 4  # most octaves from the first weight
+_FEW = 6  # sweeps with a displaced copy
+
+
+class Verdict(NamedTuple):
+    """Whether the reference is used, in plain values (see `Decisions`).
+
+    Attributes:
+        used: False: the volume is that of `auto`.
+        because: the residuals in held-out projections, or the question that failed.
+        weight: μ for all projections, in the units of the scan.
+        affine, splines: coefficients of the displacement, in mm: of `Basis.affine` and `Basis.splines`.
+        gains: of the ground and of the particles together.
+    """
+
+    used: bool
+    because: str
+    weight: float = 0.0
+    affine: Sequence[float] = ()
+    splines: Sequence[float] = ()
+    gains: Sequence[float] = (1.0, 1.0)
+
+    @classmethod
+    def of(cls, values: Sequence[Any]) -> Verdict:
+        return cls(*values)
+
+
+def not_moved(reference: Volume, problem: VoxelProblem) -> Moved | None:
+    """The reference on the voxels of a problem, before its motion is known; None: it shows no material there."""
+    grid = problem.units.projector(problem.projector, 1).grid
+    volume, first = placed(reference, grid, MARGIN)
+    particles = particles_of(times_power(volume, -problem.units.density))
+    if particles is None:
+        return None
+    nz, ny, nx = grid.shape
+    still = np.zeros((3, ny, nx, nz), np.float32)
+    radius = problem.projector.geometry.reach / problem.projector.grid.voxel_size if problem.wide else np.inf
+    return Moved(particles, first, still, np.ones(particles.count + 1), radius)
+
+
+def width_of(problem: VoxelProblem) -> float:
+    """Width of the field of view, across which motion has its splines, in the units of the problem."""
+    return 2 * problem.projector.geometry.reach
+
+
+def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> Verdict:
+    """The three questions, on the rows and projections of a trial; `choice` is that of `auto`."""
+    problem, mu = trial.problem, trial.weight
+    moved = not_moved(reference, problem)
+    if mu is None or moved is None:
+        return Verdict(False, "the reference shows no material here" if mu else "the weights could not be chosen")
+    mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # that of the projections that are not held out, see `choose_weight`
+    smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
+    width, grid = width_of(trial.scan), problem.projector.grid
+    affine = Basis.affine(grid, width)
+    c = roughly_moved(moved, smooth, grid, width)
+    moved = replace(moved, u=padded(affine.field(c)))
+    beside = np.where(moved.known(), 0, smooth).astype(np.float32)
+    moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
+    coefficients, gains = affine.nearest(moved.u), moved.gains[:2].tolist()
+    start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
+    fit = StateFit(problem, moved, start, _FIRST * mu, width)
+    fit.rounds(PLAN)
+    if trial.ended or not fit.x.any():
+        return Verdict(False, "stopped before it was tried")
+    octave, left = _best_octave(trial, fit)
+    alone = _without(trial, fit, smooth, mu)
+    least = choice.least
+    others = [("total variation of the same kind without it", trial.in_line_integrals(alone))]
+    others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
+    own = trial.in_line_integrals(left)
+    told = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"
+    for name, residuals in others:
+        told += f", by {name} {residuals.mean():#.4g}"
+        if not significantly_better(own, residuals, LEAST_GAIN):
+            return Verdict(False, f"it does not predict held-out projections better than {name} ({told})")
+    if (where := _better_displaced(trial, fit)) is not None:
+        return Verdict(False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}")
+    all_views = fit.weight * 2.0**octave * np.sqrt(ONE_IN / (ONE_IN - 1))
+    of_scan = problem.units.prior(Prior(float(all_views)), problem.weight is not None, 1).weight
+    splines = Basis.splines(grid, width, KNOTS)
+    bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
+    edge = problem.units.projector(problem.projector, 1).grid.voxel_size
+    mm = [(edge * each).ravel().tolist() for each in (coefficients, bent.mean(-1, keepdims=True))]
+    return Verdict(True, told, of_scan, mm[0], mm[1], gains)
+
+
+def _best_octave(trial: Trial, fit: StateFit) -> tuple[float, F64]:
+    """The weight in octaves from that of `fit` that predicts best, between whole octaves, and the least residuals."""
+    tried: dict[int, F64] = {}
+
+    def mean(octave: int) -> float:
+        if octave not in tried:
+            other = fit.again(fit.weight * 2.0**octave, fit.x)
+            other.sharpen(1)
+            tried[octave] = trial.residuals(other.x)
+        return float(tried[octave].mean())
+
+    at = _descended(mean)
+    down, up = mean(at - 1) - mean(at), mean(at + 1) - mean(at)
+    vertex = (down - up) / (2 * (down + up)) if min(down, up) >= 0 and down + up > 0 else 0.0
+    return at + vertex, tried[at]
+
+
+def _descended(mean: Any) -> int:
+    at = 0
+    for towards in (1, -1):
+        while abs(at + towards) <= _OCTAVES and mean(at + towards) < mean(at):
+            at += towards
+        if at:
+            break
+    return at
+
+
+def _without(trial: Trial, fit: StateFit, smooth: np.ndarray, mu: float) -> F64:
+    """The least residuals of total variation with weights that fall as with the reference, but without it."""
+    tried: dict[int, F64] = {}
+
+    def mean(octave: int) -> float:
+        if octave not in tried:
+            other = fit.again(mu * 2.0**octave, smooth)
+            other.alone()
+            other.sharpen(1)
+            tried[octave] = trial.residuals(other.x)
+        return float(tried[octave].mean())
+
+    return tried[_descended(mean)]
+
+
+def _better_displaced(trial: Trial, fit: StateFit) -> str | None:
+    """Where a copy of the reference, displaced by a voxel, predicts as well as the reference itself; None: nowhere."""
+    own = trial.residuals(fit.x)
+    for axis in range(2 if fit.moved.u[2].any() == 0 else 3):
+        for step in (-1, 1):
+            u = fit.moved.u.copy()
+            u[axis] += step
+            copy = fit.again(fit.weight, fit.x, replace(fit.moved, u=u))
+            copy.solve(most=_FEW)
+            if not exceeds_standard_error(trial.residuals(copy.x) - own, 1.0):
+                return f"along {'yxz'[axis]}"
+    return None

@@ -1,0 +1,195 @@
+"""The volume of a state: what the moved reference explains, and a change that has few edges.
+
+    min over x, u, g of  ½ |A x - p|² + μ Σ_i (a_i |D x|_i + b_i |D (x - m(u, g))|_i),    x >= 0
+
+m is the reference, moved by u and with a gain g for each particle. The three are improved in turn: x by
+`ordered_fista`, g by medians of x, u by the views. (Chen, Tang & Leng 2008, Med. Phys. 35, 660; with the motion: Dang
+et al. 2014, Phys. Med. Biol. 59, 4799; weights that fall: Candès, Wakin & Boyd 2008, J. Fourier Anal. Appl. 14, 877.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage as ndi
+
+from recon.base.arrays import F32
+from recon.base.decisions import GoesOn
+from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, improved
+from recon.features.reference.weights import falling
+from recon.kernels.cpu.two_tv import ascend, pace_of, primal
+from recon.voxels.ordered_fista import SUBSETS, Subsets, ordered_fista, subsets_of
+from recon.voxels.voxel_problem import VoxelProblem, difference_weights
+
+OWN = 0.3
+"""Weight of total variation of the volume, divided by that of the change."""
+_STEPS = 6  # dual steps of each proximal step; with three, damped steps do not converge
+_EDGE = 0.12  # slope of the moved reference, in levels of particles per voxel, from which a voxel is at an edge
+PLAN: tuple[tuple[tuple[int, float], ...], ...] = (((4, 1), (4, 1)), ((6, 0.5), (6, 0)), ((KNOTS, 0), (KNOTS, 0)))
+"""Rounds: intervals of the splines, and blur in voxels, of each step of the motion."""
+_MOST, _STILL = 12, 2e-3  # sweeps of a volume within the rounds, and its change at which it has converged
+
+
+class TwoVariations:
+    """argmin_y ½|y - x|² + threshold Σ_i (a_i |D y|_i + b_i |D (y - m)|_i), y >= 0: the `Prox` of a state.
+
+    The dual fields are kept from one call, and from one m, to the next. Memory: 8 volumes beside m, a and b.
+    """
+
+    def __init__(self, shape: tuple[int, int, int], weights: tuple[float, float, float], nonnegative: bool) -> None:
+        self._weights, self._nonnegative = weights, nonnegative
+        self._fields = np.zeros((3, *shape), np.float32), np.zeros((3, *shape), np.float32)
+        self._start, self._beside = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self.m = self.own = self.change = self._start
+
+    def copy(self) -> TwoVariations:
+        """The same with dual fields of its own."""
+        other = TwoVariations(self._start.shape, self._weights, self._nonnegative)
+        other._fields = self._fields[0].copy(), self._fields[1].copy()
+        return other
+
+    def about(self, m: F32, own: F32, change: F32) -> None:
+        """Set m and the weights a (`own`) and b (`change`), all [y, x, z]."""
+        self.m, self.own, self.change = m, own, change
+
+    def __call__(self, x: F32, threshold: float) -> None:
+        """Replace x [y, x, z] by the proximal point."""
+        if threshold <= 0:
+            np.maximum(x, 0, out=x, where=self._nonnegative)
+            return
+        self._start[...] = x
+        given = self._start, self._fields, self.m, threshold, self._weights, self._nonnegative, (x, self._beside)
+        pace = pace_of(threshold, self._weights)
+        primal(*given)
+        for _ in range(_STEPS):
+            ascend(x, self.own, pace, self._weights, self._fields[0])
+            ascend(self._beside, self.change, pace, self._weights, self._fields[1])
+            primal(*given)
+
+    def turn(self) -> None:
+        """Nothing: the differences stay those to the next voxels."""
+
+
+@dataclass(eq=False)
+class StateFit:
+    """A state whose volume, gains and motion are improved in turn.
+
+    Attributes:
+        problem: the projections of the state.
+        moved: the reference as it is moved so far.
+        x: the volume so far [y, x, z].
+        weight: μ, that of the total variation of the change.
+        width: of the field in mm (in the units of the problem), across which splines have their intervals.
+        rounds: falling weights, in rounds of the volume.
+    """
+
+    problem: VoxelProblem
+    moved: Moved
+    x: F32
+    weight: float
+    width: float
+    going: GoesOn = field(init=False)
+
+    def __post_init__(self) -> None:
+        problem = self.problem
+        self.going = GoesOn(problem.go_on)
+        self._subsets = Subsets.of(problem, subsets_of(problem.projector.geometry, SUBSETS, True), True)
+        self._prox = TwoVariations(self.x.shape, difference_weights(problem.projector.grid), problem.nonnegative)
+        self._views = MotionViews.of(problem)
+        self._done = 0
+        self.m = self.moved.volume()
+        self.known = self.moved.known()
+
+    def again(self, weight: float, x: F32, moved: Moved | None = None) -> StateFit:
+        """The same state with another weight, volume and (if given) place of the reference."""
+        other = copy(self)
+        other.weight, other.x, other.moved = weight, x.copy(), moved or self.moved
+        other._prox = self._prox.copy()
+        other.m, other.known = (self.m, self.known) if moved is None else (moved.volume(), moved.known())
+        return other
+
+    def alone(self) -> None:
+        """Leave the reference out: both weights are then of total variation of x."""
+        self.m, self.known = np.zeros_like(self.m), np.ones_like(self.known)
+
+    def solve(
+        self, own: F32 | float = 1.0, change: F32 | float = 1.0, still: float = _STILL, most: int = _MOST
+    ) -> None:
+        """Improve x; `own` and `change` are factors of the two weights [y, x, z]."""
+        if not self.going.going:
+            return
+        own, change = (np.broadcast_to(np.asarray(w, np.float32), self.x.shape) for w in (own, change))
+        # Where the reference shows nothing, and in the differences to such voxels, all of the weight is that of x.
+        inner = ndi.binary_erosion(self.known, border_value=1)
+        a = np.where(inner, np.float32(OWN) * own, np.float32(OWN + 1) * own).astype(np.float32)
+        self._prox.about(self.m, a, np.where(inner, change, np.float32(0)).astype(np.float32))
+        done = self._done
+
+        def go_on(sweep: int, left: float) -> bool:
+            self._done = done + sweep
+            return self.going(self._done, left)
+
+        self.x = ordered_fista(
+            replace(self.problem, go_on=go_on), self.x, self.weight, self._subsets, sweeps=most, tv_steps=self._prox,
+            still=still,
+        )  # fmt: skip
+
+    def follow(self, steps: Sequence[tuple[int, float]]) -> None:
+        """Improve the gains by x, then the motion by the views.
+
+        What x shows beside m has changed and is not explained by motion, except at edges of m: there a motion that was
+        not found yet looks like a change.
+        """
+        self.moved = replace(self.moved, gains=gains_of(self.x, self.moved))
+        m, slopes = self.moved.with_slopes(self.moved.at_rest)
+        assert slopes is not None
+        known = self.moved.known()
+        steep = np.sqrt(np.square(slopes).sum(0)) > _EDGE * self.moved.particles.level
+        edge = ndi.maximum_filter(steep & known, (3, 3, 1))
+        beside = np.where(edge, 0, self.x - m * known).astype(np.float32)
+        for intervals, blur in steps:
+            basis = Basis.splines(self.problem.projector.grid, self.width, intervals)
+            self.moved = improved(self._views, self.moved, basis, blur, beside, False)
+        self.m, self.known = self.moved.volume(), self.moved.known()
+
+    def rounds(self, plan: Sequence[Sequence[tuple[int, float]]], most: int = _MOST) -> None:
+        """Rounds of the volume and of the reference in turn, with at most `most` sweeps each."""
+        self.solve(most=most)
+        for steps in plan:
+            if not self.going.going:
+                return
+            self.follow(steps)
+            self.solve(most=most)
+
+    def sharpen(self, rounds: int, still: float = _STILL, most: int = _MOST) -> None:
+        """Rounds with weights that fall where the change is steep, and along dark lines in particles."""
+        for _ in range(rounds):
+            own, change = falling(self.problem, self.moved, self.x, self.m)
+            self.solve(own, change, still, most)
+
+
+def gains_of(x: F32, moved: Moved) -> NDArray[np.float64]:
+    """Gains of the ground and of the particles of a volume: medians, which cracks and pores do not move.
+
+    A particle that is gone gets 0.
+    """
+    own, label, gains = moved.particles, moved.labels(), moved.gains.copy()
+    ground, above, known = moved.pulled(own.ground), moved.pulled(own.above), moved.known()
+    apart = known & (above < 0.1 * own.level) & (ground > 0.8 * own.ground.max())
+    if own.base > 0 and apart.any():
+        gains[0] = np.median(x[apart] / ground[apart])
+    label = np.where(known, label, 0)
+    order = np.argsort(label, axis=None, kind="stable")
+    ends = np.searchsorted(label.ravel()[order], np.arange(gains.size + 1))
+    flat, high, low = x.ravel(), above.ravel(), ground.ravel()
+    for k in range(1, gains.size):
+        inside = order[ends[k] : ends[k + 1]]
+        a = high[inside]
+        if a.size > 4 and (top := 0.75 * np.percentile(a, 90)) > 0:
+            inside, a = inside[a > top], a[a > top]
+            gains[k] = np.median((flat[inside] - gains[0] * low[inside]) / a)
+    return np.maximum(gains, 0)

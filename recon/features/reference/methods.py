@@ -1,0 +1,159 @@
+"""FromReference: the reconstruction of a state of a sample of which there is a careful scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from recon.auto import Auto
+from recon.base.arrays import F32
+from recon.base.choices import Quality
+from recon.base.decisions import Decisions, Prior
+from recon.base.geometry import Geometry
+from recon.base.method import Method, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.volume import Grid, Volume
+from recon.features.reference.choice import Verdict, asked, not_moved, width_of
+from recon.features.reference.fit import PLAN, StateFit
+from recon.features.reference.motion import KNOTS, Basis, padded
+from recon.voxels.choice import TrialChoice
+from recon.voxels.iterative import Watch, solve_views
+from recon.voxels.projector import Projector, volume_slices
+from recon.voxels.trial import Trial
+from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_power
+
+_ROUNDS = PLAN[2:]
+_FIRST, _SHARPER, _LAST = 8, 2, 12  # most sweeps of a round; rounds with falling weights, most sweeps of each
+_BUFFERS = Buffers(34.0, 3.0, 4.8, filtered=True)
+
+
+@dataclass(frozen=True, eq=False)
+class FromReference(Method):
+    """A state of a sample, from few projections and an earlier, careful volume of the same sample.
+
+    The reference is moved to the state (a turn, a shift, an affine map, then smooth splines, found from the
+    projections), each of its particles gets a gain, and total variation of the volume and of its difference from the
+    moved reference are kept small; see `recon.features.reference.fit`. Held-out projections decide whether the
+    reference is used. If not, or if there are fewer than 16 projections, the volume is exactly that of `otherwise`.
+
+    Memory: 34 volumes and 3 times the projections.
+
+    Attributes:
+        reference: the earlier volume, in 1/mm, in the frame of its own scan; None: there is none.
+        otherwise: the method if the reference is not used.
+    """
+
+    name: ClassVar[str] = "from-reference"
+    label: ClassVar[str] = "From a reference"
+    takes: ClassVar[frozenset[str]] = frozenset({"device", "quality", "reference"})
+    halo: ClassVar[int] = Auto.halo
+    needs_matter: ClassVar[bool] = True
+
+    reference: Volume | None = None
+    otherwise: Auto = field(default_factory=Auto)
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        """The volume with its change, or that of `otherwise`; the settings say which of the two, and why.
+
+        Raises:
+            ValueError: the reference is elsewhere, or no method can use these projections.
+        """
+        decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
+        control = replace(control, decide=decide)
+
+        def compared() -> TrialChoice:
+            choice, trial = self.otherwise.tried(problem, control)
+            trials.append(trial)
+            return choice
+
+        choice = TrialChoice.of(decide("method", compared))
+        verdict = Verdict.of(decide("reference", lambda: self._asked(choice, trials)))
+        if verdict.used:
+            return self._from_reference(verdict, problem, control)
+        made = self.otherwise.run_chosen(choice, problem, control)
+        settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
+        return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
+
+    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> Verdict:
+        if self.reference is None:
+            return Verdict(False, "none was given")
+        trial = trials[0] if trials else None
+        if trial is None or trial.settings.all_rows:
+            return Verdict(False, f"whether it helps cannot be tested ({choice.where})")
+        return asked(trial, choice, self.reference)
+
+    def _from_reference(self, verdict: Verdict, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        assert self.reference is not None and control.decide is not None
+        begin, history = control.now(), list[Progress]()
+        planned = (1 + len(_ROUNDS)) * _FIRST + _SHARPER * _LAST
+
+        def report(iteration: int, residual: float) -> bool:
+            seconds = control.now() - begin
+            history.append(Progress(iteration, planned, seconds, residual, residual, 0, problem.geometry.n_views))
+            control.tell(history[-1])
+            return control.stop()
+
+        state, decide = _State(self.reference, verdict), control.decide
+        projector = Projector(problem.geometry, problem.grid)
+        volume = solve_views(
+            state, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=Watch(report),
+            decide=decide, wide=problem.wide,
+        )  # fmt: skip
+        settings = {
+            **decide.settings, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,
+            "reference_weight": verdict.weight,
+        }  # fmt: skip
+        return Reconstruction(
+            volume, settings, tuple(history), method=self.name, chosen=f"The reference was used: {verdict.because}",
+            change=Volume(volume.data - state.moved, volume.grid), displacement=state.displacement,
+        )  # fmt: skip
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """As for `otherwise`."""
+        return replace(self, otherwise=self.otherwise.with_quality(quality, default_count))
+
+    def toy(self) -> Self:
+        return replace(self, otherwise=self.otherwise.toy())
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return max(bytes_of(_BUFFERS, geometry, grid, weighted), self.otherwise.memory(geometry, grid, weighted))
+
+
+class _State:
+    """The iterations from a verdict to the volume; after them, the moved reference and the displacement.
+
+    Attributes:
+        moved: [z, y, x] in 1/mm.
+        displacement: [axis z, y, x; z, y, x] in mm, from where each voxel takes its value of the reference.
+    """
+
+    def __init__(self, reference: Volume, verdict: Verdict) -> None:
+        self._reference, self._verdict = reference, verdict
+        self.moved = self.displacement = np.empty(0, np.float32)
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        moved = not_moved(self._reference, problem)
+        grid, width, verdict = problem.projector.grid, width_of(problem), self._verdict
+        edge = problem.units.projector(problem.projector, 1).grid.voxel_size
+        assert moved is not None
+        for basis, values in (
+            (Basis.affine(grid, width), verdict.affine),
+            (Basis.splines(grid, width, KNOTS).uniform_along_z(), verdict.splines),
+        ):
+            c = np.reshape(values, (-1, *basis.used.shape)) / edge
+            moved = replace(moved, u=moved.u + padded(replace(basis, axes=len(c)).field(c)))
+        gains = np.full(moved.gains.shape, verdict.gains[1])
+        gains[0] = verdict.gains[0]
+        moved = replace(moved, gains=gains)
+        weight = problem.units.prior(Prior(verdict.weight), problem.weight is not None, -1).weight
+        start = moved.volume()
+        if problem.wide or not start.any():
+            problem.first_sweep(x, problem.rng)
+            start = np.where(moved.known(), start, x)
+        fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
+        fit.rounds(_ROUNDS, _FIRST)
+        fit.sharpen(_SHARPER, most=_LAST)
+        self.moved = volume_slices(times_power(fit.m.copy(), problem.units.density))
+        self.displacement = np.float32(edge) * fit.moved.u[[2, 0, 1]].transpose(0, 3, 1, 2)
+        return fit.x

@@ -1,0 +1,333 @@
+"""How a reference has moved until a state was scanned: an affine map, then cubic splines, estimated from the views.
+
+    m(r) = v(r + u(r)),    u = Σ_c B_c a_c
+
+v is the reference with a gain for each particle. Each step of Gauss-Newton fits the projected derivatives of m to what
+the views show beside it (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft
+from scipy import ndimage as ndi
+
+from recon.base.arrays import F32, F64
+from recon.base.views import spread
+from recon.base.volume import Grid
+from recon.features.reference.particles import Particles
+from recon.kernels.cpu.spline_warp import coefficients, pull
+from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import VoxelProblem
+
+_TALL = 8  # slices from which on the motion along the axis is estimated; with fewer, it is taken for 0
+_VIEWS = 40  # most projections from which the motion is estimated
+_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # turns about the axis that are tried first
+_MOST = 16  # least shift in voxels that is tried first; a tenth of the width if that is more
+_ACROSS = 96  # largest number of voxels across with which they are tried
+_BAND = 2.5, 10.0  # widths in voxels of the Gaussians between which structure is compared
+_BLURS = 4, 4, 2, 1, 1  # voxels, of the steps towards the affine map
+_STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of each, for splines and for an affine map
+_BENDING = 160  # columns for which the weight of bending is stated
+KNOTS = 8
+"""Intervals of the finest splines across the field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Displacements [axis, y, x, z] that are linear in coefficients [axis, p, q, r].
+
+    Attributes:
+        y, x, z: functions along each axis, [place, function].
+        used: [p, q, r], 1 for the products of functions that are used.
+        axes: 2: in the plane of the slices; 3: also along the axis.
+        intervals: of the splines; 0: no splines, and nothing to bend.
+    """
+
+    y: F64
+    x: F64
+    z: F64
+    used: F64
+    axes: int
+    intervals: int = 0
+
+    @classmethod
+    def affine(cls, grid: Grid, width: float) -> Basis:
+        """1, y, x and z, with coordinates from the rotation axis divided by half of `width` (mm)."""
+        z, y, x = (np.stack((at**0, 2 * at / width), axis=1) for at in grid.coordinates())
+        used = (np.add.outer(np.add.outer(np.arange(2), np.arange(2)), np.arange(2)) <= 1).astype(float)
+        if grid.shape[0] < _TALL:
+            used[:, :, 1] = 0
+        return cls(y, x, z, used, 2 + (grid.shape[0] >= _TALL))
+
+    @classmethod
+    def splines(cls, grid: Grid, width: float, intervals: int) -> Basis:
+        """Cubic B-splines with this number of intervals across `width` (mm); as wide along z, at least constant."""
+        edge = width / intervals
+        z, y, x = grid.coordinates()
+        along = round(grid.shape[0] * grid.spacing[0] / edge)
+        functions = np.ones((z.size, 1)) if along < 2 else _splines(z - z.mean(), edge, along)
+        rows, cols = (_splines(at, edge, intervals) for at in (y, x))
+        used = np.ones((intervals + 3, intervals + 3, functions.shape[1]))
+        return cls(rows, cols, functions, used, 2 + (grid.shape[0] >= _TALL), intervals)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.axes, *self.used.shape)
+
+    def field(self, c: F64) -> F32:
+        """The displacement [axis, y, x, z]."""
+        wide = np.einsum("yp,apqr->ayqr", self.y, c * self.used).astype(np.float32)
+        wide = np.einsum("xq,ayqr->ayxr", self.x.astype(np.float32), wide)
+        return np.ascontiguousarray(wide @ self.z.T.astype(np.float32))
+
+    def back(self, field: F32) -> F64:
+        """The transpose of `field`."""
+        some = np.einsum("xq,ayxr->ayqr", self.x.astype(np.float32), field @ self.z.astype(np.float32))
+        return self.used * np.einsum("yp,ayqr->apqr", self.y, some.astype(np.float64))
+
+    def uniform_along_z(self) -> Basis:
+        """The same functions of y and x, constant along the axis."""
+        return replace(self, z=np.ones((len(self.z), 1)), used=np.ones((*self.used.shape[:2], 1)))
+
+    def squared(self) -> Basis:
+        """The basis of the squares of the functions."""
+        return replace(self, y=self.y**2, x=self.x**2, z=self.z**2)
+
+    def bending(self, c: F64) -> F64:
+        """Half the gradient of the sum of the squared second differences of neighbouring coefficients."""
+        out = np.zeros_like(c)
+        for axis in (1, 2, 3) if self.intervals else ():
+            if c.shape[axis] > 2:
+                e, wide = np.diff(c, 2, axis), [(0, 0)] * 4
+                wide[axis] = (2, 2)
+                out += np.diff(np.pad(e, wide), 2, axis)
+        return out
+
+    def nearest(self, u: F32) -> F64:
+        """The coefficients whose displacement is nearest to u [axis, y, x, z]."""
+        y, x, z = (np.linalg.pinv(each, rcond=1e-6) for each in (self.y, self.x, self.z))
+        return np.einsum("py,qx,rz,ayxz->apqr", y, x, z, u[: self.axes], optimize=True)
+
+
+def _splines(at: F64, edge: float, intervals: int) -> F64:
+    """Cubic B-splines [place, function] on intervals as long as `edge`, around 0."""
+    t = np.abs(at[:, None] / edge - (np.arange(intervals + 3) - (intervals + 2) / 2))
+    return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0) ** 3 / 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """A reference moved to a state.
+
+    Attributes:
+        particles: its parts; `first` is the voxel of them at voxel 0 of the state.
+        u: displacement [3, y, x, z]: from where each voxel of the state takes its value, in voxels.
+        gains: of the ground, then of each particle. Voxels beside particles have the median gain of particles.
+        radius: how far the reference is known around the axis, in voxels.
+    """
+
+    particles: Particles
+    first: tuple[int, int, int]
+    u: F32
+    gains: F64
+    radius: float = math.inf
+
+    @property
+    def at_rest(self) -> F32:
+        """The reference with its gains, before it is moved."""
+        own = self.particles
+        of_label = np.concatenate(([self.gains[0]], self.gains[1:])).astype(np.float32)
+        of_label[0] = np.float32(np.median(self.gains[1:])) if own.count else np.float32(1)
+        return np.float32(self.gains[0]) * own.ground + of_label[own.label] * own.above
+
+    def pulled(self, volume: F32) -> F32:
+        """A volume on the voxels of the reference, moved to the state."""
+        return self.with_slopes(volume, False)[0]
+
+    def with_slopes(self, volume: F32, slopes: bool = True) -> tuple[F32, F32 | None]:
+        """As `pulled`, and its derivatives [3, y, x, z] with respect to u."""
+        out = np.empty(self.u.shape[1:], np.float32)
+        derivatives = np.empty_like(self.u) if slopes else None
+        pull(coefficients(volume), self.u, self.first, out, derivatives)
+        return out, derivatives
+
+    def _places(self) -> list[F32]:
+        places = []
+        for axis, (at, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
+            own = (np.arange(n, dtype=np.float32) + at).reshape([-1 if a == axis else 1 for a in range(3)])
+            places.append(own + self.u[axis])
+        return places
+
+    def labels(self) -> np.ndarray:
+        """The particle of each voxel [y, x, z] of the state."""
+        label = self.particles.label
+        nearest = (np.rint(at).astype(int).clip(0, n - 1) for at, n in zip(self._places(), label.shape, strict=True))
+        return label[tuple(nearest)]
+
+    def known(self) -> np.ndarray:
+        """[y, x, z] whether the reference shows the place of each voxel of the state."""
+        places, shape = self._places(), self.particles.label.shape
+        inside = np.ones(self.u.shape[1:], bool)
+        for at, n in zip(places, shape, strict=True):
+            inside &= (at > -0.5) & (at < n - 0.5)
+        if self.radius < math.inf:
+            y, x = (at - (n - 1) / 2 for at, n in zip(places[:2], shape[:2], strict=True))
+            inside &= np.hypot(y, x) < self.radius
+        return inside
+
+    def volume(self) -> F32:
+        """The moved reference [y, x, z]; 0 where it is not known."""
+        return self.pulled(self.at_rest) * self.known()
+
+
+@dataclass(frozen=True, eq=False)
+class MotionViews:
+    """The projections from which the motion is estimated: at most 40 of a problem."""
+
+    projector: Projector
+    lines: F32
+    weight: F32 | None
+
+    @classmethod
+    def of(cls, problem: VoxelProblem) -> MotionViews:
+        angles = np.argsort(np.mod(problem.projector.geometry.angles, problem.projector.geometry.period), kind="stable")
+        some = np.sort(spread(angles, _VIEWS))
+        weight = None if problem.weight is None else problem.weight[some]
+        return cls(problem.projector.subset(some), problem.data[some], weight)
+
+    def weighed(self, lines: F32) -> F32:
+        return lines if self.weight is None else lines * self.weight
+
+
+def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside: F32, with_gains: bool) -> Moved:
+    """The reference after a step of Gauss-Newton towards the views, both blurred by `blur` voxels in the plane.
+
+    A bend of a voxel over an eighth of the field costs as much as the mean residual of a ray, so that the splines
+    relax as the fit improves.
+
+    Args:
+        beside: a volume [y, x, z] that the views show in addition to the moved reference.
+        with_gains: True: also one gain of the ground and one of all particles.
+    """
+
+    def smooth(volume: F32) -> F32:
+        return ndi.gaussian_filter(volume, (blur, blur, 0)) if blur else volume
+
+    own, known = moved.particles, moved.known()
+    now, slopes = moved.with_slopes(smooth(moved.at_rest))
+    assert slopes is not None
+    slopes = slopes[: basis.axes] * known
+    parts = [moved.pulled(smooth(part)) * known for part in (own.ground, own.above)] if with_gains else []
+    lines = views.lines - views.projector.forward_lines(beside) if beside.any() else views.lines
+    left = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
+    left = left - views.projector.forward_lines(now * known)
+    n, n_views = slopes.shape[2], len(left)
+    kept, size = basis.squared().back(slopes**2), math.prod(basis.shape)
+    share = 1.0 if views.weight is None else float(views.weight.mean())
+    stiff = float(views.weighed(left**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
+
+    def forward(v: F64) -> F32:
+        change = np.einsum("ayxz,ayxz->yxz", slopes, basis.field(v[:size].reshape(basis.shape)))
+        for gain, part in zip(v[size:], parts, strict=True):
+            change += np.float32(gain) * part
+        return views.weighed(views.projector.forward_lines(change))
+
+    def back(rays: F32) -> F64:
+        volume = views.projector.adjoint_lines(rays)
+        of_u = basis.back(slopes * volume)
+        return np.concatenate((of_u.ravel(), [float(np.vdot(volume, part)) for part in parts]))
+
+    def normal(v: F64) -> F64:
+        out = back(forward(v))
+        out[:size] += stiff * basis.bending(v[:size].reshape(basis.shape)).ravel()
+        return out
+
+    of_u = share * 4 * kept + 6 * stiff / n_views
+    scale = np.concatenate((of_u.ravel(), [share * float(np.square(part).sum()) * n / 4 for part in parts]))
+    step = _conjugate(
+        normal, back(views.weighed(left)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
+    )
+    u, gains = moved.u.copy(), moved.gains.copy()
+    u[: basis.axes] += basis.field(step[:size].reshape(basis.shape))
+    if with_gains:
+        gains[0] += step[-2]
+        gains[1:] += step[-1]
+    return replace(moved, u=u, gains=np.maximum(gains, 0))
+
+
+def _conjugate(normal: Callable[[F64], F64], right: F64, scale: F64, steps: int) -> F64:
+    """Conjugate-gradient iterations (Hestenes & Stiefel 1952) from 0, preconditioned by a diagonal."""
+    x, r = np.zeros_like(right), right.copy()
+    z = r / scale
+    p, rz = z.copy(), float(r @ z)
+    for _ in range(steps):
+        q = normal(p)
+        if not (curved := float(p @ q)) > 0:
+            break
+        a = rz / curved
+        x, r = x + a * p, r - a * q
+        z, before = r / scale, rz
+        rz = float(r @ z)
+        p = z + rz / before * p
+    return x
+
+
+def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
+    """Coefficients of `Basis.affine` for a turn about the axis and a shift: the best correlation with a volume x.
+
+    Both volumes are compared between two widths of Gaussians, so that neither levels nor noise count.
+    """
+    basis, factor = Basis.affine(grid, width), math.ceil(x.shape[1] / _ACROSS)
+    still = replace(moved, u=np.zeros_like(moved.u))
+
+    def band(volume: F32) -> F32:
+        v = volume[::factor, ::factor]
+        low, high = (ndi.gaussian_filter(v, (s / factor, s / factor, 0)) for s in _BAND)
+        return low - high
+
+    target = fft.rfftn(band(x * still.known()))
+    most = max(_MOST, x.shape[1] // 10) // factor
+    along = 0 if basis.axes == 2 else min(x.shape[2] // 4, _MOST)
+    best = (-math.inf, basis.used * 0)
+    reference = moved.particles.volume
+    for turn in _TURNS:
+        c = _turned(basis, turn, (0.0, 0.0, 0.0), width / grid.voxel_size)
+        there = replace(still, u=padded(basis.field(c)))
+        product = fft.irfftn(target * np.conj(fft.rfftn(band(there.pulled(reference)))), s=band(x).shape)
+        at = [np.arange(-m, m + 1) for m in (most, most, along)]
+        some = product[np.ix_(*at)]
+        j, i, k = np.unravel_index(some.argmax(), some.shape)
+        shift = (-factor * float(at[0][j]), -factor * float(at[1][i]), -float(at[2][k]))
+        if some.max() > best[0]:
+            best = float(some.max()), _turned(basis, turn, shift, width / grid.voxel_size)
+    return np.asarray(best[1])
+
+
+def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) -> F64:
+    """Coefficients of a turn about the axis after a shift (y, x, z), both in voxels; `across` voxels in the width."""
+    c = np.zeros(basis.shape)
+    cos, sin, half = math.cos(turn), math.sin(turn), across / 2
+    dy, dx, dz = shift
+    c[0, 0, 0, 0], c[1, 0, 0, 0] = cos * dy + sin * dx, cos * dx - sin * dy
+    c[0, 1, 0, 0], c[0, 0, 1, 0] = (cos - 1) * half, sin * half
+    c[1, 0, 1, 0], c[1, 1, 0, 0] = (cos - 1) * half, -sin * half
+    if basis.axes == 3:
+        c[2, 0, 0, 0] = dz
+    return c
+
+
+def affinely_moved(views: MotionViews, moved: Moved, basis: Basis, beside: F32) -> Moved:
+    """The reference after steps on an affine map and two gains, from coarse to fine; arguments as of `improved`."""
+    for blur in _BLURS:
+        moved = improved(views, moved, basis, blur, beside, True)
+    return moved
+
+
+def padded(u: F32) -> F32:
+    """A displacement [3, y, x, z]; 0 along axes that it lacks."""
+    return np.concatenate((u, np.zeros((3 - len(u), *u.shape[1:]), np.float32)))

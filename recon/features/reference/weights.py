@@ -1,0 +1,65 @@
+"""Weights of total variation that fall where a state differs from its reference, and along thin dark lines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage as ndi
+
+from recon.base.arrays import F32
+from recon.features.reference.motion import Moved
+from recon.kernels.cpu.stencils import weighted_sum
+from recon.voxels.voxel_problem import VoxelProblem
+
+_FLOOR = 0.1  # slope of the change, in levels of particles per voxel, that halves its weight
+_FROM, _STEP = 3.0, 0.7  # deviations of the noise from which on a dark line counts, and that lower weights once more
+_MOST = 4.0  # largest fall by a line
+_LENGTH, _BESIDE, _TURNS = 9, 2.5, 12  # of a line in voxels; from it to what is beside it; directions
+
+
+def falling(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> tuple[F32, F32]:
+    """Factors [y, x, z] of the weights of x and of the change x - m."""
+    square = np.zeros_like(x)
+    for axis in range(3):
+        low = tuple(slice(None, -1) if e == axis else slice(None) for e in range(3))
+        square[low] += np.square(np.diff(x - m, axis=axis))
+    steep = ndi.gaussian_filter(np.sqrt(square), 0.5) / np.float32(_FLOOR * moved.particles.level)
+    if not m.any():
+        return np.ones_like(x), 1 / (1 + steep)
+    lines = np.maximum(dark_lines(problem, moved, x, m) - _FROM, 0) / np.float32(_STEP)
+    lines = ndi.maximum_filter(lines, (3, 3, 1))
+    return 1 / (1 + np.minimum(lines, 1)), 1 / (1 + steep + np.minimum(lines, np.float32(_MOST)))
+
+
+def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
+    """In particles: by how many deviations of the noise a line of voxels is darker than both of its sides.
+
+    The lines are those of the change x - m and of what filtered back-projection makes of the residual; 0 beside
+    particles.
+    """
+    own = moved.particles
+    left = problem.views - problem.projector.forward_lines(x)
+    d, missing = x - m, replace(problem, data=left, measured=None).filtered("hann")
+    if missing is not None:
+        d = d + missing
+    d = ndi.uniform_filter1d(d, min(3, d.shape[2]), axis=2, mode="nearest")
+    solid = m > 0.5 * own.level + own.base
+    inner, best, contrast = ndi.binary_erosion(solid, np.ones((3, 3, 1))), np.zeros_like(d), np.empty_like(d)
+    if not inner.any():
+        return best
+    for turn in np.arange(_TURNS) * np.pi / _TURNS:
+        weighted_sum(d, line_contrast(turn), contrast)
+        noise = 1.4826 * float(np.median(np.abs(contrast[inner])))
+        np.maximum(best, contrast / np.float32(max(noise, 1e-30)), out=best)
+    return np.where(solid, best, np.float32(0))
+
+
+def line_contrast(turn: float) -> F32:
+    """The stencil of what is beside a line minus the line, in a direction (radians from x towards y)."""
+    half = int(_LENGTH / 2 + _BESIDE) + 1
+    j, i = np.mgrid[-half : half + 1, -half : half + 1]
+    along, across = i * np.cos(turn) + j * np.sin(turn), np.abs(j * np.cos(turn) - i * np.sin(turn))
+    on = np.clip(_LENGTH / 2 + 0.5 - np.abs(along), 0, 1)
+    line, side = on * np.clip(1 - across, 0, 1), on * np.clip(1 - np.abs(across - _BESIDE), 0, 1)
+    return np.asarray(side / side.sum() - line / line.sum(), np.float32)

@@ -1,0 +1,115 @@
+"""FromReference: better than without where the reference is right, and otherwise exactly the volume of auto."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import recon
+from recon.base.arrays import F32
+from recon.base.method import DataUse, RunControl
+from recon.base.volume import Volume
+from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, packed, psnr, scanned
+
+AUTO = recon.Auto((recon.Fbp(), recon.FistaTv()))
+BEFORE = packed()
+STATE = replace(
+    BEFORE, turn=np.radians(1.2), shift=(2.3, -1.4), slit=4,
+    level=BEFORE.level * np.random.default_rng(7).uniform(0.93, 1.07, len(BEFORE.level)),
+)  # fmt: skip
+
+
+def reference(scene: Discs = BEFORE) -> Volume:
+    """The volume of a careful scan."""
+    data, geometry = scanned(scene, 180, 1e5)
+    return recon.reconstruct(data, geometry, recon.FistaTv()).volume
+
+
+@pytest.fixture(scope="module")
+def before() -> Volume:
+    return reference()
+
+
+@pytest.fixture(scope="module")
+def state() -> tuple[F32, recon.Geometry]:
+    return scanned(STATE, 24, 1e4, seed=1)
+
+
+@pytest.fixture(scope="module")
+def without(state: tuple[F32, recon.Geometry]) -> recon.Reconstruction:
+    return recon.reconstruct(*state, AUTO)
+
+
+def test_a_right_reference_is_used_and_shows_more(
+    before: Volume, state: tuple[F32, recon.Geometry], without: recon.Reconstruction
+) -> None:
+    made = recon.reconstruct(*state, recon.FromReference(before, AUTO))
+    assert made.method == "from-reference" and made.settings["reference_used"]
+    assert made.chosen.startswith("The reference was used: root mean square residual in held-out projections")
+    truth = STATE.volume
+    assert psnr(made.volume.data, truth) > psnr(without.volume.data, truth) + 1.5
+    assert made.change is not None and made.displacement is not None
+    moved = made.volume.data - made.change.data
+    gap = replace(STATE, slit=-1).volume - truth  # what is missing in the slit
+    shown = float((-made.change.data * gap).sum() / np.square(gap).sum())
+    assert shown > 0.6, "the slit is a change"
+    assert abs(float((moved - replace(STATE, slit=-1).volume).mean())) < 0.02 * LEVEL
+    # state(r) = reference(r + u): u = R (r - shift) - r
+    at = np.arange(N) - (N - 1) / 2
+    expected = np.sin(STATE.turn) * (at - STATE.shift[0]) + np.cos(STATE.turn) * (0 - STATE.shift[1])
+    middle = made.displacement[2, ROWS // 2, N // 4 : -N // 4, N // 2 - 1 : N // 2 + 1].mean(1)
+    np.testing.assert_allclose(middle, expected[N // 4 : -N // 4], atol=0.5)
+    assert not made.displacement[0].any()
+
+
+def test_the_reference_of_another_sample_is_refused_to_the_bit(
+    state: tuple[F32, recon.Geometry], without: recon.Reconstruction
+) -> None:
+    made = recon.reconstruct(*state, recon.FromReference(reference(packed(seed=9)), AUTO))
+    np.testing.assert_array_equal(made.volume.data, without.volume.data)
+    assert not made.settings["reference_used"] and made.change is None
+    assert made.chosen.startswith("The reference was not used: it does not predict held-out projections better than")
+    assert made.method == without.method
+
+
+@pytest.mark.parametrize("kind", ["none", "empty"])
+def test_without_a_usable_reference_the_volume_is_that_of_auto(
+    kind: str, state: tuple[F32, recon.Geometry], without: recon.Reconstruction, before: Volume
+) -> None:
+    given = None if kind == "none" else Volume(np.zeros_like(before.data), before.grid)
+    made = recon.reconstruct(*state, recon.FromReference(given, AUTO))
+    np.testing.assert_array_equal(made.volume.data, without.volume.data)
+    because = {"none": "none was given", "empty": "the reference shows no material here"}[kind]
+    assert made.settings["reference_because"] == because
+
+
+def test_too_few_projections_leave_the_reference_out(before: Volume) -> None:
+    data, geometry = scanned(STATE, 12, 1e4)
+    made = recon.reconstruct(data, geometry, recon.FromReference(before, AUTO))
+    assert "12 projections are too few to hold any out" in made.settings["reference_because"]
+    np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, geometry, AUTO).volume.data)
+
+
+def test_weights_of_rays_are_used(before: Volume, state: tuple[F32, recon.Geometry]) -> None:
+    data, geometry = state
+    spoiled, weights = data.copy(), np.ones_like(data)
+    spoiled[::3, :, 20:24], weights[::3, :, 20:24] = 0, 0
+    made = recon.reconstruct(spoiled, geometry, recon.FromReference(before, AUTO), use=DataUse(weights))
+    assert made.settings["reference_used"]
+    assert psnr(made.volume.data, STATE.volume) > psnr(
+        recon.reconstruct(data, geometry, AUTO).volume.data, STATE.volume
+    )
+
+
+def test_it_stops_when_it_is_asked_to(before: Volume, state: tuple[F32, recon.Geometry]) -> None:
+    steps: list[int] = []
+
+    def stop() -> bool:
+        return len(steps) > 3
+
+    control = RunControl(should_stop=stop, on_progress=lambda progress: steps.append(progress.step) if not progress.unit
+                         else None)  # fmt: skip
+    made = recon.reconstruct(*state, recon.FromReference(before, AUTO), control=control)
+    assert np.isfinite(made.volume.data).all() and made.history[-1].step <= 6
