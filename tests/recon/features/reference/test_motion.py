@@ -81,7 +81,9 @@ def test_a_turn_and_a_shift_are_found_from_the_views() -> None:
     problem, moved = _state(scene)
     grid, views = problem.projector.grid, MotionViews.of(problem)
     width = grid.voxel_size * grid.shape[2]
-    basis, x = Basis.affine(grid, width), np.maximum(problem.filtered("hann"), 0)
+    basis, filtered = Basis.affine(grid, width), problem.filtered("hann")
+    assert filtered is not None
+    x = np.maximum(filtered, 0)
     rough = replace(moved, u=padded(basis.field(roughly_moved(moved, x, grid, width))))
     found = affinely_moved(views, rough, basis, np.zeros_like(x))
     at = np.arange(N) - (N - 1) / 2

@@ -1,0 +1,96 @@
+"""`beamline recon --reference`: a state with the volume, or with the scan, of the sample before it changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.cli.recon import recon as command
+from beamline.storage.volumes.files import opened_volume
+from tests.beamline.cli.small_scan import beamline
+from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
+from tests.recon.features.reference.scene import Discs, N, packed, scanned
+
+QUICK = "--axis", str((N - 1) / 2), "--quality", "preview"
+AFTER = replace(packed(), turn=np.radians(0.8), shift=(1.5, -1.0), slit=4)
+
+
+def written(path: Path, scene: Discs, views: int, seed: int) -> Path:
+    """A scan of the scene, with flats and darks."""
+    lines, geometry = scanned(scene, views, 1e4, seed)
+    frames = frames_of(TwoCylinders(geometry.angles, geometry.detector_shape, axis_col=(N - 1) / 2))
+    counts = np.round(DARK + BEAM * np.exp(-lines)).astype(np.uint16)
+    return write_flagged(
+        path, frames[:4] + [replace(frame, counts=image) for frame, image in zip(frames[4:], counts, strict=True)], {}
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scans good.h5 and state.h5, and the volume good_volume.h5."""
+    folder = tmp_path_factory.mktemp("states")
+    good, _ = written(folder / "good.h5", packed(), 90, 1), written(folder / "state.h5", AFTER, 24, 2)
+    done = beamline(
+        "recon", str(good), "-m", "fista-tv", *QUICK[:2], "--no-report", "-o", str(folder / "good_volume.h5")
+    )
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_the_result_says_that_the_reference_was_used_and_shows_the_change(folder: Path) -> None:
+    out = folder / "out.h5"
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(folder / "good_volume.h5"), *QUICK, "-o",
+                    str(out))  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert f"{'chosen':<10}from-reference: The reference was used: root mean square residual" in done.output
+    with opened_volume(out) as record, h5py.File(out) as file:
+        data = file["entry/data"]
+        assert record.method == "from-reference" and data["change"].shape == record.grid.shape
+        assert data["change"].attrs["units"] == data["data"].attrs["units"]
+        moved = record.volume.data[:] - data["change"][:]
+        gap = replace(AFTER, slit=-1).volume - AFTER.volume
+        missing = -(data["change"][:] / moved.max() * gap).sum() / (gap**2).sum() * gap.max()
+        assert missing > 0.3, "the slit is in the change"
+        shifts = [data[f"displacement_{axis}"] for axis in "zyx"]
+        assert all(each.shape == record.grid.shape and each.attrs["units"] == record.length_unit for each in shifts)
+    assert "Change since the reference" in out.with_suffix(".html").read_text()
+
+
+def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
+    scan, made = folder / "good.h5", folder / "good_reference.h5"
+    for name in ("first.h5", "second.h5"):
+        done = beamline("recon", str(folder / "state.h5"), "--reference", str(scan), *QUICK, "--no-report", "-o",
+                        str(folder / name))  # fmt: skip
+        assert done.exit_code == 0, done.output
+        assert made.exists() and ("is reconstructed first" in done.output) == (name == "first.h5")
+        assert "The reference was used" in done.output
+    with opened_volume(folder / "first.h5") as one, opened_volume(folder / "second.h5") as other:
+        np.testing.assert_array_equal(one.volume.data[:], other.volume.data[:])
+    twin = written(folder / "other" / "good.h5", packed(), 24, 3) if (folder / "other").mkdir() is None else scan
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(twin), *QUICK, "-o", str(folder / "x.h5"))
+    assert done.exit_code != 0 and "was made from" in done.output and "Nothing was changed." in done.output
+    assert not (folder / "x.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (("--reference", "none.h5"), "none.h5 does not exist"),
+        (("--reference", "good_volume.h5", "-m", "fbp"), "--reference works only with from-reference"),
+        (("--reference", "good_volume.h5", "--follow"), "it needs a finished scan"),
+        (("--reference", "good_volume.h5", "--uncertainty"), "error bars are not calibrated for it"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(options: tuple[str, ...], error: str, folder: Path) -> None:
+    named = [str(folder / word) if word.endswith(".h5") else word for word in options]
+    done = beamline("recon", str(folder / "state.h5"), *named, "-o", str(folder / "refused.h5"))
+    assert done.exit_code != 0 and error in " ".join(done.output.split())
+    assert not (folder / "refused.h5").exists()
+
+
+def test_help_states_the_option() -> None:
+    assert "--reference" in {name for param in command.params for name in param.opts}
