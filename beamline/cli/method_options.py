@@ -233,7 +233,7 @@ _WITH_REFERENCE = option(
     argument="reference",
     excludes={
         **_FINISHED,
-        **dict.fromkeys(("volumes", "spectra"), "a reference helps to reconstruct a single volume"),
+        "volumes": "a reference helps to reconstruct a single volume",
         "uncertainty": "error bars are not calibrated for it",
         "roi": "the motion of the sample is estimated in all of the field",
     },

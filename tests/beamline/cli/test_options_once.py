@@ -22,7 +22,7 @@ TYPED = {
     "steps": "5", "seconds": "5", "budget": "30s", "quality": "best", "gaussians": "9", "start": "tv", "loss": "l2",
     "kernel": "gaussian", "device": "cuda", "early-stop": "", "finish": "2", "checkpoint": "c.h5", "resume": __file__,
     "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "levels": "0.1,0.5",
-    "allow-negative": "", "volumes": "3", "moves": "",
+    "allow-negative": "", "reference": "g.h5", "volumes": "3", "moves": "",
     "plain-splatting": "", "uncertainty": "", "truth": "t.npy", "follow": "", "previous-part": "e.h5",
     "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1",
     "dry-run": "",
@@ -102,7 +102,7 @@ def test_defaults_of_the_command_are_those_of_python() -> None:
         for each in fields(ReconOptions)
         if each.name in context.params and each.name not in ("follow", "method", "target")
     ]
-    assert len(shared) == 11
+    assert len(shared) == 12
     for each in shared:
         assert (context.params[each.name] or None) == (each.default or None), each.name
     for name in ("views", "rows", "binning", "cone"):
