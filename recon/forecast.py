@@ -131,7 +131,8 @@ class Timing:
             first = method.first_sweeps if isinstance(method, VoxelMethod) else 0
             pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
             if isinstance(method, VoxelMethod):
-                pace = pace._replace(planned=min(pace.planned, method.usual_sweeps))
+                further = method.further_sweeps(self._geometry, self._grid)
+                pace = pace._replace(planned=min(pace.planned, method.usual_sweeps) + further)
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # A step that does not use all projections costs the same for any number of them: it grows with the samples
             # along a ray.

@@ -206,6 +206,10 @@ class VoxelMethod(Iterative):
         """Usual number of iterations; fewer than `iterations` if the volume converges earlier."""
         return self.iterations
 
+    def further_sweeps(self, geometry: Geometry, grid: Grid) -> int:
+        """Usual time after `iterations`, in iterations; 0 unless further ones use smaller voxels."""
+        return 0
+
     def refit(self, share: float) -> VoxelMethod:
         """The method with this share of its iterations, for error bars, which continue from a finished volume."""
         return replace(self, iterations=max(1, round(share * self.iterations)))
@@ -220,10 +224,11 @@ class VoxelMethod(Iterative):
             ValueError: as for `solve`.
         """
         begin, views = control.now(), problem.geometry.n_views
+        further = self.further_sweeps(problem.geometry, problem.grid)
         history: list[Progress] = []
 
         def report(iteration: int, residual: float) -> bool:
-            seconds, planned = control.now() - begin, self.first_sweeps + self.iterations
+            seconds, planned = control.now() - begin, self.first_sweeps + self.iterations + further
             history.append(Progress(iteration, planned, seconds, residual, residual, 0, views))
             control.tell(history[-1])
             return control.stop()

@@ -18,6 +18,7 @@ from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
+from recon.voxels.half_voxels import STILL, HalfVoxels, in_half_voxels
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
@@ -39,7 +40,7 @@ from recon.voxels.voxel_problem import (
 
 
 @dataclass(frozen=True)
-class FistaTv(VoxelMethod):
+class FistaTv(HalfVoxels):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
 
     The iterations end when the volume has converged: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
@@ -53,6 +54,8 @@ class FistaTv(VoxelMethod):
         tv_steps: dual steps of total variation in each step.
         still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
             all iterations are made.
+        half_voxels: whether further iterations use voxels half as wide; None: with few projections, see
+            `recon.voxels.half_voxels`.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -68,28 +71,17 @@ class FistaTv(VoxelMethod):
     tv_steps: Count = 3
     still: NonNegative = STANDS_STILL
     allow_negative: bool = False
-
-    to_the_end: ClassVar[bool] = True
+    half_voxels: bool | None = None
 
     @property
     def trial_sweeps(self) -> int:
         """Iterations of the test reconstructions that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
-    @property
-    def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume has converged."""
-        return min(self.iterations, USUAL_SWEEPS)
-
     def refit(self, share: float) -> VoxelMethod:
         """`EarlyTv` with this share of its iterations."""
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
-
-    def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The same method with another limit at which it ends: nearer to the minimum, or for a preview farther from
-        it."""
-        return with_quality(self, quality)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals in the held-out projections with the best weight; with `tv_weight`, if it is given."""
@@ -98,7 +90,18 @@ class FistaTv(VoxelMethod):
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        return self.with_weight(problem, x)[0]
+        first = GoesOn(problem.go_on)
+        x, weight = self.with_weight(replace(problem, go_on=first), x)
+        if not first.going or not self.halves(problem.projector.geometry, problem.projector.grid):
+            return x
+        return in_half_voxels(problem, x, weight, self.in_halves)
+
+    def in_halves(self, problem: VoxelProblem, x: F32, mu: float) -> F32:
+        """The volume x [y, x, z] after further iterations with the weight μ, each with all projections."""
+        still = STILL * self.still
+        return ordered_fista(
+            problem, x, mu, Subsets.of(problem, 1), sweeps=self.iterations, tv_steps=self.tv_steps, still=still
+        )
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None

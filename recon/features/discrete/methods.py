@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.choices import Quality
 from recon.base.decisions import GoesOn, MaterialPrior, Prior
 from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
@@ -20,13 +19,14 @@ from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
+from recon.voxels.half_voxels import STILL, HalfVoxels, in_half_voxels
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
-from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, with_quality
+from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
@@ -41,7 +41,7 @@ _TRIALS = 6  # usual number of test reconstructions with levels
 
 
 @dataclass(frozen=True)
-class Discrete(VoxelMethod):
+class Discrete(HalfVoxels):
     """Discrete tomography: FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0.
 
     φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
@@ -56,7 +56,7 @@ class Discrete(VoxelMethod):
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
             voxels are pulled weakly to given levels.
-        still: as in `FistaTv`.
+        still, half_voxels: as in `FistaTv`.
     """
 
     name: ClassVar[str] = "discrete"
@@ -71,24 +71,16 @@ class Discrete(VoxelMethod):
     levels: tuple[float, ...] | None = None
     still: NonNegative = STANDS_STILL
     allow_negative: bool = False
+    half_voxels: bool | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
-    def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """As in `FistaTv`."""
-        return with_quality(self, quality)
-
     def refit(self, share: float) -> VoxelMethod:
         """`EarlyTv` with a part of its iterations: `share` times the number that the calibration of error bars used."""
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
-
-    @property
-    def usual_sweeps(self) -> int:
-        """Usual number of iterations until the volume has converged."""
-        return min(self.iterations, USUAL_SWEEPS)
 
     @property
     def trial_sweeps(self) -> int:
@@ -132,14 +124,34 @@ class Discrete(VoxelMethod):
         return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        smooth = FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels)
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return FistaTv(self.iterations, still=self.still).iterate(problem, x)
+            return smooth.iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
-        x, weight = FistaTv(still=self.still).with_weight(replace(problem, go_on=first), x, trial)
-        materials = self.materials(problem, weight, trial)
-        if materials is None or not first.going:
+        watched = replace(problem, go_on=first)
+        x, weight = FistaTv(still=self.still).with_weight(watched, x, trial)
+        materials, halves = self.materials(problem, weight, trial), problem.projector
+        if not first.going:
             return x
-        return self.pulled(problem, x, weight, materials, self.first_sweeps)
+        if materials is not None:
+            x = self.pulled(watched, x, weight, materials, self.first_sweeps)
+        if not first.going or not self.halves(halves.geometry, halves.grid):
+            return x
+        if materials is None:
+            return in_half_voxels(problem, x, weight, smooth.in_halves)
+        return in_half_voxels(problem, x, weight, partial(self.in_halves, materials), self.first_sweeps)
+
+    def in_halves(self, materials: MaterialPrior, problem: VoxelProblem, x: F32, mu: float) -> F32:
+        """The volume x [y, x, z] after further iterations with a pull to the levels, each with all projections.
+
+        Args:
+            mu: weight of total variation without the pull.
+        """
+        pull = MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))
+        return ordered_fista(
+            problem, x, mu * materials.tv_share, Subsets.of(problem, 1), sweeps=self.iterations, tv_steps=TV_STEPS,
+            pull=pull, still=STILL * self.still,
+        )  # fmt: skip
 
     def materials(
         self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None]

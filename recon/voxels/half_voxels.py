@@ -1,0 +1,128 @@
+"""Voxels half as wide as a pixel: the last iterations of total variation and of discrete tomography use them.
+
+A ray through voxels as wide as a pixel is interpolated between two of them. Therefore computed projections are more
+blurred than measured ones (`recon.voxels.resolution`), and one voxel must stand for the sharp edge of a grain. Voxels
+half as wide have a quarter of this blur. The result is the mean of the four small voxels in each voxel.
+
+With 10⁴ photons, packed grains gain 0.8 to 1.1 dB from 30 and 45 projections of 192 columns. The residual in
+projections that were not used falls from 0.0190 to 0.0172 on a measured electrode, and from 0.0049 to 0.0044 on a
+measured walnut. Voxels of bone, cement and thorax gain 0.1 to 0.5 dB. (tests/bench/half_voxels.py)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.choices import Quality
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.iterative import VoxelMethod
+from recon.voxels.priors import NoiseBalance
+from recon.voxels.resolution import smoothed
+from recon.voxels.standstill import ENDED, USUAL_SWEEPS, with_quality
+from recon.voxels.voxel_problem import VoxelProblem, bytes_of
+
+COST, USUAL_FURTHER = 3, 25
+"""Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
+STILL = 2.0
+"""Factor on `still`: these sweeps end earlier, which costs less than 0.1 dB."""
+_FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH = 1 / 3, 1024, 1.1, 0.75
+_BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
+
+
+class HalfVoxels(VoxelMethod):
+    """A method whose iterations end when the volume has converged, and whose last ones may use half voxels.
+
+    Attributes:
+        still: as in `FistaTv`.
+        half_voxels: True or False: always or never; None: see `uses_half_voxels`.
+        to_the_end: False: a fixed number of iterations, on whole voxels.
+    """
+
+    still: float
+    half_voxels: bool | None
+    to_the_end: ClassVar[bool] = True
+
+    @property
+    def usual_sweeps(self) -> int:
+        """Usual number of iterations on whole voxels until the volume has converged."""
+        return min(self.iterations, USUAL_SWEEPS)
+
+    def further_sweeps(self, geometry: Geometry, grid: Grid) -> int:
+        """Usual time on half voxels, in iterations on whole ones."""
+        return COST * min(self.iterations, USUAL_FURTHER) if self.halves(geometry, grid) else 0
+
+    def halves(self, geometry: Geometry, grid: Grid) -> bool:
+        """Whether the last iterations use half voxels."""
+        return self.to_the_end and uses_half_voxels(self.half_voxels, geometry, grid)
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """The method that ends nearer to the minimum, on half voxels; or, for a preview, farther from it."""
+        wanted, settings = _BY_QUALITY[quality], {}
+        if wanted is not None:
+            settings["half_voxels"] = wanted
+        return replace(with_quality(self, quality), **settings)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        """Peak memory in bytes: on half voxels, volumes are four times as large."""
+        return bytes_of(self.buffers, geometry, halved(grid) if self.halves(geometry, grid) else grid, weighted)
+
+
+def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> bool:
+    """Whether the last iterations use voxels of half a pixel.
+
+    None: only for a parallel beam with fewer projections than a third of the columns, because a sweep over more of them
+    takes long. (With 90 projections of 128 columns total variation would gain 0.3 dB. In a cone, and in a sample wider
+    than the field of view, nothing was gained.) The grid may have up to 1024 columns, because half voxels need four
+    times the memory. Voxels that are narrower than 0.75 pixels are never halved.
+    """
+    columns, own = grid.shape[2], geometry.detector_shape[1]
+    if wanted is False or grid.voxel_size < _LEAST_WIDTH * geometry.sample_pitch:
+        return False
+    few = geometry.n_views < _FEW * own and columns <= min(_MOST_COLUMNS, _WIDEST * own)
+    return wanted is True or (few and not geometry.is_cone)
+
+
+def halved(grid: Grid) -> Grid:
+    """The grid with voxels half as wide along y and x, and with the same slices."""
+    nz, ny, nx = grid.shape
+    return Grid((nz, 2 * ny, 2 * nx), grid.voxel_size / 2, grid.centre, grid.spacing[0])
+
+
+def in_half_voxels(
+    problem: VoxelProblem,
+    x: F32,
+    weight: NoiseBalance | float,
+    make: Callable[[VoxelProblem, F32, float], F32],
+    first: int = 0,
+) -> F32:
+    """The volume x [y, x, z] after further iterations on half voxels.
+
+    Total variation is a surface times a change of density. Differences between voxels half as wide, summed over four
+    times as many voxels, are twice as large. Therefore the weight is halved.
+
+    Args:
+        x: the volume of whole voxels.
+        weight: weight μ of total variation with whole voxels.
+        make: function of the problem with half voxels, its first volume and its weight; returns the volume.
+        first: number of planned iterations before those that made x, for the progress.
+    """
+    settings = problem.decide.settings
+    before = int(settings.get(ENDED[1], 0))
+    projector = replace(problem.projector, grid=halved(problem.projector.grid))
+    data = smoothed(problem.views, projector.resolution, None if problem.weight is None else problem.weight > 0)
+    fine = replace(
+        problem, projector=projector, data=data, measured=None if data is problem.views else problem.views,
+        go_on=lambda sweep, left: problem.go_on(first + before + COST * sweep, left), _norms=[],
+    )  # fmt: skip
+    mu = weight.value if isinstance(weight, NoiseBalance) else weight
+    made = make(fine, np.repeat(np.repeat(x, 2, axis=0), 2, axis=1), mu / 2)
+    settings["half_voxel_iterations"] = int(settings.get(ENDED[1], 0))
+    settings[ENDED[1]] = before + settings["half_voxel_iterations"]
+    ny, nx, nz = x.shape
+    return made.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)

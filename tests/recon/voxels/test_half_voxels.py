@@ -1,0 +1,154 @@
+"""Half voxels: when they are used, what they gain on exact line integrals, and that they can be stopped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import recon
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import Progress, ReconProblem, RunControl
+from recon.base.view_data import Views
+from recon.base.volume import Grid
+from recon.kernels.cpu.tv import total_variation
+from recon.voxels.half_voxels import COST, halved, uses_half_voxels
+from recon.voxels.voxel_problem import difference_weights
+
+
+def packed() -> list[tuple[float, float, float, float]]:
+    """A disc full of small ones: (x, y, radius) in pixels, and the density that each adds."""
+    rng, discs = np.random.default_rng(5), [(0.0, 0.0, 29.0, 0.02)]
+    while len(discs) < 45:
+        (x, y), radius = rng.uniform(-26, 26, 2), rng.uniform(2, 4)
+        if np.hypot(x, y) + radius < 28 and all(np.hypot(x - a, y - b) > radius + r for a, b, r, _ in discs[1:]):
+            discs.append((x, y, radius, 0.03))
+    return discs
+
+
+DISCS = packed()
+SIDE, ROWS = 64, 3
+
+
+def geometry_of(views: int, columns: int = SIDE) -> Geometry:
+    return Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), (ROWS, columns), pixel_pitch=1.0)
+
+
+def exact_views(geometry: Geometry) -> np.ndarray:
+    """Line integrals of the discs, averaged over each pixel."""
+    u = (np.arange(8 * SIDE) - 4 * SIDE + 0.5) / 8
+    lines = np.zeros((geometry.n_views, u.size))
+    for x, y, radius, density in DISCS:
+        away = u - (x * np.cos(geometry.angles) + y * np.sin(geometry.angles))[:, None]
+        lines += 2 * density * np.sqrt(np.maximum(radius**2 - away**2, 0))
+    pixels = lines.reshape(geometry.n_views, SIDE, 8).mean(2)
+    return np.repeat(pixels[:, None], ROWS, axis=1).astype(np.float32)
+
+
+def truth() -> np.ndarray:
+    """[y, x] mean density of each voxel."""
+    at = (np.arange(8 * SIDE) - 4 * SIDE + 0.5) / 8
+    fine = sum(d * (np.hypot(at - x, at[:, None] - y) < r) for x, y, r, d in DISCS)
+    return np.asarray(fine).reshape(SIDE, 8, SIDE, 8).mean((1, 3))
+
+
+def error_of(volume: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(volume - truth()))))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "views", "columns", "used"),
+    [(None, 21, 64, True), (None, 22, 64, False), (True, 90, 64, True), (False, 12, 64, False),
+     (None, 180, 1024, True), (None, 180, 2048, False), (True, 180, 2048, True)],
+)  # fmt: skip
+def test_few_projections_use_them(wanted: bool | None, views: int, columns: int, used: bool) -> None:
+    geometry = geometry_of(views, columns)
+    assert uses_half_voxels(wanted, geometry, Grid.matching(geometry)) is used
+
+
+def test_never_in_voxels_that_are_already_narrow_nor_by_default_in_a_wide_box() -> None:
+    geometry = geometry_of(12)
+    grid = Grid.matching(geometry)
+    assert not uses_half_voxels(True, geometry, halved(grid))
+    wide = replace(grid, shape=(ROWS, 2 * SIDE, 2 * SIDE))
+    assert not uses_half_voxels(None, geometry, wide)
+    assert uses_half_voxels(True, geometry, wide)
+
+
+def test_never_by_default_in_a_cone() -> None:
+    cone = Geometry.cone(np.linspace(0, 2 * np.pi, 12), (ROWS, SIDE), pixel_pitch=1.0, sod=200.0, sdd=400.0)
+    assert not uses_half_voxels(None, cone, Grid.matching(cone))
+
+
+def test_total_variation_doubles_so_that_half_the_weight_is_the_same_prior() -> None:
+    step = np.zeros((16, 16, 4), np.float32)
+    step[:, 8:] = 0.7
+    grid = Grid.matching(Geometry.parallel(np.zeros(1), (4, 16), pixel_pitch=1.0))
+    fine = np.repeat(np.repeat(step, 2, axis=0), 2, axis=1)
+    of_whole, of_halves = (total_variation(x, difference_weights(g)) for x, g in ((step, grid), (fine, halved(grid))))
+    assert of_halves == pytest.approx(2 * of_whole, rel=1e-6)
+
+
+def test_discs_are_closer_to_the_truth() -> None:
+    geometry = geometry_of(20)
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    whole, halves = (
+        error_of(recon.reconstruct(views, geometry, method=recon.Discrete(half_voxels=wanted)).volume.data)
+        for wanted in (False, True)
+    )
+    assert halves < 0.92 * whole
+
+
+def test_total_variation_is_not_farther_from_the_truth() -> None:
+    geometry = geometry_of(20)
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    whole, halves = (
+        error_of(recon.reconstruct(views, geometry, method=recon.FistaTv(half_voxels=wanted)).volume.data)
+        for wanted in (False, True)
+    )
+    assert halves < whole
+
+
+def test_the_record_says_how_many_iterations_used_them() -> None:
+    geometry = geometry_of(20)
+    result = recon.reconstruct(exact_views(geometry), geometry, method="fista-tv")
+    own, all_of_them = result.settings["half_voxel_iterations"], result.settings["ended_after"]
+    assert 0 < own < all_of_them
+    assert result.history[-1].step == all_of_them - own + COST * own
+    assert result.volume.data.shape == (ROWS, SIDE, SIDE)
+
+
+def test_a_stop_leaves_them_out() -> None:
+    geometry, seen = geometry_of(20), list[Progress]()
+    problem = ReconProblem(Views(exact_views(geometry), geometry), Grid.matching(geometry))
+    control = RunControl(lambda: len(seen) >= 3, on_progress=seen.append)
+    result = recon.FistaTv(tv_weight=0.01, half_voxels=True).run(problem, control)
+    assert "half_voxel_iterations" not in result.settings
+    assert result.settings["ended"] == "stopped"
+
+
+def test_a_slab_that_follows_decisions_is_the_same_to_the_bit() -> None:
+    geometry = geometry_of(20)
+    problem = ReconProblem(Views(exact_views(geometry), geometry), Grid.matching(geometry))
+    decide = Decisions()
+    first = recon.FistaTv().run(problem, RunControl(decide=decide))
+    again = recon.FistaTv().run(problem, RunControl(decide=Decisions(0, decide.made)))
+    np.testing.assert_array_equal(first.volume.data, again.volume.data)
+
+
+def test_memory_counts_four_times_the_volume_only_with_few_projections() -> None:
+    few, many = geometry_of(20), geometry_of(60)
+    method = recon.FistaTv()
+    never = replace(method, half_voxels=False)
+    grid = Grid.matching(few)
+    assert method.memory(few, grid, False) == method.memory(few, halved(grid), False) > never.memory(few, grid, False)
+    assert method.memory(many, grid, False) == never.memory(many, grid, False)
+
+
+def test_best_uses_them_and_a_preview_does_not() -> None:
+    wanted = {
+        quality: recon.FistaTv().with_quality(quality, 0).half_voxels for quality in ("preview", "standard", "best")
+    }
+    assert wanted == {"preview": False, "standard": None, "best": True}
