@@ -18,6 +18,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
+from recon.voxels.half_voxels import with_halves
 from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import TrialWatch, VoxelMethod, Watch, scaled_problem, threads_for
 from recon.voxels.projector import Projector
@@ -122,11 +123,13 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """ "preview" tries only the first two candidates. "best" accepts a costlier method even if it is only slightly
-        better, and runs each test of a fit to its end."""
+        """With "preview", only the first two candidates are tried. With "best", any gain is enough, no test of a fit
+        ends early, and the last iterations use half voxels."""
         if quality == "preview":
-            return replace(self, candidates=self.candidates[:2])
-        return replace(self, least_gain=0.0) if quality == "best" else self
+            return replace(self, candidates=tuple(with_halves(each, False) for each in self.candidates[:2]))
+        if quality == "best":
+            return replace(self, candidates=tuple(with_halves(each, True) for each in self.candidates), least_gain=0.0)
+        return self
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))

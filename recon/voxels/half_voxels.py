@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from recon.voxels.resolution import smoothed
 from recon.voxels.standstill import ENDED, USUAL_SWEEPS, with_quality
 from recon.voxels.voxel_problem import VoxelProblem, bytes_of
 
-COST, USUAL_FURTHER = 3, 25
+MethodT = TypeVar("MethodT")
+
+COST, USUAL_FURTHER = 3, 30
 """Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
-STILL = 2.0
-"""Factor on `still`: these sweeps end earlier, which costs less than 0.1 dB."""
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH = 1 / 3, 1024, 1.1, 0.75
 _BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 
@@ -63,14 +63,19 @@ class HalfVoxels(VoxelMethod):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The method that ends nearer to the minimum, on half voxels; or, for a preview, farther from it."""
-        wanted, settings = _BY_QUALITY[quality], {}
-        if wanted is not None:
-            settings["half_voxels"] = wanted
-        return replace(with_quality(self, quality), **settings)
+        made, wanted = with_quality(self, quality), _BY_QUALITY[quality]
+        return made if wanted is None else with_halves(made, wanted)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory in bytes: on half voxels, volumes are four times as large."""
         return bytes_of(self.buffers, geometry, halved(grid) if self.halves(geometry, grid) else grid, weighted)
+
+
+def with_halves(method: MethodT, wanted: bool) -> MethodT:
+    """The method that uses half voxels always or never, if it is one that can; otherwise the method itself."""
+    settings: Any = method
+    changed: MethodT = replace(settings, half_voxels=wanted) if isinstance(method, HalfVoxels) else method
+    return changed
 
 
 def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> bool:

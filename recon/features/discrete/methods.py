@@ -19,7 +19,7 @@ from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
-from recon.voxels.half_voxels import STILL, HalfVoxels, in_half_voxels
+from recon.voxels.half_voxels import HalfVoxels, in_half_voxels
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
@@ -150,7 +150,7 @@ class Discrete(HalfVoxels):
         pull = MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))
         return ordered_fista(
             problem, x, mu * materials.tv_share, Subsets.of(problem, 1), sweeps=self.iterations, tv_steps=TV_STEPS,
-            pull=pull, still=STILL * self.still,
+            pull=pull, still=self.still,
         )  # fmt: skip
 
     def materials(

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import recon
+from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import total_variation
-from recon.voxels.half_voxels import COST, halved, uses_half_voxels
+from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels
 from recon.voxels.voxel_problem import difference_weights
 
 
@@ -152,3 +153,11 @@ def test_best_uses_them_and_a_preview_does_not() -> None:
         quality: recon.FistaTv().with_quality(quality, 0).half_voxels for quality in ("preview", "standard", "best")
     }
     assert wanted == {"preview": False, "standard": None, "best": True}
+
+
+def test_auto_passes_the_preset_to_its_candidates() -> None:
+    def wanted(quality: Quality) -> set[bool | None]:
+        candidates = recon.Auto().with_quality(quality, 0).candidates
+        return {each.half_voxels for each in candidates if isinstance(each, HalfVoxels)}
+
+    assert [wanted("preview"), wanted("standard"), wanted("best")] == [{False}, {None}, {True}]
