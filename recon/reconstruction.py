@@ -55,8 +55,8 @@ def reconstruct(
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
         masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
-        `Counts` instead. The method then gets line integrals with weights that represent the likelihood of the counts,
-        see `recon.prep.counts.line_integrals`; they are multiplied by `use.weights`.
+        `Counts` instead. The method then gets line integrals, with weights that represent the likelihood of the counts
+        (`recon.prep.counts.line_integrals`). These weights are multiplied by `use.weights`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the

@@ -216,8 +216,8 @@ class OppositeCheck(Logged):
             f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
             else (
-                f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: the sample shrank, "
-                "bent or lost something"
+                f"the sample changed its shape: it shrank, bent or lost something. The frames differ as much as if it "
+                f"had moved by {fit.remainder:.1f} px"
             )
         )
         advice = (

@@ -132,7 +132,8 @@ class FilterPvs(CheckedSettings):
     """The process variables of a filter, as pva://NAME or ca://NAME; times in s."""
 
     pv: str = setting(
-        doc="Process variable to which the value of a place is written: a number, a text or a label.",
+        doc="Process variable that moves the filter. The driver writes the value of the wanted position: a number, "
+        "a text or a label.",
         problem=url_problem,
     )
     status_pv: str | None = setting(

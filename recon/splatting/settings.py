@@ -189,18 +189,19 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
         ssim_weight: weight of 1 - SSIM, which is added to the loss.
-        tv_weight: weight of total variation. None: 3e5 times the variance of a pixel's noise (in units of the half
-            field times the density unit), divided by the number of pixels of a Gaussian. If the sample changes by more
-            than 0.16 of the density unit per voxel, the weight falls with the square of this change. It is at most
-            0.25.
+        tv_weight: weight of total variation. None: 3e5 s² / n, where n is the number of pixels that a Gaussian
+            covers, and s is the noise of a pixel, divided by the density unit and by half the field's width. If the
+            sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
+            change. It is at most 0.25.
         tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
             is lower, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
         tv_moves: True: total variation may move centres. In the published code this gradient is too small by the voxel
-            size squared and has no effect (its weight there is 0.05). With the right gradient we measure +0.2 dB on the
-            walnut (60 projections) and +0.4 dB on the battery (90 projections).
-        rates: learning rates at the first step: of means (per half field), log scales, quaternions and raw densities.
+            size squared and has no effect (its weight there is 0.05). The correct gradient improves the walnut
+            by 0.2 dB (60 projections) and the battery by 0.4 dB (90 projections).
+        rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
+            quaternions and raw densities.
         pace: factor on all rates. The published rates are for 30 000 steps; a fit of 1000 steps with the published
             rates is far from convergence. Rates twenty times as high, with two projections per step and a low last
             rate, gain 1 to 4 dB in 1000 steps. Rates 26 times as high, with a higher last rate, need only 400 steps

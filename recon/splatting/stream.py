@@ -133,8 +133,8 @@ class StreamingFit:
 
         The model is kept, unless the new data differ by a fifth from the data with which the Gaussians were placed. In
         that case the Gaussians are placed again. `kept` are the numbers of the projections that these data belong to,
-        in order. If it is given, only these projections count from then on, and the rates start again, because the
-        model has learnt from bad projections.
+        in order. If `kept` is given, the fit uses only these projections from now on. The learning rates then start
+        from their first values again, because the model has learnt from bad projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.

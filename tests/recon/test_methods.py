@@ -71,7 +71,7 @@ def test_an_unknown_name_is_refused_with_the_legal_ones() -> None:
     for look in (methods.by_name, methods.streams):
         with pytest.raises(
             ValueError,
-            match=r"'art'.*r2-published \(did .* sart\?\)",
+            match=r"'art'.*from-reference \(did .* sart\?\)",
         ):
             look("art")
 

@@ -90,7 +90,7 @@ class Basis(Enum):
 
     GIVEN = "the frame that ride.first_id states"
     NUMBERS = "the frame whose number follows the number of the last frame before the block"
-    COUNTER = "the frame that the camera's own count shows"
+    COUNTER = "the frame whose number follows from the camera's counter"
     WAITED = "the first frame that arrived"
     UNKNOWN = "the first frame that arrived, although others may have come before it"
 

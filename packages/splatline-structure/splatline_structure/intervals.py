@@ -43,7 +43,10 @@ CAUSES = {
     "voxels": "the voxel size limits this; more projections would not help",
     "particles": "more whole particles (a larger field of view) would narrow the interval",
 }
-_NO_CAUSE = f"no cause changes this number, so the interval has the smallest width ({100 * NARROWEST:g} % to each side)"
+_NO_CAUSE = (
+    "no source of error changes this number, so the interval has the smallest width that is given "
+    f"({100 * NARROWEST:g} % to each side)"
+)
 _SHARES = "fraction", "sphericity", "cracks", "connected"
 
 

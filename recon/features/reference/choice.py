@@ -30,7 +30,7 @@ _OCTAVES = 4  # most octaves from the first weight
 _FEW = 6  # sweeps with a displaced copy
 
 
-class Verdict(NamedTuple):
+class ReferenceVerdict(NamedTuple):
     """Whether the reference is used, in plain values (see `Decisions`).
 
     Attributes:
@@ -49,7 +49,7 @@ class Verdict(NamedTuple):
     gains: Sequence[float] = (1.0, 1.0)
 
     @classmethod
-    def of(cls, values: Sequence[Any]) -> Verdict:
+    def of(cls, values: Sequence[Any]) -> ReferenceVerdict:
         return cls(*values)
 
 
@@ -71,12 +71,14 @@ def width_of(problem: VoxelProblem) -> float:
     return 2 * problem.projector.geometry.reach
 
 
-def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> Verdict:
+def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerdict:
     """The three questions, on the rows and projections of a trial; `choice` is that of `auto`."""
     problem, mu = trial.problem, trial.weight
     moved = not_moved(reference, problem)
     if mu is None or moved is None:
-        return Verdict(False, "the reference shows no material here" if mu else "the weights could not be chosen")
+        return ReferenceVerdict(
+            False, "the reference shows no material here" if mu else "the weights could not be chosen"
+        )
     mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # that of the projections that are not held out, see `choose_weight`
     smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
     width, grid = width_of(trial.scan), problem.projector.grid
@@ -90,7 +92,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> Verdict:
     fit = StateFit(problem, moved, start, _FIRST * mu, width)
     fit.rounds(PLAN)
     if trial.ended or not fit.x.any():
-        return Verdict(False, "stopped before it was tried")
+        return ReferenceVerdict(False, "stopped before it was tried")
     octave, left = _best_octave(trial, fit)
     alone = _without(trial, fit, smooth, mu)
     least = choice.least
@@ -101,16 +103,18 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> Verdict:
     for name, residuals in others:
         told += f", by {name} {residuals.mean():#.4g}"
         if not significantly_better(own, residuals, LEAST_GAIN):
-            return Verdict(False, f"it does not predict held-out projections better than {name} ({told})")
+            return ReferenceVerdict(False, f"it does not predict held-out projections better than {name} ({told})")
     if (where := _better_displaced(trial, fit)) is not None:
-        return Verdict(False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}")
+        return ReferenceVerdict(
+            False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}"
+        )
     all_views = fit.weight * 2.0**octave * np.sqrt(ONE_IN / (ONE_IN - 1))
     of_scan = problem.units.prior(Prior(float(all_views)), problem.weight is not None, 1).weight
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
     mm = [(edge * each).ravel().tolist() for each in (coefficients, bent.mean(-1, keepdims=True))]
-    return Verdict(True, told, of_scan, mm[0], mm[1], gains)
+    return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 
 def _best_octave(trial: Trial, fit: StateFit) -> tuple[float, F64]:

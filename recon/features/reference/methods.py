@@ -14,7 +14,7 @@ from recon.base.decisions import Decisions, Prior
 from recon.base.geometry import Geometry
 from recon.base.method import Method, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
-from recon.features.reference.choice import Verdict, asked, not_moved, width_of
+from recon.features.reference.choice import ReferenceVerdict, asked, not_moved, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.voxels.choice import TrialChoice
@@ -68,22 +68,22 @@ class FromReference(Method):
             return choice
 
         choice = TrialChoice.of(decide("method", compared))
-        verdict = Verdict.of(decide("reference", lambda: self._asked(choice, trials)))
+        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials)))
         if verdict.used:
             return self._from_reference(verdict, problem, control)
         made = self.otherwise.run_chosen(choice, problem, control)
         settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
         return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
-    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> Verdict:
+    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
         if self.reference is None:
-            return Verdict(False, "none was given")
+            return ReferenceVerdict(False, "none was given")
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
-            return Verdict(False, f"whether it helps cannot be tested ({choice.where})")
+            return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
         return asked(trial, choice, self.reference)
 
-    def _from_reference(self, verdict: Verdict, problem: ReconProblem, control: RunControl) -> Reconstruction:
+    def _from_reference(self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl) -> Reconstruction:
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
         planned = (1 + len(_ROUNDS)) * _FIRST + _SHARPER * _LAST
@@ -128,7 +128,7 @@ class _State:
         displacement: [axis z, y, x; z, y, x] in mm, from where each voxel takes its value of the reference.
     """
 
-    def __init__(self, reference: Volume, verdict: Verdict) -> None:
+    def __init__(self, reference: Volume, verdict: ReferenceVerdict) -> None:
         self._reference, self._verdict = reference, verdict
         self.moved = self.displacement = np.empty(0, np.float32)
 
