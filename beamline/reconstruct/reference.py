@@ -21,6 +21,7 @@ from beamline.storage.volumes.files import opened_volume, volume_format
 from drivers.base.clock import Clock
 from recon.auto import Auto
 from recon.base.volume import Volume
+from recon.features.reference.particles import require_finite
 from recon.methods import with_settings
 
 
@@ -36,10 +37,16 @@ def with_reference(
     That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again.
 
     Raises:
-        DataError: the file is neither a volume of attenuation nor a scan.
+        DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has
+            the name of the reference's volume.
     """
     if volume_format(path) is None:
         made = options.target.output.with_name(f"{safe_name(path.stem)}_reference.h5")
+        if made == options.target.output:
+            raise DataError(
+                f"The reference {path.name} is a scan, whose volume would be in {made}, which is also the output. "
+                "Name another output. Nothing was computed."
+            )
         if not made.exists():
             said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
             sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
@@ -51,7 +58,11 @@ def with_reference(
         if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
             raise DataError(f"{path} is not a single volume of attenuation; give a volume that recon wrote.")
         data = np.array(record.volume.data[: record.grid.shape[0]], np.float32)
-        volume = Volume(np.nan_to_num(data), record.grid)
+        volume = Volume(data, record.grid)
+    try:
+        require_finite(volume)
+    except ValueError as error:
+        raise DataError(f"{path} is no reference: {error}. The state was not reconstructed.") from None
     return replace(options, method=with_settings(options.method, {"reference": volume}))
 
 

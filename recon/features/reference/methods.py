@@ -17,6 +17,7 @@ from recon.base.volume import Grid, Volume
 from recon.features.reference.choice import ReferenceVerdict, asked, not_moved, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
+from recon.features.reference.particles import require_finite
 from recon.voxels.choice import TrialChoice
 from recon.voxels.iterative import Watch, solve_views
 from recon.voxels.projector import Projector, volume_slices
@@ -57,8 +58,11 @@ class FromReference(Method):
         """The volume with its change, or that of `otherwise`; the settings say which of the two, and why.
 
         Raises:
-            ValueError: the reference is elsewhere, or no method can use these projections.
+            ValueError: the reference is elsewhere or has values that are not finite, or no method can use these
+                projections.
         """
+        if self.reference is not None:
+            require_finite(self.reference)
         decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
         control = replace(control, decide=decide)
 

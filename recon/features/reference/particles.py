@@ -89,6 +89,17 @@ def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
     return label
 
 
+def require_finite(reference: Volume) -> None:
+    """Raises ValueError if a voxel of the reference has no finite value: it would spoil the levels of all particles."""
+    voxels = reference.data
+    wrong = sum(int(np.count_nonzero(~np.isfinite(each))) for each in voxels)
+    if wrong:
+        raise ValueError(
+            f"{wrong} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation in "
+            "1/mm; write 0 where there is no material, and interpolate where there is some"
+        )
+
+
 def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, int, int]]:
     """The reference on the voxels of `grid` and up to `margin` voxels beyond it, as far as it reaches.
 

@@ -92,5 +92,23 @@ def test_what_cannot_be_done_is_refused(options: tuple[str, ...], error: str, fo
     assert not (folder / "refused.h5").exists()
 
 
+def test_a_reference_with_a_voxel_that_is_not_finite_is_refused(folder: Path) -> None:
+    spoilt = folder / "spoilt.h5"
+    spoilt.write_bytes((folder / "good_volume.h5").read_bytes())
+    with h5py.File(spoilt, "r+") as file:
+        file["entry/data/data"][1, 30, 30] = np.nan
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(spoilt), *QUICK, "-o", str(folder / "y.h5"))
+    assert done.exit_code != 0 and "1 of 16384 voxels of the reference are not finite" in done.output
+    assert not (folder / "y.h5").exists()
+
+
+def test_an_output_with_the_name_of_the_volume_of_the_reference_is_refused_at_once(folder: Path) -> None:
+    scan = written(folder / "careful.h5", packed(), 24, 3)
+    out = folder / "careful_reference.h5"
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(scan), *QUICK, "-o", str(out))
+    assert done.exit_code != 0 and "which is also the output" in " ".join(done.output.split())
+    assert not out.exists()
+
+
 def test_help_states_the_option() -> None:
     assert "--reference" in {name for param in command.params for name in param.opts}

@@ -113,3 +113,21 @@ def test_it_stops_when_it_is_asked_to(before: Volume, state: tuple[F32, recon.Ge
                          else None)  # fmt: skip
     made = recon.reconstruct(*state, recon.FromReference(before, AUTO), control=control)
     assert np.isfinite(made.volume.data).all() and made.history[-1].step <= 6
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_reference_with_a_voxel_that_is_not_finite_is_refused(
+    value: float, before: Volume, state: tuple[F32, recon.Geometry]
+) -> None:
+    data = before.data.copy()
+    data[1, 30, 30] = value
+    with pytest.raises(ValueError, match=f"1 of {data.size} voxels of the reference are not finite"):
+        recon.reconstruct(*state, recon.FromReference(Volume(data, before.grid), AUTO))
+
+
+def test_in_a_cone_the_volume_is_that_of_auto(before: Volume, state: tuple[F32, recon.Geometry]) -> None:
+    data, parallel = state
+    cone = recon.Geometry.cone(parallel.angles, parallel.detector_shape, pixel_pitch=1.001, sod=1e5, sdd=1.001e5)
+    made = recon.reconstruct(data, cone, recon.FromReference(before, AUTO))
+    assert made.settings["reference_because"] == "a reference is used only with a parallel beam, and this is a cone"
+    np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, cone, AUTO).volume.data)
