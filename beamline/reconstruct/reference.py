@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Sink, StateEntered
 from beamline.core.quantities import VoxelKind
 from beamline.core.recon_events import VolumeDone
@@ -21,7 +21,6 @@ from beamline.storage.volumes.files import opened_volume, volume_format
 from drivers.base.clock import Clock
 from recon.auto import Auto
 from recon.base.volume import Volume
-from recon.features.reference.particles import require_finite
 from recon.methods import with_settings
 
 
@@ -39,6 +38,7 @@ def with_reference(
     Raises:
         DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has
             the name of the reference's volume.
+        ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
     if volume_format(path) is None:
         made = options.target.output.with_name(f"{safe_name(path.stem)}_reference.h5")
@@ -52,7 +52,13 @@ def with_reference(
             sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
             target, source = OutputPaths(made, None), SourceOptions(path)
             first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
-            reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
+            record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
+            if record.ended_early:  # later calls would use a poor reference
+                made.unlink()
+                raise ScanStopped(
+                    f"The reconstruction of the reference {path.name} was stopped, so its volume {made} was removed. "
+                    "The state was not reconstructed."
+                )
         path = _of_this_scan(made, path)
     with opened_volume(path) as record:
         if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
@@ -60,10 +66,10 @@ def with_reference(
         data = np.array(record.volume.data[: record.grid.shape[0]], np.float32)
         volume = Volume(data, record.grid)
     try:
-        require_finite(volume)
+        method = with_settings(options.method, {"reference": volume})
     except ValueError as error:
         raise DataError(f"{path} is no reference: {error}. The state was not reconstructed.") from None
-    return replace(options, method=with_settings(options.method, {"reference": volume}))
+    return replace(options, method=method)
 
 
 def _of_this_scan(made: Path, scan: Path) -> Path:

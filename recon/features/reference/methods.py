@@ -54,15 +54,17 @@ class FromReference(Method):
     reference: Volume | None = None
     otherwise: Auto = field(default_factory=Auto)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reference is not None:
+            require_finite(self.reference)
+
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The volume with its change, or that of `otherwise`; the settings say which of the two, and why.
 
         Raises:
-            ValueError: the reference is elsewhere or has values that are not finite, or no method can use these
-                projections.
+            ValueError: the reference is elsewhere, or no method can use these projections.
         """
-        if self.reference is not None:
-            require_finite(self.reference)
         decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
         control = replace(control, decide=decide)
 

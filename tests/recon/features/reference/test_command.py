@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from beamline.cli.recon import recon as command
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Sink
+from beamline.projections.selection import Selection
+from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.reference import with_reference
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
+from drivers.base.clock import SystemClock
+from recon.features.reference.methods import FromReference
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
 from tests.recon.features.reference.scene import Discs, N, packed, scanned
@@ -108,6 +118,20 @@ def test_an_output_with_the_name_of_the_volume_of_the_reference_is_refused_at_on
     done = beamline("recon", str(folder / "state.h5"), "--reference", str(scan), *QUICK, "-o", str(out))
     assert done.exit_code != 0 and "which is also the output" in " ".join(done.output.split())
     assert not out.exists()
+
+
+def test_a_reference_whose_reconstruction_was_stopped_is_not_kept(folder: Path, tmp_path: Path) -> None:
+    made = tmp_path / "good_reference.h5"
+
+    def stopped(options: ReconOptions, sink: Sink) -> Any:
+        options.target.output.write_bytes(b"a volume so far")
+        return SimpleNamespace(ended_early=True)
+
+    options = ReconOptions(SourceOptions(folder / "state.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(),
+                           FromReference())  # fmt: skip
+    with pytest.raises(ScanStopped, match=r"good.h5 was stopped, so its volume .* was removed"):
+        with_reference(options, folder / "good.h5", stopped, lambda event: None, SystemClock())
+    assert not made.exists()
 
 
 def test_help_states_the_option() -> None:
