@@ -123,8 +123,8 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With "preview", only the first two candidates are tried. With "best", any gain is enough, no test of a fit
-        ends early, and the last iterations use half voxels."""
+        """With "preview", only the first two candidates are tried. With "best", a costlier method is taken even if
+        it is only slightly better, each test of a fit runs to its end, and the last iterations use half voxels."""
         if quality == "preview":
             return replace(self, candidates=tuple(with_halves(each, False) for each in self.candidates[:2]))
         if quality == "best":

@@ -39,7 +39,7 @@ class Event:
     A field that has its default value is not written to JSON.
 
     Attributes: event: name of the kind of event, as it is written to JSON.
-        time: time in s since the Unix epoch; the announcer of a run sets it.
+        time: time in s since the Unix epoch, set by the `Announcer` that passes the event on.
         source: "recon" if the event comes from the live reconstruction of a scan.
         scan: in a batch, the scan file that the event belongs to.
     """

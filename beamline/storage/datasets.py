@@ -270,7 +270,9 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
             `default` if they state none.
     """
     if lost := missing_links(item):
-        raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
+        raise DataError(
+            f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape than stated."
+        )
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
     if angles is None:

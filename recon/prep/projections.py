@@ -19,11 +19,12 @@ class Projections:
     Attributes:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
-        floored: fraction of the live pixels that were set to -log(floor).
-        air: float32 [view], mean transmission of the air by which each projection was divided; 1 without air columns.
+        floored: fraction of the live pixels whose transmission was below the smallest allowed one, and was set to it.
+        air: float32 [view], mean transmission of the air in each projection, by which it was divided; 1 without air
+            columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0): `air` was not measured.
-        replaced: fraction of the live pixels that were zingers or not finite in one projection; filled from their
+        replaced: fraction of all values of live pixels that were zingers or not finite, and were filled from their
             neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
             masked pixels. None: photons were not counted.

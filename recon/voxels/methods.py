@@ -247,8 +247,8 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Iterations of the tests: those for the weight of total variation, those of a first volume, and the steps with
-        four thresholds."""
+        """Iterations of all tests: to choose the weight of total variation, to make the first volume of PnP-DCT, and to
+        try four thresholds."""
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
@@ -262,7 +262,7 @@ class PnpDct(VoxelMethod):
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections with the best threshold; with `patch_threshold`, if it is given.
+        """The residuals in the held-out projections, with `patch_threshold` or, if it is None, the best threshold.
 
         If the sample is wider than the field of view and simpler methods were tried before, PnP-DCT is not tried, see
         `Trial.wide`.

@@ -273,7 +273,7 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
         if half.shape != data.shape:
             raise ValueError(
                 f"the volume from half of the projections has the shape {half.shape}, not {data.shape}: give --parts "
-                "with the same voxels, or --quick"
+                "with volumes of the same shape as the volume itself, or --quick"
             )
         parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])

@@ -273,7 +273,8 @@ REFUSED = [
     (
         ("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"),
         5,
-        "half of the projections has the shape (4, 12, 12), not (40, 72, 72): give --parts with the same voxels, or",
+        "half of the projections has the shape (4, 12, 12), not (40, 72, 72): give --parts with volumes of the "
+        "same shape as the volume itself, or",
     ),
 ]
 

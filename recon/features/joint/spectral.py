@@ -89,8 +89,8 @@ def fit_materials(
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
         sweeps: number of iterations, each of about nine steps that use all projections equally often.
         go_on: called with (iteration, residual) after each iteration. During the test reconstructions for the weights
-            it is called with (-n, residual), with n the number that may still follow (`TRIAL_SWEEPS` at most). False
-            ends the fit with the volumes so far.
+            the first argument is -n, where n is the number of iterations that may still follow (`TRIAL_SWEEPS` at
+            most). False ends the fit with the volumes so far.
         stop: called many times within an iteration, from the second step on. True ends the fit with the volumes before
             the current step.
     """

@@ -68,8 +68,9 @@ class Phase:
         "--phase",
         _AUTO,
         "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a "
-        "chemical formula, or a name that scenes use. none: no filter. auto: if the outer edges of the "
-        "sample show phase fringes, use the filter length that predicts held-out projections best.",
+        "chemical formula, or a material of the simulator. none: no filter. auto: a filter only if the outer edges "
+        "of the sample show phase fringes; its length, which follows from delta/beta and the distance, is the one "
+        "that predicts held-out projections best.",
         parse=_material,
         metavar="auto|none|paganin:X",
     )
