@@ -22,6 +22,7 @@ from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import VoxelMethod
+from recon.voxels.ordered_fista import Subsets, subsets_of
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.resolution import smoothed
 from recon.voxels.standstill import ENDED, USUAL_SWEEPS, with_quality
@@ -31,7 +32,7 @@ MethodT = TypeVar("MethodT")
 
 COST, USUAL_FURTHER = 3, 30
 """Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
-_FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH = 1 / 3, 1024, 1.1, 0.75
+_FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 1.1, 0.75, 0.1
 _BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 
 
@@ -83,14 +84,22 @@ def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> boo
 
     None: only for a parallel beam with fewer projections than a third of the columns, because a sweep over more of them
     takes long. (With 90 projections of 128 columns total variation would gain 0.3 dB. In a cone, and in a sample wider
-    than the field of view, nothing was gained.) The grid may have up to 1024 columns, because half voxels need four
-    times the memory. Voxels that are narrower than 0.75 pixels are never halved.
+    than the field of view, nothing was gained.) Voxels must be as wide as pixels: with voxels of 0.8 and 1.5 pixels,
+    errors grew by 2 to 11 %. The grid may have up to 1024 columns, because half voxels need four times the memory.
+
+    True: always, unless voxels are narrower than 0.75 pixels.
     """
-    columns, own = grid.shape[2], geometry.detector_shape[1]
-    if wanted is False or grid.voxel_size < _LEAST_WIDTH * geometry.sample_pitch:
+    columns, own, width = grid.shape[2], geometry.detector_shape[1], grid.voxel_size / geometry.sample_pitch
+    if wanted is False or width < _LEAST_WIDTH:
         return False
     few = geometry.n_views < _FEW * own and columns <= min(_MOST_COLUMNS, _WIDEST * own)
-    return wanted is True or (few and not geometry.is_cone)
+    return wanted is True or (few and abs(width - 1) < _AS_WIDE and not geometry.is_cone)
+
+
+def subsets_on_halves(problem: VoxelProblem) -> Subsets:
+    """All projections in each step if steps are damped; otherwise subsets, because steps are then short."""
+    together = Subsets.of(problem, 1)
+    return together if together.is_damped else Subsets.of(problem, subsets_of(problem.projector.geometry))
 
 
 def halved(grid: Grid) -> Grid:

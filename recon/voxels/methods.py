@@ -18,7 +18,7 @@ from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels, in_half_voxels
+from recon.voxels.half_voxels import HalfVoxels, in_half_voxels, subsets_on_halves
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
@@ -99,7 +99,7 @@ class FistaTv(HalfVoxels):
     def in_halves(self, problem: VoxelProblem, x: F32, mu: float) -> F32:
         """The volume x [y, x, z] after further iterations with the weight μ, each with all projections."""
         return ordered_fista(
-            problem, x, mu, Subsets.of(problem, 1), sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
+            problem, x, mu, subsets_on_halves(problem), sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
         )
 
     def with_weight(

@@ -19,7 +19,7 @@ from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels, in_half_voxels
+from recon.voxels.half_voxels import HalfVoxels, in_half_voxels, subsets_on_halves
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
@@ -149,7 +149,7 @@ class Discrete(HalfVoxels):
         """
         pull = MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))
         return ordered_fista(
-            problem, x, mu * materials.tv_share, Subsets.of(problem, 1), sweeps=self.iterations, tv_steps=TV_STEPS,
+            problem, x, mu * materials.tv_share, subsets_on_halves(problem), sweeps=self.iterations, tv_steps=TV_STEPS,
             pull=pull, still=self.still,
         )  # fmt: skip
 

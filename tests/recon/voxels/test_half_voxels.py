@@ -161,3 +161,24 @@ def test_auto_passes_the_preset_to_its_candidates() -> None:
         return {each.half_voxels for each in candidates if isinstance(each, HalfVoxels)}
 
     assert [wanted("preview"), wanted("standard"), wanted("best")] == [{False}, {None}, {True}]
+
+
+def test_columns_without_weight_keep_the_gain_although_steps_are_not_damped() -> None:
+    geometry = geometry_of(20)
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    weights = np.ones_like(views)
+    weights[:, :, [10, 33]] = 0
+    whole, halves = (
+        recon.reconstruct(
+            views, geometry, method=recon.Discrete(half_voxels=wanted), use=recon.DataUse(weights=weights)
+        )
+        for wanted in (False, True)
+    )
+    assert error_of(halves.volume.data) < 0.95 * error_of(whole.volume.data)
+
+
+@pytest.mark.parametrize(("width", "used"), [(1.0, True), (0.8, False), (1.5, False)])
+def test_by_default_only_in_voxels_as_wide_as_pixels(width: float, used: bool) -> None:
+    geometry = geometry_of(12)
+    grid = replace(Grid.matching(geometry), voxel_size=width)
+    assert uses_half_voxels(None, geometry, grid) is used
