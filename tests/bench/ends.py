@@ -4,7 +4,7 @@ python -m tests.bench.ends [--columns 192] [--views 30 45 90 180] [--photons 1e4
 
 It prints a table with a row for each method and number of projections: how many iterations the default made, its PSNR,
 the PSNR after 200 more with the same weights, and the PSNR after some smaller numbers of iterations. Scenes, noise and
-PSNR are those of tests.bench.first_users.
+PSNR are those of tests.bench.first_users. All voxels are as wide as pixels.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import recon
 from recon.auto import method_named
+from recon.voxels.half_voxels import with_halves
 from tests.bench.first_users import Cell, judged, noisy
 from tests.bench.first_users_scenes import scene_of
 
@@ -41,7 +42,7 @@ def longer(method: Any, settings: Mapping[str, Any], iterations: int) -> Any:
 def row(cell: Cell, name: str) -> str:
     scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views, cell.packing)
     views, rows = noisy(cell, scene), range(cell.rows)
-    method = method_named(name)
+    method = with_halves(method_named(name), False)
     begin = time.process_time()
     default = recon.reconstruct(views, scene.geometry, method=method)
     seconds = time.process_time() - begin
