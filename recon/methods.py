@@ -72,8 +72,9 @@ def names() -> tuple[str, ...]:
 
 
 def names_of_one_volume() -> tuple[str, ...]:
-    """Names of the methods that make one volume from all projections; imports no module of this project."""
-    return tuple(name for name, entry in METHODS.items() if not entry.several)
+    """Names of the methods that make one volume from all projections, and from nothing else; imports no module of this
+    project."""
+    return tuple(name for name, entry in METHODS.items() if not (entry.several or entry.reference))
 
 
 def names_compared() -> tuple[str, ...]:

@@ -24,7 +24,7 @@ ANGLES = np.arange(32) * 2 * np.pi / 32
 # Their rays are those of r2 and fista-tv.
 QUICK = "fbp", "cgls"
 CONES = "r2", "fbp", "sirt"  # whose rays of a cone are those of the others
-LIKE_OTHERS = "r2-published", "series"
+LIKE_OTHERS = "r2-published", "series", "from-reference"
 SHORT = {
     "r2": {"steps": 60, "gaussians": 300, "finish": 4},
     "r2-published": {"steps": 60, "gaussians": 300},

@@ -179,7 +179,7 @@ def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
     projector, _, views = parallel_case(n_views=5, noise=0.03)
     matrix = system_matrix(projector.geometry, projector.grid)
     step = 1 / float(svds(matrix, k=1, return_singular_vectors=False, rng=0)[0] ** 2)
-    settings = FistaTv(iterations=150, tv_weight=2e-3, tv_steps=10)
+    settings = FistaTv(iterations=150, tv_weight=2e-3, tv_steps=10, half_voxels=False)
     found = solve(settings, projector, views)
     # The weight is in units that the first sweep fixes; read the same sweep.
     first = solve(OsSirtTv(iterations=1, tv_weight=0.0), projector, views)
