@@ -72,8 +72,12 @@ def names() -> tuple[str, ...]:
 
 
 def names_of_one_volume() -> tuple[str, ...]:
-    """Names of the methods that make one volume from all projections, and from nothing else; imports no module of this
-    project."""
+    """Names of the methods that make one volume from all projections; imports no module of this project."""
+    return tuple(name for name, entry in METHODS.items() if not entry.several)
+
+
+def names_of_trials() -> tuple[str, ...]:
+    """Names of the methods that make one volume from the projections alone, so that a trial can compare them."""
     return tuple(name for name, entry in METHODS.items() if not (entry.several or entry.reference))
 
 

@@ -32,7 +32,7 @@ from beamline.core.text import safe_name
 from beamline.features.trials.sweep_command import sweep
 from beamline.features.trials.view_choices import STUDIES
 from recon.base.choices import Filter
-from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
+from recon.methods import BASELINE, DEFAULT, names_compared, names_of_trials
 
 if TYPE_CHECKING:
     from beamline.features.trials.runner import ComparedScan
@@ -44,8 +44,8 @@ __all__ = ["study", "sweep", "tradeoff"]
 def listed(value: str) -> tuple[str, ...]:
     """Parse names of methods separated by commas. Raises ValueError for an unknown name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    if others := [name for name in wanted if name not in names_of_one_volume()]:
-        raise ValueError(unknown_method(others[0], names_of_one_volume()))
+    if others := [name for name in wanted if name not in names_of_trials()]:
+        raise ValueError(unknown_method(others[0], names_of_trials()))
     return wanted
 
 
@@ -67,8 +67,8 @@ class TradeoffRequest:
         "--methods",
         callback=parsed(listed),
         metavar="A,B,...",
-        help=f"Methods to compare: some of {', '.join(names_of_one_volume())}. "
-        f"Default: all except {', '.join(name for name in names_of_one_volume() if name not in names_compared())}.",
+        help=f"Methods to compare: some of {', '.join(names_of_trials())}. "
+        f"Default: all except {', '.join(name for name in names_of_trials() if name not in names_compared())}.",
     )
     quick: bool = set_by(
         "--quick/--full",
@@ -147,13 +147,13 @@ class StudyRequest:
     methods: tuple[str, ...] = set_by(
         "-m",
         "--method",
-        type=MethodChoice(names_of_one_volume()),
+        type=MethodChoice(names_of_trials()),
         multiple=True,
         default=(DEFAULT, BASELINE),
         show_default=True,
         metavar="NAME",
         help=(
-            f"Method with which every row of the table is reconstructed: {', '.join(names_of_one_volume())}. Can "
+            f"Method with which every row of the table is reconstructed: {', '.join(names_of_trials())}. Can "
             "be given several times."
         ),
     )

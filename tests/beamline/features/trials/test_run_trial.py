@@ -18,7 +18,7 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.volume import Grid, Volume
-from recon.methods import by_name, names_of_one_volume
+from recon.methods import by_name, names_of_trials
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
@@ -93,7 +93,7 @@ def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> N
 
 @pytest.mark.parametrize(
     "method",
-    [name for name in names_of_one_volume() if by_name(name).fitted],
+    [name for name in names_of_trials() if by_name(name).fitted],
 )
 def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
     """On a clock that goes on by a tenth of a second whenever it is asked."""
