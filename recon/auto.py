@@ -14,7 +14,6 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.registry import LibraryError
 from recon.base.setting import NonNegative
-from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
@@ -145,7 +144,7 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     sweeps = max(_sweeps(each) for each in candidates)
     watch = Watch(on_trial=TrialWatch(silent, problem.geometry.n_views, sweeps))
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide, problem.wide)
+    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide)
     return Trial.of(scan, TrialSettings(all_rows, control.now))
 
 
@@ -158,7 +157,7 @@ def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:
     """The problem binned 2 x 2, or not binned if its detector is small; and a text that says which of the two."""
     if min(problem.geometry.detector_shape) < _SMALLEST:
         return problem, "all rows"
-    views = Views(problem.views.masked().data, problem.geometry).binned(2)
+    views = replace(problem.views.masked(), weights=None).binned(2)
     return replace(problem, views=views, grid=Grid.matching(views.geometry)), "all rows, binned 2 x 2"
 
 

@@ -181,7 +181,7 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
             refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(progress),
-            decide=decide, wide=problem.wide,
+            decide=decide,
         )  # fmt: skip
         if stopped:
             return None

@@ -29,8 +29,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, accepting
 from recon.prep.counts import Counts, line_integrals
-from recon.voxels.beyond_field import run_on_extended_grid
-from recon.voxels.field_edges import FieldEdges
+from recon.voxels.beyond_field import reach_of, run_on_extended_grid
 from recon.voxels.view_weights import covers_the_circle, density_errors, unseen_wedges
 
 if TYPE_CHECKING:
@@ -40,8 +39,8 @@ _LOOKED_AT, _LARGEST = 2**16, 1e15  # values in the sample; largest line integra
 
 
 def reconstruct(
-    projections: ArrayLike | Tensor | Counts,
-    geometry: Geometry,
+    projections: ArrayLike | Tensor | Counts | Views,
+    geometry: Geometry | None = None,
     method: str | Method = DEFAULT,
     *,
     grid: Grid | None = None,
@@ -56,7 +55,9 @@ def reconstruct(
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
         masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
         `Counts` instead. The method then gets line integrals, with weights that represent the likelihood of the counts
-        (`recon.prep.counts.line_integrals`). These weights are multiplied by `use.weights`.
+        (`recon.prep.counts.line_integrals`). These weights are multiplied by `use.weights`. `Views` contain their
+        geometry, their weights and the reach of the sample, which then is not measured again.
+        geometry: geometry of the projections; None for `Views`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
@@ -68,9 +69,9 @@ def reconstruct(
         control: how to follow, stop and resume the reconstruction.
 
     Raises:
-        ValueError: the method is unknown, shapes do not match, all projections are from one side, the axis is outside
-        the detector, the projections show no material, the seed is negative, or the method cannot use the projections,
-        the held-out projections, the device or the checkpoint.
+        ValueError: the method is unknown, something that `Views` contain is given twice, shapes do not match, all
+        projections are from one side, the axis is outside the detector, the projections show no material, the seed is
+        negative, or the method cannot use the projections, the held-out projections, the device or the checkpoint.
 
     Warns:
         UserWarning: values with a weight are not finite, angles look like degrees, the projections look like counts,
@@ -82,23 +83,20 @@ def reconstruct(
     chosen = method_named(method) if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
-    _refuse_geometry(geometry)
-    if isinstance(projections, Counts):
-        projections, use = _of_counts(projections, geometry, use)
-        data = _line_integrals(projections, geometry)
-    else:
-        data = _line_integrals(projections, geometry)
+    views = _views(projections, geometry, use)
+    data, geometry = views.data, views.geometry
+    if not isinstance(projections, Counts):
         warn_of_other_quantity(data)
-        _warn_of_unknown(data, use.weights)
+        _warn_of_unknown(data, views.weights)
     if not chosen.allow_negative:  # a method with that setting can make such voxels
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
     _warn_of_missing_wedge(chosen, geometry)
-    _warn_of_half_acquisition(data, geometry)
+    views = replace(views, reach=reach_of(views))
+    _warn_of_half_acquisition(views)
     begin = control.now()
-    grid = grid or Grid.matching(geometry)
-    problem = ReconProblem(Views(data, geometry, use.weights), grid, use, int(seed), device)
+    problem = ReconProblem(views, grid or Grid.matching(geometry), use, int(seed), device)
     result = run_on_extended_grid(chosen, problem, control)
     by, seconds = result.method or chosen.name, result.seconds or control.now() - begin
     return replace(result, settings=dict(result.settings), method=by, seconds=seconds)
@@ -158,12 +156,13 @@ def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
     )
 
 
-def _warn_of_half_acquisition(data: NDArray[np.float32], geometry: Geometry) -> None:
+def _warn_of_half_acquisition(views: Views) -> None:
     """Warn if a sample reaches beyond the edge near the axis, and no full circle shows what is beyond that edge."""
+    geometry = views.geometry
     if not geometry.is_off_middle or covers_the_circle(geometry.angles):
         return
     left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
-    if ("left" if left < right else "right") in FieldEdges.of(data, geometry).beyond():
+    if ("left" if left < right else "right") in reach_of(views).beyond:
         warnings.warn(
             "take projections over 360 degrees without a gap, or distrust the densities: the sample reaches beyond the "
             f"edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only a full "
@@ -204,14 +203,24 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         )
 
 
-def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
-    """Line integrals of the counts, and their weights multiplied by the given weights."""
-    require_views(geometry, counts.counts, "counts")
+def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry | None, use: DataUse) -> Views:
+    """Line integrals with their weights and their geometry, as far as it can be used."""
+    if isinstance(projections, Views):
+        given = {"geometry": geometry, "use.weights": use.weights, "use.sample_radius": use.sample_radius}
+        if twice := [name for name, value in given.items() if value is not None]:
+            raise ValueError(f"leave out {' and '.join(twice)}, because the projections are given as Views")
+        _refuse_geometry(projections.geometry)
+        return replace(projections, data=_line_integrals(projections.data, projections.geometry))
+    if geometry is None:
+        raise ValueError("give the geometry of the projections; only Views contain it")
+    _refuse_geometry(geometry)
+    if not isinstance(projections, Counts):
+        return Views(_line_integrals(projections, geometry), geometry, use.weights)
+    require_views(geometry, projections.counts, "counts")
     if use.weights is not None:
         require_views(geometry, use.weights, "weights")
-    data, weights = line_integrals(counts)
-    weights = weights if use.weights is None else weights * use.weights
-    return data, replace(use, weights=weights)
+    data, weights = line_integrals(projections)
+    return Views(_line_integrals(data, geometry), geometry, weights if use.weights is None else weights * use.weights)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

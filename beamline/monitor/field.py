@@ -22,8 +22,8 @@ from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
 from recon.base.noise import deviation_between_neighbours
+from recon.base.reach import LEAST
 from recon.base.setting import setting
-from recon.voxels.field_edges import LEAST
 
 LASTS = 5  # projections in a row with sample at an edge
 NO_BEAM = 3.0  # times the noise; a flat whose bright part is below this has no beam (noise alone gives 1.3)

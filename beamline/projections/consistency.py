@@ -29,7 +29,7 @@ from recon.prep.moments import ViewMoments, moments_of
 from recon.prep.projections import Projections
 from recon.prep.repeats import changes_seen
 from recon.prep.tilt import roll_of_mean_view
-from recon.voxels.field_edges import FieldEdges
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.view_weights import circle_weights, covers_the_circle
 
 _VIEWS = 180  # projections used for the moments; more do not make them more accurate, they only take time to read
@@ -126,7 +126,7 @@ def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[Consis
     """The conditions that apply to this scan; `whole`: the data contain all detector rows."""
     geometry, data = prepared.geometry, prepared.projections.data
     some = spread(np.arange(len(data)), _VIEWS)
-    edges, frames = FieldEdges.of(data, geometry), prepared.projections.view_ids
+    edges, frames = reach_of(prepared.views).edges, prepared.projections.view_ids
     wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
     conditions = list[ConsistencyCondition]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):

@@ -42,6 +42,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.projections import Projections
+from recon.voxels.beyond_field import reach_of, whole_reach
 from recon.voxels.projector import seen_rays
 
 _HELD_OUT_VIEWS = 16
@@ -115,7 +116,7 @@ def prepare_projections(
     prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, plan, view_geometry, others, warn)
     prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
-    prepared = _after_scan_steps(scan, prepared, phases)
+    prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
@@ -293,11 +294,18 @@ def assemble(
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
-        sample_radius=None if selection.sample_width is None else selection.sample_width / 2,
     )
+    prepared = with_reach(scan, prepared)
     report_defects(prepared, first, binning, warn)
     warn_of_the_field(scan, prepared.centred, warn)
     return prepared
+
+
+def with_reach(scan: SelectedScan, prepared: PreparedProjections) -> PreparedProjections:
+    """The projections with the reach of the sample that they show; its radius is known only if the user gave it."""
+    width = scan.selection.sample_width
+    views = Views(prepared.projections.data, prepared.geometry, prepared.shares)
+    return replace(prepared, reach=reach_of(views) if width is None else whole_reach(views, width / 2))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

@@ -15,7 +15,7 @@ from beamline.storage.flag_legend import FrameFlags
 from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.method import SampleRadius
+from recon.base.reach import Reach
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
@@ -49,9 +49,8 @@ class PreparedProjections:
             disk; None: use `shares`.
         times: [view] time of the exposure of each projection in s; None: the method does not need it.
         laws: the residuals of the consistency conditions, in words, by name.
-        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or
-            measured.
-        inside: True if the contribution of the sample outside the volume was subtracted from the projections.
+        reach: how far the sample goes beyond the field of view, as these projections show it; lengths are in the
+            geometry's unit.
         stretch: height of a pixel divided by its width. `geometry` has square pixels; slices are this much farther
             apart.
     """
@@ -73,8 +72,7 @@ class PreparedProjections:
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
     held_out_ids: NDArray[np.int64] | None = None
     times: NDArray[np.float64] | None = None
-    sample_radius: float | SampleRadius | None = None
-    inside: bool = False
+    reach: Reach | None = None
     stretch: float = 1.0
     laws: Mapping[str, str] = field(default_factory=dict)
 
@@ -87,15 +85,10 @@ class PreparedProjections:
         return Volume(volume.data, high)
 
     @property
-    def is_wide(self) -> bool:
-        """True if the sample was measured, and is wider than the field of view."""
-        return isinstance(self.sample_radius, SampleRadius)
-
-    @property
     def box(self) -> Grid:
-        """The box of the field of view, or as wide as the sample was measured to be."""
-        grid, sample = Grid.matching(self.geometry), self.sample_radius
-        return grid.reaching(sample.radius, self.geometry) if isinstance(sample, SampleRadius) else grid
+        """The box of the field of view, or one that contains all of the sample, as far as its reach was measured."""
+        grid = Grid.matching(self.geometry)
+        return grid if self.reach is None else self.reach.box(grid, self.geometry)
 
     @property
     def on_disk(self) -> bool:
@@ -187,7 +180,7 @@ class PreparedProjections:
     def views(self) -> Views:
         """The projections used, with weights that are computed on request."""
         weights: Any = self.ray_factors()
-        return Views(self.projections.data, self.geometry, weights)
+        return Views(self.projections.data, self.geometry, weights, self.reach)
 
     @property
     def views_held_out(self) -> Views | None:

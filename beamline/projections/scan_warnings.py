@@ -20,8 +20,8 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection, SelectedScan
 from beamline.storage.rules.light import without_air
 from recon.base.masks import areas
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.direct import has_direct_method
-from recon.voxels.field_edges import FieldEdges
 
 _LEAST_MAGNIFICATION = 1.02
 _SAME_AXIS = 0.05  # columns
@@ -62,7 +62,7 @@ def warn_of_the_field(scan: SelectedScan, prepared: PreparedProjections, warn: W
     the ring current.
     """
     projections, geometry = prepared.projections, prepared.geometry
-    edges = FieldEdges.of(projections.data, geometry, prepared.shares)
+    edges = reach_of(prepared.views).edges
     unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""

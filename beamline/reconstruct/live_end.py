@@ -10,7 +10,7 @@ from beamline.core.events import StateEntered
 from beamline.core.text import count, frames_text
 from beamline.projections.consistency import compare_with_flats
 from beamline.projections.growing import outdated
-from beamline.projections.prepare import assemble
+from beamline.projections.prepare import assemble, with_reach
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PlaceStep, ScanStep
 from beamline.projections.registry import in_order
@@ -74,7 +74,7 @@ def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableVi
             if done[step.name].sentence:
                 live.tell_done({step.name: done[step.name]})
                 state.fit.replace_views(prepared.centred.projections.measured)
-    return replace(prepared, done=done)
+    return with_reach(scan, replace(prepared, done=done))
 
 
 def final_fit(

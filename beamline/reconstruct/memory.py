@@ -20,6 +20,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import Method
+from recon.base.reach import Reach
 from recon.base.registry import add_on_missing, plugins
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
@@ -44,8 +45,8 @@ class ReconMemory:
         steps: memory of the correction steps.
         largest_step: name of the step that needs the most memory alone.
         bars: True if error bars are computed, too.
-        radius: radius of a sample wider than the field of view in mm; None: the sample is inside.
-        taller: True if the sample extends above or below the field of view of a cone beam.
+        reach: how far the sample goes beyond the field of view, for a method that reconstructs all of it; None: it is
+            within the field of view.
         weights: memory of the ray weights that stay in memory together with the line integrals.
     """
 
@@ -56,8 +57,7 @@ class ReconMemory:
     steps: StepMemory = _NO_STEPS
     largest_step: str = ""
     bars: bool = False
-    radius: float | None = None
-    taller: bool = False
+    reach: Reach | None = None
     weights: int = 0
 
     @property
@@ -138,8 +138,7 @@ class ReconMemory:
 
     def _grid(self, rows: int) -> Grid:
         grid = Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
-        grid = grid if self.radius is None else grid.reaching(self.radius, self.geometry)
-        return grid.as_tall_as_rays(self.geometry) if self.taller else grid
+        return grid if self.reach is None else self.reach.box(grid, self.geometry)
 
 
 def recon_memory_of(scan: SelectedScan, options: ReconOptions) -> ReconMemory:

@@ -46,13 +46,11 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.method import SampleRadius
 from recon.base.slabs import Slab, slabs_of
 from recon.base.views import parse_views
 from recon.base.volume import Grid
 from recon.splatting.backend import backend_for
-from recon.voxels.beyond_field import sample_radius
-from recon.voxels.field_edges import taller_than_field
+from recon.voxels.beyond_field import whole_reach
 
 _BATCH = 0.25  # fraction of the memory for projections during correction
 
@@ -121,14 +119,13 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     geometry = prepared.geometry
     method, shares = options.method, prepared.shares
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
-    weighted, sample = differ if method.weighs else shares is not None, prepared.sample_radius
+    weighted, reach = differ if method.weighs else shares is not None, prepared.reach
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
-        radius=sample.radius if isinstance(sample, SampleRadius) else None,
-        taller=method.knows_outside and taller_than_field(prepared.projections.data, geometry),
+        reach=reach if method.knows_outside else None,
         weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
-    more = "The sample extends beyond the field of view" if needs.radius is not None or needs.taller else ""
+    more = "The sample extends beyond the field of view" if needs.reach is not None and needs.reach.is_outside else ""
     more = more or "Some pixels have no data, so each ray needs a weight" * bool(needs.weights)
     if geometry.is_cone and more and needs.at_once > plan.allowed:
         raise DataError(
@@ -251,8 +248,7 @@ def prepare_within(
     if "times" in options.method.takes:
         prepared = replace(prepared, times=times_of(scan.source, prepared.projections.view_ids, warn))
     if options.method.knows_outside:
-        radius = sample_radius(prepared.views, prepared.sample_radius) or 0.0  # it is not searched again
-        prepared = replace(prepared, sample_radius=radius)
+        prepared = replace(prepared, reach=whole_reach(prepared.views))
     return prepared, of_views(scan.source, options, plan, prepared)
 
 

@@ -18,7 +18,7 @@ from beamline.projections.selection import SelectedScan, Selection
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.field_edges import FieldEdges
+from recon.voxels.beyond_field import reach_of
 
 Span = tuple[int, int]
 
@@ -203,7 +203,7 @@ def box_around_sample(scan: SelectedScan) -> Region:
     grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
-    if cut := FieldEdges.of(data, geometry).beyond():
+    if cut := reach_of(prepared.views).beyond:
         where = " and the ".join(cut)
         return _uncut(
             height, across, f"the sample extends beyond the field of view at the {where}, so it has no edge there"

@@ -49,18 +49,18 @@ def run_on(
     Raises:
         ValueError: the method cannot use these projections.
     """
-    data, geometry, use = views_for(method, prepared)
-    return reconstruct(data, geometry, method, grid=grid, seed=seed, device=device, use=use, control=control)
+    views, use = views_for(method, prepared)
+    return reconstruct(views, method=method, grid=grid, seed=seed, device=device, use=use, control=control)
 
 
-def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geometry, DataUse]:
-    """Line integrals [view, row, col], geometry, and use of the projections, in the form that the method expects."""
+def views_for(method: Method, prepared: PreparedProjections) -> tuple[Views, DataUse]:
+    """The projections, and how they are used, in the form that the method expects."""
     prepared = prepared.wanted(method.views_wanted(prepared.geometry))
     data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
     if "held_out" in method.takes:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     weights, times = _weights(method, prepared, len(held_out)), prepared.times if "times" in method.takes else None
-    return data, geometry, DataUse(weights, held_out, times, prepared.sample_radius)
+    return Views(data, geometry, weights, prepared.reach), DataUse(held_out=held_out, times=times)
 
 
 def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -> F32 | None:
@@ -79,7 +79,9 @@ def without_outside(prepared: PreparedProjections, result: Reconstruction) -> Pr
         prepared.projections.data[some] -= result.outside(prepared.geometry.select(some))
     if (held := prepared.held_out) is not None:
         held = replace(held, data=held.data - result.outside(held.geometry))
-    return replace(prepared, held_out=held, inside=True)
+    assert prepared.reach is not None
+    within = replace(prepared.reach, sample=None, tall=False, measured=True)
+    return replace(prepared, held_out=held, reach=within)
 
 
 _AT_ONCE = 32  # projections that are computed together

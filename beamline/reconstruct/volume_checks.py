@@ -15,13 +15,14 @@ from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.scan_facts import ReportContext, label_of
 from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
-from recon.base.method import SAMPLE, Reconstruction, SampleRadius
+from recon.base.method import Reconstruction
+from recon.base.reach import SAMPLE, SampleRadius
 from recon.base.volume import Grid, Volume
 from recon.judgement import Aspect, Judgement, TimeLeft, contrast, judge
 from recon.methods import BASELINE, by_name
 from recon.splatting.gaussians import NEEDLES_LIMIT, needles
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.field_edges import FieldEdges
 from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, lost_matter
 from recon.voxels.odd_views import LIMIT, OddView
 from recon.voxels.view_weights import density_gain
@@ -122,9 +123,9 @@ def _aspects(result: Reconstruction, prepared: PreparedProjections, context: Rep
     if context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
-        show_more = SAMPLE in result.settings and not prepared.inside
+        show_more = prepared.reach is not None and prepared.reach.sample is not None
     else:
-        show_more = bool(FieldEdges.of(prepared.projections.data, geometry).beyond())
+        show_more = bool(reach_of(prepared.views).beyond)
     if show_more:
         return Aspect.STRAY
     return Aspect.STRAY | Aspect.RESIDUAL | (Aspect.FIT if fitted else Aspect(0))

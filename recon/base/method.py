@@ -10,7 +10,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 from zipfile import is_zipfile
@@ -25,6 +25,7 @@ from recon.base.declared_types import Checked, types_of
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 from recon.base.json_values import plain
+from recon.base.reach import SampleRadius
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 if TYPE_CHECKING:
@@ -68,33 +69,6 @@ SWEEPS_OF_TRIALS = "sweeps of trials"
 
 The planned number is the usual one. A search continues as long as necessary, and few scans take the largest number.
 """
-
-
-SAMPLE = "sample_radius"
-"""Name of the decision on the sample radius, and prefix of its settings."""
-
-
-@dataclass(frozen=True)
-class SampleRadius:
-    """Distance from the rotation axis to the edge of a sample that is wider than the field of view.
-
-    Attributes:
-        radius: mm; the radius that predicts held-out projections best, or the given one. It is half the width of a
-            square box. For a round sample it is between the true radius and 0.886 of it (a square of equal area).
-        low, high: mm, range of radii that predict held-out projections equally well within chance, plus a step of the
-            search.
-        density: relative uncertainty of the density in the middle: half of its change from `low` to `high`.
-    """
-
-    radius: float
-    low: float
-    high: float
-    density: float
-
-    @property
-    def settings(self) -> dict[str, float]:
-        """The values in the form of settings of a result."""
-        return {SAMPLE if name == "radius" else f"{SAMPLE}_{name}": value for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +153,6 @@ class ReconProblem:
     Attributes:
         views: line integrals with the weights of their rays.
         use: how the projections are used; its weights are those of `views`.
-        wide: True if the grid contains a sample that is wider than the field of view.
     """
 
     views: Views
@@ -187,7 +160,6 @@ class ReconProblem:
     use: DataUse = DataUse()
     seed: int = 0
     device: str = "cpu"
-    wide: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "use", replace(self.use, weights=self.views.weights))
@@ -200,6 +172,11 @@ class ReconProblem:
     @property
     def geometry(self) -> Geometry:
         return self.views.geometry
+
+    @property
+    def wide(self) -> bool:
+        """True if the sample is known to be wider than the field of view."""
+        return self.views.reach is not None and self.views.reach.sample is not None
 
 
 @dataclass(frozen=True)

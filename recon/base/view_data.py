@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, Mask, bin_views
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
+from recon.base.reach import Reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,22 +21,24 @@ class Views:
         data: float32 [view, row, col]; values that are not finite are allowed.
         geometry: geometry of these projections.
         weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere.
+        reach: how far the sample goes beyond the field of view of the scan; None: not measured.
     """
 
     data: F32
     geometry: Geometry
     weights: F32 | None = None
+    reach: Reach | None = None
 
     def select(self, chosen: NDArray[np.integer]) -> Views:
         """Only the chosen projections, in this order."""
         weights = None if self.weights is None else self.weights[chosen]
-        return Views(self.data[chosen], self.geometry.select(chosen), weights)
+        return Views(self.data[chosen], self.geometry.select(chosen), weights, self.reach)
 
     def rows(self, rows: slice) -> Views:
         """Only these detector rows of all projections, see `Geometry.rows`."""
         weights = None if self.weights is None else np.ascontiguousarray(self.weights[:, rows])
         data = np.ascontiguousarray(self.data[:, rows])
-        return Views(data, self.geometry.rows(rows.start, rows.stop), weights)
+        return Views(data, self.geometry.rows(rows.start, rows.stop), weights, self.reach)
 
     def masked(self) -> Views:
         """The projections with all values finite; values that were not finite get weight 0, see `masks.masked`.
@@ -63,9 +66,9 @@ class Views:
             return self
         views = geometry or self.geometry.binned(factor)
         if self.weights is None:
-            return Views(bin_views(self.data, factor), views)
+            return Views(bin_views(self.data, factor), views, None, self.reach)
         sums, known = bin_views(self.weights * self.data, factor), bin_views(self.weights, factor)
-        return Views(np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), views, known)
+        return Views(np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), views, known, self.reach)
 
     def split(self, one_in: int = ONE_IN) -> tuple[Views, Views]:
         """The projections to reconstruct from, and one in `one_in` held out, see `split_views`."""

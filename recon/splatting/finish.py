@@ -174,7 +174,6 @@ def finish(
     refined = solve_views(
         method, projector, prepared, start=start, nonnegative=nonnegative,
         watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
-        wide=problem.wide,
     )  # fmt: skip
     return Finished(refined, min(count, made))
 

@@ -22,8 +22,8 @@ from recon.kernels.cpu.slopes import slopes_at, windowed
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.direct import Fbp, has_direct_method
-from recon.voxels.field_edges import wider_than_field
 from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import volume_lines
 from recon.voxels.voxel_problem import density_unit, difference_weights
@@ -83,8 +83,7 @@ def _count_of(field: Grid, cone: bool) -> float:
 
 def place(
     volume: Volume,
-    projections: NDArray[np.float32],
-    geometry: Geometry,
+    views: Views,
     count: int | None,
     rng: np.random.Generator,
     *,
@@ -92,7 +91,7 @@ def place(
     rays: RayModel | None = None,
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
-    """The starting point of a fit: Gaussians sampled from a first volume, scaled to the data [view, row, col].
+    """The starting point of a fit: Gaussians sampled from a first volume, scaled to the projections.
 
     Args:
         volume: see `first_volume`. Its box must contain everything that the projections see (`Grid.for_fit`), because a
@@ -104,14 +103,15 @@ def place(
     Raises:
         ValueError: the count is below 1, or the data contain no material or are not line integrals.
     """
+    geometry = views.geometry
     wanted = default_count(geometry, volume.grid.voxel_size) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a fit needs at least one Gaussian, got {wanted}")
-    radius = math.inf if wider_than_field(projections, geometry) else geometry.reach
+    radius = math.inf if reach_of(views).edges.beyond(0.0) else geometry.reach
     if start == "published":
         return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
-    return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
+    return scale_to_data(placed, without_wild_pixels(views.data), geometry, rays=rays)
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:

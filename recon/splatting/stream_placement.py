@@ -19,7 +19,7 @@ from recon.splatting.anytime import averaged, is_held_out
 from recon.splatting.initialise import default_count, first_volume, place, sample_gaussians, scale_to_data
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import FitSettings
-from recon.voxels.beyond_field import sample_radius
+from recon.voxels.beyond_field import whole_reach
 
 # largest number of voxels, so that a placement takes about a second; new projections wait meanwhile
 _PLACED_FROM = 2**22
@@ -122,8 +122,9 @@ def place_gaussians(
     """
     all_of = Views(np.stack(images), views.geometry).masked()
     learnt = [view for view in range(views.n) if all_views or not views.held_out[view]]
-    geometry, seen = all_of.geometry.select(learnt), all_of.data[learnt]
-    wider = sample_radius(all_of)
+    reach = whole_reach(all_of)
+    wider, used = reach.sample, replace(all_of, reach=reach).select(np.array(learnt))
+    geometry, seen = used.geometry, used.data
     box = plan.grid if wider is None else plan.grid.reaching(wider.radius, views.template)
     fitted = Grid.for_fit(views.template, box, wider=wider is not None)
     coarser = 2 ** max(0, math.ceil(math.log2(math.prod(fitted.shape) / _PLACED_FROM) / 3))
@@ -134,7 +135,7 @@ def place_gaussians(
     kernel = plan.settings.kernel
     if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
         volume = first_volume(seen, geometry, rough)
-        gaussians = place(volume, seen, geometry, count, rng, kernel=kernel)
+        gaussians = place(volume, used, count, rng, kernel=kernel)
     else:
         model, problem = averaged(known.state), known.problem
         rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))

@@ -242,7 +242,7 @@ def _started(
         if not isinstance(start, Gaussians):
             first = first_volume(views.seen.data, views.seen.geometry, views.field, method.start, problem.device)
             start = place(
-                first, views.seen.data, views.seen.geometry, views.count, np.random.default_rng(problem.seed),
+                first, views.seen, views.count, np.random.default_rng(problem.seed),
                 start=method.start, rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
             first = first if method.start == "fbp" else None

@@ -1,4 +1,5 @@
-"""Samples wider than the field of view: measures how far they reach, and reconstructs a box that contains all of them.
+"""Samples beyond the field of view: measures how far they reach (the only place that does), and reconstructs a box
+that contains all of them.
 
 Each projection also contains material outside the field of view. A box of the field alone would put this material at
 its rim and make the middle too dense. So voxels or Gaussians cover the whole sample, and only the part in the field of
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +21,19 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
+from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
+from recon.base.reach import SAMPLE, Reach, SampleRadius
 from recon.base.view_data import Views
-from recon.base.views import spread_views
+from recon.base.views import spread, spread_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import predicts_as_well
 from recon.voxels.field_edges import (
     busiest_rows,
+    edges_of,
+    ends_in_matter,
     middle_of_cone,
     sample_reach,
     slab_of,
-    taller_than_field,
-    wider_than_field,
 )
 from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods import EarlyTv
@@ -41,6 +43,7 @@ from recon.voxels.residuals import residuals_of
 # test reconstruction: columns and rows after binning, projections, iterations
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16
 _LOOKS = 8  # number of projections from which rows are chosen
+_ROWS_FROM = 32  # projections whose mean shows the rows that end in material
 # ratios between radii in the first and in the second search; largest radius / field of view
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5
 
@@ -56,26 +59,22 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
     Raises:
         ValueError: as for `Method.run`.
     """
-    decide = control.decide or Decisions(problem.seed)
     if not method.knows_outside:
         return method.run(problem, control)
-
-    data, views, grid = problem.projections, problem.geometry, problem.grid
-
-    def measured() -> list[float]:
-        sample = sample_radius(problem.views, problem.use.sample_radius)
-        return [] if sample is None else list(asdict(sample).values())
-
-    sample = SampleRadius(*values) if (values := decide(SAMPLE, measured)) else None
-    box = grid if sample is None else grid.reaching(sample.radius, views)
-    box = box.as_tall_as_rays(views) if decide("taller", lambda: taller_than_field(data, views)) else box
+    decide, grid = control.decide or Decisions(problem.seed), problem.grid
+    known = whole_reach(problem.views, problem.use.sample_radius)
+    values = decide(SAMPLE, lambda: [] if known.sample is None else list(astuple(known.sample)))
+    tall = bool(decide("taller", lambda: known.tall))
+    reach = replace(known, sample=SampleRadius(*values) if values else None, tall=tall)
+    problem, box = replace(problem, views=replace(problem.views, reach=reach)), reach.box(grid, problem.geometry)
     if box == grid:
         return method.run(problem, control)
-    result = method.run(replace(problem, grid=box, wide=sample is not None), control)
+    result = method.run(replace(problem, grid=box), control)
     before = np.rint(np.subtract(grid.first, box.first) / grid.spacing).astype(int)
     field = tuple(slice(first, first + n) for first, n in zip(before, grid.shape, strict=True))
     whole = result.volume.data
-    volume, radius = Volume(np.ascontiguousarray(whole[field]), grid), {} if sample is None else sample.settings
+    radius = {} if reach.sample is None else reach.sample.settings
+    volume = Volume(np.ascontiguousarray(whole[field]), grid)
     if result.change is not None and result.displacement is not None:
         change = Volume(np.ascontiguousarray(result.change.data[field]), grid)
         result = replace(result, change=change, displacement=result.displacement[(slice(None), *field)])
@@ -96,8 +95,45 @@ class _Outside:
         return Projector(views, self.box).forward(matter)
 
 
-def sample_radius(views: Views, given: float | SampleRadius | None = None) -> SampleRadius | None:
-    """How far the sample reaches; None: it is within the field of view. Below 16 projections, the end assumed by FBP.
+def reach_of(views: Views) -> Reach:
+    """How far the sample reaches, as the projections state it; if they do not, it is measured, without the radius."""
+    return views.reach or Reach(edges_of(views), _is_tall(views))
+
+
+def whole_reach(views: Views, given: float | SampleRadius | None = None) -> Reach:
+    """`reach_of` with the radius of the sample, which is measured unless the projections state it.
+
+    Args:
+        given: the radius in mm if it is known.
+
+    Raises:
+        ValueError: the given radius is not a length.
+    """
+    reach = reach_of(views)
+    if reach.measured and given is None:
+        return reach
+    sample = _radius_of(views) if given is None else _given_radius(given, views.geometry.reach)
+    return replace(reach, sample=sample, measured=True)
+
+
+def _is_tall(views: Views) -> bool:
+    """Whether the sample continues above or below the slices of a cone, where the rays of its rows also cross it.
+
+    Values that are not finite do not count.
+    """
+    geometry, data = views.geometry, views.data
+    if not geometry.is_cone or not len(data) or geometry.is_fan:
+        return False
+    if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows in most projections
+        at = geometry.offsets[:, 1]
+        lowest, highest = np.nan_to_num(data[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
+        return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
+    rows = np.nan_to_num(data[spread(np.arange(len(data)), _ROWS_FROM)], posinf=0, neginf=0).mean(axis=(0, 2))
+    return bool(ends_in_matter(rows[None]).any())
+
+
+def _radius_of(views: Views) -> SampleRadius | None:
+    """The radius of the sample; None: it is within the field of view. Below 16 projections, the end assumed by FBP.
 
     FISTA-TV with a small weight reconstructs some binned rows from seven of every eight projections, in wider and wider
     boxes. Each box is judged by the held-out projections. If a box is too small, the outside material ends up in wrong
@@ -107,19 +143,14 @@ def sample_radius(views: Views, given: float | SampleRadius | None = None) -> Sa
 
     Args:
         views: only some rows of some projections are read; rays of weight 0 do not count.
-        given: the radius in mm if it is known.
     """
     geometry = views.geometry
     own, reach = geometry.is_centred, geometry.reach
-    if given is not None:
-        return _given_radius(given, reach)
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
-    if (measured := _some_rows(views, some)) is None:
+    if (measured := _some_rows(views, some)) is None or not edges_of(measured).beyond(0.0):
         return None
     ordinary = measured.select(np.flatnonzero(measured.geometry.is_centred))
-    if not wider_than_field(ordinary.data, ordinary.geometry):
-        return None
     if ordinary.geometry.n_views < LEAST_VIEWS:
         ends = sample_reach(ordinary.data.mean(axis=0), geometry.axis_col) * geometry.sample_pitch
         return SampleRadius(float(np.clip(np.median(ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
@@ -135,7 +166,7 @@ def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None
 
     Args:
         geometry: the geometry of the projections.
-        sample: result of `sample_radius`; None: the sample is within the field of view.
+        sample: its radius; None: the sample is within the field of view.
     """
     return 0.0 if sample is None else (sample.density * _middle_density(volume, geometry.reach)) ** 2
 

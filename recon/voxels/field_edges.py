@@ -1,26 +1,23 @@
-"""Field edges: whether a sample continues beyond the edges of the field of view; the only place that decides this."""
+"""Field edges: the line integrals at the edges of the field of view, and the rows and columns that show material."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, F64, I64
-from recon.base.empirical import EMPTY, ENOUGH_MATTER
+from recon.base.arrays import F32, F64
+from recon.base.empirical import ENOUGH_MATTER
 from recon.base.geometry import Geometry
+from recon.base.reach import FieldEdges
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.voxels.view_weights import covers_the_circle
 
-LEAST = 0.1
-"""Line integral at an edge above which there is material; phase fringes, scatter and a drift of air are lower."""
-
 _VIEWS, _ROWS, _PARTS = 32, 128, 4  # approximate numbers of projections and rows examined; parts of the scan
-_FEWEST = 2  # fewest of these projections in which material leaves the field of view
 _FULL = 0.5  # share of the fullest row's mass that a row needs
 
 CUT_SHARE, CUT_LEAST = 0.1, 0.02  # share of the value in the middle, and line integral; lower values at an edge are air
@@ -66,108 +63,46 @@ def sample_reach(mean: F32, axis: float) -> F64:
     return np.asarray(np.sqrt(squared_distance[outer].mean() + level / np.maximum(fall, 1e-30)))
 
 
-@dataclass(frozen=True)
-class FieldEdges:
-    """Line integrals at the left and right edge of the projections, which show whether the sample exceeds the field.
+def edges_of(views: Views) -> FieldEdges:
+    """Edge levels of up to 32 projections, without laterally offset ones, in the rows that show material.
 
-    Attributes:
-        levels: line integral at each edge ("left", "right") that should show air: the smallest of the quarters of a
-            scan.
-        mean: mean of the projections.
-        of_views: line integral at these edges [view] in the examined projections `views`.
-        continued: True if a row ends in material at this edge, so that FBP and FDK extrapolate it.
+    Levels are medians over projections and rows, so that corners of a sample at some angles do not count. The smallest
+    quarter of the scan counts, because a beam drifts away from its flats, but a sample is there from the first
+    projection to the last. In a 360° scan with the axis off the middle, the edge near the axis is truncated on purpose,
+    because the other half of the scan sees the missing part. So this edge is ignored. Values that are not finite, or
+    have weight 0, do not count; the field ends at the last column with a value that counts.
     """
-
-    levels: Mapping[str, float]
-    mean: float
-    of_views: Mapping[str, F64] = field(default_factory=dict)
-    views: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
-    continued: bool = False
-
-    @classmethod
-    def of(cls, data: F32, geometry: Geometry, weights: F32 | None = None) -> FieldEdges:
-        """Edge levels of up to 32 projections, in the rows that show material.
-
-        Levels are medians over projections and rows, so that corners of a sample at some angles do not count. The
-        smallest quarter of the scan counts, because a beam drifts away from its flats, but a sample is there from the
-        first projection to the last. In a 360° scan with the axis off the middle, the edge near the axis is truncated
-        on purpose, because the other half of the scan sees the missing part. So this edge is ignored.
-
-        Args:
-            data: line integrals [view, row, col]; values that are not finite do not count.
-            weights: weights of the values; values with weight 0 do not count. None: all count.
-        """
-        n, cols = len(data), data.shape[2]
-        width = max(2, cols // 50)
-        if n == 0 or cols < 2 * width:
-            return cls({}, 0.0)
-        views = spread(np.arange(n), _VIEWS)
-        part = np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))
-        some = np.where(np.isfinite(data[part]) & (weights is None or weights[part] > 0), data[part], np.nan)
-        mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
-        some = some[:, mass >= _FULL * mass.max()]
-        edges = {"left": some[..., :width], "right": some[..., -width:]}
-        if geometry.is_off_middle and covers_the_circle(geometry.angles):
-            far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
-            edges = {far: edges[far]}
-        levels = {
-            side: min(_median(part) for part in np.array_split(values, min(_PARTS, len(values))))
-            for side, values in edges.items()
-        }
-        of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
-        some = np.nan_to_num(some)
-        cut = ends_in_matter(some.mean(axis=0))[:, [int(side == "right") for side in edges]]
-        return cls(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, views, bool(cut.any()))
-
-    def beyond(self, least: float = LEAST) -> dict[str, float]:
-        """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.
-
-        Args:
-            least: line integral that a changing beam may cause; 0: the air of these projections is at zero.
-        """
-        return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
-
-    def passing(self) -> dict[str, tuple[int, int]]:
-        """The edges at which material leaves the field in a part of the scan, with the first and last such projection.
-
-        Empty if a projection has material at both edges, because then the sample is wider than the field or the beam
-        changed.
-        """
-        least = max(LEAST, EMPTY * self.mean)
-        at = {side: levels > least for side, levels in self.of_views.items()}
-        count = sum(flags.astype(int) for flags in at.values())
-        if self.beyond() or not at or np.max(count) > 1 or not _FEWEST <= np.sum(count) < self.views.size:
-            return {}
-        return {
-            side: (int(self.views[flags][0]), int(self.views[flags][-1])) for side, flags in at.items() if flags.any()
-        }
+    own = np.flatnonzero(views.geometry.is_centred)
+    geometry, cols = views.geometry.select(own), views.data.shape[2]
+    width = max(2, cols // 50)
+    if own.size == 0 or cols < 2 * width:
+        return FieldEdges({}, 0.0)
+    numbers = spread(np.arange(own.size), _VIEWS)
+    part = np.ix_(own[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
+    known = np.isfinite(views.data[part]) & (views.weights is None or views.weights[part] > 0)
+    if not (measured := np.flatnonzero(known.any(axis=(0, 1)))).size:
+        return FieldEdges({}, 0.0)
+    some = np.where(known, views.data[part], np.nan)[..., measured[0] : measured[-1] + 1]
+    mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
+    some = some[:, mass >= _FULL * mass.max()]
+    edges = {"left": some[..., :width], "right": some[..., -width:]}
+    if geometry.is_off_middle and covers_the_circle(geometry.angles):
+        far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
+        edges = {far: edges[far]}
+    levels = {
+        side: min(_median(part) for part in np.array_split(values, min(_PARTS, len(values))))
+        for side, values in edges.items()
+    }
+    of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
+    some = np.nan_to_num(some)
+    cut = ends_in_matter(some.mean(axis=0))[:, [int(side == "right") for side in edges]]
+    return FieldEdges(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, numbers, bool(cut.any()))
 
 
 def _median(values: F32) -> float:
     """Median over the measured rays; 0 if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else 0.0
-
-
-def wider_than_field(projections: F32, geometry: Geometry) -> bool:
-    """Whether the sample is wider than the field of view, for projections [view, row, col] whose air is at zero."""
-    return bool(FieldEdges.of(projections, geometry).beyond(0.0))
-
-
-def taller_than_field(projections: F32, geometry: Geometry) -> bool:
-    """Whether the sample continues above or below the slices of a cone, where the rays of its rows also cross it.
-
-    Args:
-        projections: line integrals [view, row, col]; values that are not finite do not count.
-    """
-    if not geometry.is_cone or not len(projections) or geometry.is_fan:
-        return False
-    if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows in most projections
-        at = geometry.offsets[:, 1]
-        lowest, highest = np.nan_to_num(projections[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
-        return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
-    rows = np.nan_to_num(projections[spread(np.arange(len(projections)), _VIEWS)], posinf=0, neginf=0).mean(axis=(0, 2))
-    return bool(ends_in_matter(rows[None]).any())
 
 
 AIR = 0.03

@@ -130,12 +130,9 @@ def solve_views(
     nonnegative: bool = True,
     watch: Watch = _UNWATCHED,
     decide: Decisions | None = None,
-    wide: bool = False,
 ) -> Volume:
-    """`solve` for projections in the projector's geometry, with their weights.
-
-    `wide` is that of `VoxelProblem`; other arguments and errors are those of `solve`."""
-    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions(), wide)
+    """`solve` for projections in the projector's geometry, with their weights and the reach of the sample."""
+    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -160,7 +157,6 @@ def scaled_problem(
     nonnegative: bool,
     watch: Watch,
     decide: Decisions,
-    wide: bool,
 ) -> tuple[VoxelProblem, F32]:
     """The problem for these projections in units of about one, and its first volume [y, x, z]; see `solve_views`."""
     data, rays = _checked(projector, views.data, views.weights)
@@ -175,7 +171,7 @@ def scaled_problem(
     problem = VoxelProblem(
         inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed),
         lambda iteration, residual: not watch.on_iteration(iteration, residual), decide, lambda: not watch.on_trial(),
-        measured=None if at_voxels is data else data, units=units, wide=wide,
+        measured=None if at_voxels is data else data, units=units, reach=views.reach,
     )  # fmt: skip
     return problem, lines
 
@@ -237,8 +233,7 @@ class VoxelMethod(Iterative):
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         projector = Projector(problem.geometry, problem.grid, device=problem.device)
         volume = solve_views(
-            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide,
-            wide=problem.wide,
+            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, **decide.settings, "seed": problem.seed}, tuple(history))

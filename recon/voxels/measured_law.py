@@ -27,7 +27,7 @@ from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.beyond_field import offset_error, sample_radius
+from recon.voxels.beyond_field import offset_error, whole_reach
 from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
@@ -83,7 +83,7 @@ def measured_law(
             f"the law of the error needs {LEAST_VIEWS} projections and {_LEAST_FRAMES} frames of the open beam; "
             f"got {n} and {len(open_beam)}"
         )
-    sample = sample_radius(Views(data, geometry))
+    sample = whole_reach(Views(data, geometry)).sample
     # width of the sample over that of the field of view
     width = 1.0 if sample is None else sample.radius / geometry.reach
     slab = _Slab.of(data, geometry, width, open_beam)

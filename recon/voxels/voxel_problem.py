@@ -15,6 +15,7 @@ from recon.base.decisions import Decisions, Prior
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import ReconProblem
+from recon.base.reach import Reach
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import Weights
@@ -190,7 +191,7 @@ class VoxelProblem:
         with_all_columns: if the problem has only some columns, a function that makes the problem with all columns,
             which determines the length of the steps.
         units: units of all lengths, line integrals and weights.
-        wide: True: the grid contains a sample that is wider than the field of view.
+        reach: how far the sample goes beyond the field of view, in the units of the scan; None: not measured.
     """
 
     projector: Projector
@@ -204,7 +205,7 @@ class VoxelProblem:
     measured: F32 | None = None
     with_all_columns: Callable[[], VoxelProblem] | None = None
     units: Units = _NO_UNITS
-    wide: bool = False
+    reach: Reach | None = None
     # shared by copies of the problem
     _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)
 
@@ -230,8 +231,13 @@ class VoxelProblem:
         projector, rays = self.units.projector(self.projector, 1), self.weight
         data = times_power(projection_images(self.views).copy(), self.units.integral)
         weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
-        views = Views(data, projector.geometry, weights)
-        return ReconProblem(views, projector.grid, device=projector.device, wide=self.wide)
+        views = Views(data, projector.geometry, weights, self.reach)
+        return ReconProblem(views, projector.grid, device=projector.device)
+
+    @property
+    def wide(self) -> bool:
+        """True if the sample is known to be wider than the field of view."""
+        return self.reach is not None and self.reach.sample is not None
 
     @property
     def views(self) -> F32:

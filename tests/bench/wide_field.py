@@ -20,7 +20,7 @@ import numpy as np
 
 import recon
 from recon.auto import Auto
-from recon.base.method import SAMPLE
+from recon.base.reach import SAMPLE
 from recon.voxels.projector import Projector
 
 MATRIX, WALL, THICK, FILLED, DEPTH, PHOTONS, SUB = 0.25, 0.9, 3.0, 0.4, 2.0, 3e4, 3

@@ -17,6 +17,7 @@ from recon.base.registry import LibraryError, loaded
 from recon.base.view_data import Views
 from recon.base.volume import Volume
 from recon.methods import by_name
+from recon.voxels.beyond_field import whole_reach
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
@@ -127,6 +128,11 @@ def test_a_method_whose_library_cannot_be_loaded_is_left_out(data: F32) -> None:
         recon.reconstruct(few, views, Auto((Lacking(),)))
 
 
+def _reaching(data: F32, fields: float) -> Views:
+    """The projections of a sample whose radius is stated in widths of the field."""
+    return Views(data, VIEWS, reach=whole_reach(Views(data, VIEWS), fields * VIEWS.reach))
+
+
 @pytest.mark.parametrize("method", [Auto(), *(by_name(name)() for name in ("fista-tv", "pnp-dct", "discrete", "r2"))])
 def test_a_sample_slightly_wider_than_the_field_is_wide_for_every_method(
     method: Method, data: F32, monkeypatch: pytest.MonkeyPatch
@@ -139,7 +145,7 @@ def test_a_sample_slightly_wider_than_the_field_is_wide_for_every_method(
 
     monkeypatch.setattr(Trial, "of", of)
     for wide in (True, False):
-        method.toy().run(ReconProblem(Views(data, VIEWS), GRID, wide=wide), recon.RunControl())
+        method.toy().run(ReconProblem(_reaching(data, 1.05 if wide else 1.0), GRID), recon.RunControl())
         assert asked and set(asked) == {wide}
         asked.clear()
 
@@ -147,7 +153,7 @@ def test_a_sample_slightly_wider_than_the_field_is_wide_for_every_method(
 def test_patches_are_not_tried_of_a_sample_wider_than_the_field(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matter beside the field is in all views; they preferred patches where total variation was 0.4 dB better."""
     monkeypatch.setattr(Trial, "weight", 0.5)
-    priors, problem = list[Prior | None](), ReconProblem(Views(data, VIEWS), GRID, wide=True)
+    priors, problem = list[Prior | None](), ReconProblem(_reaching(data, 1.05), GRID)
 
     @dataclass(frozen=True)
     class Asking(Scaled):

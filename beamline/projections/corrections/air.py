@@ -91,7 +91,7 @@ class Air:
         """These settings with the columns of air, and the line integral above which edges count as sample, as in the
         monitor. Columns that the user states always count as air.
         """
-        from recon.voxels.field_edges import LEAST
+        from recon.base.reach import LEAST
 
         return replace(before, air=_parts(self.model)[0], sample_from=LEAST if self.model == "auto" else math.inf)
 
@@ -111,8 +111,7 @@ class Air:
         air = views.projections.air
         levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
         sentence, terms = without_background(
-            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked),
-            levelled,
+            views.views, self.surface, views.held_out, areas(views.projections.masked), levelled
         )  # fmt: skip
         line = any(views.projections.air_columns)
         nothing = (
@@ -165,14 +164,13 @@ class _Views:
 
 
 def without_background(
-    data: F32,
-    geometry: Geometry,
+    of_scan: Views,
     surface: Surface,
     others: Views | None = None,
     unknown: Mask | None = None,
     levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
-    """Subtract the background of the beam from projections [view, row, col], in place.
+    """Subtract the background of the beam from projections, in place.
 
     Returns what was done, in words (empty: nothing), and the coefficients of the mean surface that was subtracted.
 
@@ -186,14 +184,15 @@ def without_background(
         DataError: polynomials were asked for, and too few rays miss the sample.
     """
     from recon.base.noise import noise_level
-    from recon.voxels.field_edges import FieldEdges
+    from recon.voxels.beyond_field import reach_of
 
     if surface == "none":
         return "", None
     order = None if surface == "auto" else surface
-    views = _Views(data, geometry, unknown)
-    fills_field = FieldEdges.of(data, geometry).beyond()  # such a sample looks like air
-    shows_air = _see_all_sides(geometry) and not fills_field
+    data = of_scan.data
+    views = _Views(data, of_scan.geometry, unknown)
+    fills_field = reach_of(of_scan).beyond  # such a sample looks like air
+    shows_air = _see_all_sides(of_scan.geometry) and not fills_field
     fitted, where = _fitted(views, order) if shows_air else (None, None)
     if fitted is None or where is None:
         if order is None:

@@ -15,11 +15,10 @@ from typing import Any
 import dask
 import numpy as np
 from distributed import Client, Future, KilledWorker, LocalCluster
-from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import BeamlineError, ConfigError
-from recon import Geometry, Reconstruction, RunControl
+from recon import Reconstruction, RunControl, Views
 from recon.base.method import Method
 
 _CONNECT_TIMEOUT = 30  # s to wait for a scheduler, and for its first worker
@@ -49,8 +48,7 @@ class Cluster:
 
     def reconstruct(
         self,
-        projections: NDArray[np.float32],
-        geometry: Geometry,
+        views: Views,
         method: Method,
         *,
         control: RunControl,
@@ -63,7 +61,7 @@ class Cluster:
         """
         import numba  # imported here, because beamline loads numba after recon's compiled kernels
 
-        work = (np.array(projections), geometry, method, settings, control.decide)
+        work = (replace(views, data=np.array(views.data)), method, settings, control.decide)
         future = self.client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
         try:
             self._wait_for(future)
@@ -100,9 +98,9 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
     """Reconstruct, on a worker. The same number of threads gives bit-identical results."""
     import numba
 
-    data, geometry, method, settings, decide = work
+    views, method, settings, decide = work
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    result = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
+    result = recon.reconstruct(views, method=method, control=RunControl(decide=decide), **settings)
     return replace(result, gaussians=None, checkpoint=None, settings=dict(result.settings))
 
 

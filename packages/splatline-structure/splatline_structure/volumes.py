@@ -308,9 +308,7 @@ def parts_of(
     for n in range(count):
         tell(n, count)
         chosen = np.sort(order[n::count])
-        weights = None if views.weights is None else np.asarray(views.weights[chosen], np.float32)
-        use = recon.DataUse(weights=weights, sample_radius=prepared.sample_radius)
-        made = recon.reconstruct(views.data[chosen], prepared.geometry.select(chosen), record.method, use=use)
+        made = recon.reconstruct(views.select(chosen), method=record.method)
         volumes.append(made.volume.data[at] * np.float32(scale))
     tell(count, count)
     return volumes

@@ -104,7 +104,7 @@ class FromReference(Method):
         projector = Projector(problem.geometry, problem.grid)
         volume = solve_views(
             state, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=Watch(report),
-            decide=decide, wide=problem.wide,
+            decide=decide,
         )  # fmt: skip
         settings = {
             **decide.settings, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,

@@ -11,8 +11,9 @@ from beamline.projections.preparation import Preparation
 from beamline.projections.scan_warnings import cut_sentence
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.voxels.fbp import fbp
-from recon.voxels.field_edges import FieldEdges
+from recon.voxels.field_edges import edges_of
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 from tests.slow_cases import others_slow
@@ -54,7 +55,7 @@ def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
     u = np.arange(SHAPE[1]) - 31.5
     lines = np.broadcast_to(0.13 + 2.0 * (np.abs(u) < 8), (VIEWS, *SHAPE)).astype(np.float32)
     geometry = Geometry.parallel(ANGLES, SHAPE)
-    low, high = FieldEdges.of(lines, geometry), FieldEdges.of(lines + np.float32(0.3), geometry)
+    low, high = (edges_of(Views(data, geometry)) for data in (lines, lines + np.float32(0.3)))
     assert set(low.beyond()) == set(high.beyond()) == {"left", "right"}
     for edges, continues in ((low, False), (high, True)):
         sentences = [cut_sentence(edges.beyond(), edges.continued, wide) for wide in (False, True)]
@@ -120,6 +121,7 @@ def test_a_beam_that_is_not_that_of_its_flats_is_levelled_by_its_air(light: np.n
 def test_a_full_turn_about_an_axis_beside_the_middle_is_cut_on_purpose() -> None:
     angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     lines = np.broadcast_to(np.linspace(1, 0, 64), (180, 2, 64)).astype(np.float32)
-    assert FieldEdges.of(lines, Geometry.parallel(angles, (2, 64), axis_col=8.0)).beyond() == {}
-    assert set(FieldEdges.of(lines, Geometry.parallel(angles / 2, (2, 64), axis_col=8.0)).beyond()) == {"left"}
-    assert set(FieldEdges.of(lines[:, :, ::-1], Geometry.parallel(angles, (2, 64), axis_col=8.0)).beyond()) == {"right"}
+    turn, half = (Geometry.parallel(each, (2, 64), axis_col=8.0) for each in (angles, angles / 2))
+    assert edges_of(Views(lines, turn)).beyond() == {}
+    assert set(edges_of(Views(lines, half)).beyond()) == {"left"}
+    assert set(edges_of(Views(lines[:, :, ::-1], turn)).beyond()) == {"right"}

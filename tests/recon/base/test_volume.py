@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
@@ -63,7 +64,7 @@ def test_views_that_jump_along_the_axis_find_all_matter() -> None:
     field = Grid.of_field(views, 1.0)
     assert field == Grid((30, 32, 32))
     data = project(both, views).numpy()
-    placed = place(first_volume(data, views, field), data, views, 600, np.random.default_rng(0))
+    placed = place(first_volume(data, views, field), Views(data, views), 600, np.random.default_rng(0))
     heights = placed.means.numpy()[:, 2]
     assert (heights < -5).mean() > 0.35 and (heights > 5).mean() > 0.35
     found = _fitted(project(both, views).numpy(), views, field).volume.data.sum(axis=(1, 2))
@@ -152,7 +153,7 @@ def test_an_axis_beyond_the_detector_is_no_end_of_the_field() -> None:
     ring = Gaussians.from_physical([[59.0, 11.0, 0.0], [-50.0, -33.0, 0.5]], np.full((2, 3), 2.0), [0.1, 0.1])
     data = project(ring, views).numpy()
     field = Grid.of_field(views, 1.0)
-    placed = place(first_volume(data, views, field), data, views, 300, np.random.default_rng(0))
+    placed = place(first_volume(data, views, field), Views(data, views), 300, np.random.default_rng(0))
     near = np.linalg.norm(placed.means.numpy()[:, None] - ring.means.numpy()[None], axis=2).min(axis=1)
     assert (near < 6).mean() > 0.3  # the others are on streaks: each point is seen from a third of the circle
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting.initialise import (
     first_volume,
@@ -16,7 +17,7 @@ from recon.splatting.initialise import (
     scale_to_data,
 )
 from recon.splatting.splat import project
-from recon.voxels.field_edges import wider_than_field
+from recon.voxels.field_edges import edges_of
 from recon.voxels.projector import Projector
 from tests.recon.conftest import Make
 
@@ -55,13 +56,13 @@ def test_a_sample_wider_than_the_field_is_noticed(half: float, leaves: bool) -> 
     views = Geometry.parallel(angles, (3, 24))
     u = np.arange(24) - 11.5
     chords = 2 * np.sqrt(np.maximum(half**2 - u**2, 0)).astype(np.float32)
-    assert wider_than_field(np.broadcast_to(chords, (8, 3, 24)), views) == leaves
+    assert bool(edges_of(Views(np.broadcast_to(chords, (8, 3, 24)), views)).beyond(0.0)) == leaves
 
 
 def test_the_edge_near_an_axis_off_the_middle_does_not_count() -> None:
     views = Geometry.parallel(np.linspace(0, 2 * np.pi, 8, endpoint=False), (3, 24), axis_col=4.0)
     chords = 2 * np.sqrt(np.maximum(15.0**2 - (np.arange(24) - 4.0) ** 2, 0)).astype(np.float32)
-    assert chords[0] > 0 and not wider_than_field(np.broadcast_to(chords, (8, 3, 24)), views)
+    assert chords[0] > 0 and not edges_of(Views(np.broadcast_to(chords, (8, 3, 24)), views)).beyond(0.0)
 
 
 def test_a_sample_wider_than_the_field_gets_gaussians_up_to_the_corners(rng: np.random.Generator) -> None:
@@ -69,7 +70,7 @@ def test_a_sample_wider_than_the_field_gets_gaussians_up_to_the_corners(rng: np.
     wide, narrow = Grid((4, 24, 24)), Grid((4, 12, 12))
     for grid, corners in ((wide, True), (narrow, False)):
         data = Projector(views, grid).forward(np.ones(grid.shape, np.float32))
-        means = place(first_volume(data, views, wide), data, views, 500, rng).means.numpy()
+        means = place(first_volume(data, views, wide), Views(data, views), 500, rng).means.numpy()
         assert bool((np.hypot(*means[:, :2].T) > 12.5).any()) == corners
 
 
@@ -100,7 +101,7 @@ def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: floa
     shadow = 3 * np.sqrt(2 * np.pi) * np.exp(-(u[None] ** 2 + v[:, None] ** 2) / 18)
     data = np.broadcast_to(shadow, (30, 16, 40)).astype(np.float32)
     first = first_volume(data, views, Grid.matching(views))
-    placed = place(first, data, views, 500, np.random.default_rng(0))
+    placed = place(first, Views(data, views), 500, np.random.default_rng(0))
     assert 0.3 < placed.density_unit < 2
 
 
@@ -108,7 +109,7 @@ def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: floa
 def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
     views = Geometry.parallel([0.0, 1.0], (4, 6))
     with pytest.raises(ValueError, match="at least one Gaussian"):
-        place(_ball(), np.ones((2, 4, 6), np.float32), views, count, rng)
+        place(_ball(), Views(np.ones((2, 4, 6), np.float32), views), count, rng)
 
 
 def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import recon
-from recon.base.method import DataUse, ReconProblem, RunControl, SampleRadius
+from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.reach import SampleRadius
 from recon.base.view_data import Views
-from recon.voxels.beyond_field import offset_error, sample_radius
-from recon.voxels.field_edges import taller_than_field
+from recon.voxels.beyond_field import offset_error, reach_of, whole_reach
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -64,7 +64,7 @@ def made(wide: tuple[np.ndarray, np.ndarray]) -> recon.Reconstruction:
 @pytest.fixture(scope="module")
 def found(wide: tuple[np.ndarray, np.ndarray]) -> SampleRadius | None:
     """How far that can reaches, by its views."""
-    return sample_radius(Views(wide[0], GEOMETRY))
+    return whole_reach(Views(wide[0], GEOMETRY)).sample
 
 
 def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() -> None:
@@ -77,7 +77,7 @@ def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() ->
 
 @pytest.mark.slow
 def test_a_can_as_wide_as_the_field_is_not_taken_for_a_wider_one() -> None:
-    assert sample_radius(Views(views_of(can(COLS / 2)), GEOMETRY)) is None
+    assert whole_reach(Views(views_of(can(COLS / 2)), GEOMETRY)).sample is None
 
 
 def test_the_radius_is_that_of_the_can(found: SampleRadius | None) -> None:
@@ -111,9 +111,9 @@ def test_volume_and_outside_together_explain_the_views(
 def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     made = recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=55.0))
     assert made.settings["sample_radius"] == made.settings["sample_radius_high"] == 55.0
-    assert sample_radius(Views(wide[0], GEOMETRY), given=20.0) is None  # within the field
+    assert whole_reach(Views(wide[0], GEOMETRY), given=20.0).sample is None  # within the field
     known = SampleRadius(50.0, 48.0, 53.0, 0.02)
-    assert sample_radius(Views(wide[0], GEOMETRY), given=known) is known
+    assert whole_reach(Views(wide[0], GEOMETRY), given=known).sample is known
 
 
 @pytest.mark.slow
@@ -127,7 +127,7 @@ def test_a_small_grid_holds_what_the_field_holds_there(
 
 def test_few_views_take_the_end_that_fbp_takes_and_say_that_nothing_is_known() -> None:
     some = GEOMETRY.select(np.arange(0, VIEWS, 4))
-    found = sample_radius(Views(views_of(can(1.6 * COLS / 2), some), some))
+    found = whole_reach(Views(views_of(can(1.6 * COLS / 2), some), some)).sample
     assert found is not None and (found.low, found.high, found.density) == (COLS / 2, 4.5 * COLS / 2, 1.0)
     assert found.radius == pytest.approx(1.6 * COLS / 2, rel=0.15)
 
@@ -164,7 +164,7 @@ def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(
     )
     assert both.reach == GEOMETRY.reach and both.is_centred.sum() == VIEWS
     views = np.concatenate((wide[0], views_of(can(1.6 * COLS / 2), both.select(np.arange(VIEWS, VIEWS + 4)))))
-    seen = sample_radius(Views(views, both))
+    seen = whole_reach(Views(views, both)).sample
     assert found is not None and seen is not None and seen.density < 0.8 * found.density
     assert 0.88 < seen.radius / (1.6 * COLS / 2) < 1.05
     fbp = [recon.reconstruct(data, each, "fbp").volume.data for data, each in ((views, both), (wide[0], GEOMETRY))]
@@ -221,7 +221,7 @@ def test_a_sample_that_ends_within_the_heights_of_a_helix_is_not_taken_for_a_tal
     rod = np.where(np.hypot(x, y) < 14, 0.01, 0).astype(np.float32)
     for low, high, goes_on in ((-16, 16, False), (-32, 16, True), (-16, 32, True)):
         views = Projector(helix, tall).forward(np.where((z > low) & (z < high), rod, 0).astype(np.float32))
-        assert taller_than_field(views, helix) == goes_on
+        assert reach_of(Views(views, helix)).tall == goes_on
 
 
 def test_a_fan_sees_nothing_above_or_below_its_row() -> None:
@@ -231,6 +231,6 @@ def test_a_fan_sees_nothing_above_or_below_its_row() -> None:
     box = recon.Grid.matching(fan)
     y, x = np.meshgrid(*box.coordinates()[1:], indexing="ij")
     views = Projector(fan, box).forward(np.where(np.hypot(y, x) < 5, 0.1, 0).astype(np.float32)[None])
-    assert not taller_than_field(views, fan)
+    assert not reach_of(Views(views, fan)).tall
     aside = replace(fan, axis_row=4.0)  # its rays climb
-    assert fan.is_fan and not aside.is_fan and taller_than_field(views, aside)
+    assert fan.is_fan and not aside.is_fan and reach_of(Views(views, aside)).tall

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import recon
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
-from recon.base.method import SampleRadius
+from recon.base.reach import SampleRadius
 from recon.base.volume import Grid
 from recon.voxels.measured_law import measured_law
 from recon.voxels.priors import NoiseBalance
@@ -127,7 +127,7 @@ def test_gaps_last_until_the_views_are_as_many_as_the_sample_is_columns_wide(
 ) -> None:
     """A sample of 56 columns on a field of 28. With gaps the law is known less well."""
     monkeypatch.setattr(
-        "recon.voxels.measured_law.sample_radius",
+        "recon.voxels.beyond_field._radius_of",
         lambda views: SampleRadius(2 * views.geometry.reach, views.geometry.reach, 2 * views.geometry.reach, 0.02),
     )
     views, geometry, open_beam, _ = scan(n, 1e6, cols=28)

@@ -179,11 +179,12 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 def _clearly_seen(views: PreparedProjections) -> str:
     """A sentence if the rows with the most material show hardening although nobody asked for a correction; else ""."""
-    from recon.voxels.field_edges import FieldEdges, busiest_rows
+    from recon.voxels.beyond_field import reach_of
+    from recon.voxels.field_edges import busiest_rows
 
     data, geometry = views.centred.projections.data, views.centred.geometry
     plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
-    if not plain or geometry.n_views < _FEWEST or FieldEdges.of(data, geometry).beyond():
+    if not plain or geometry.n_views < _FEWEST or reach_of(views.views).beyond:
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
     if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _AS_EVEN:

@@ -46,7 +46,7 @@ def test_a_bent_beam_is_taken_off_and_weak_matter_stays() -> None:
     clean, fading = _views(DOME, POST), np.linspace(0, -0.01, 60, dtype=np.float32)[:, None, None]
     bent = clean + BENT + fading
     views = bent.copy()
-    said, _ = without_background(views, GEOMETRY, "auto")
+    said, _ = without_background(Views(views, GEOMETRY), "auto")
     assert "order 2" in said and "subtracted" in said
     np.testing.assert_allclose(views - clean, 0, atol=0.008)  # of 0.07
     assert np.sqrt(np.mean((views - clean) ** 2)) < 0.002
@@ -74,7 +74,7 @@ def test_a_bent_beam_is_taken_off_and_weak_matter_stays() -> None:
 def test_nothing_is_taken_off_beams_that_are_their_flats(bodies: tuple[Cylinder | Ellipsoid, ...]) -> None:
     views = _views(*bodies)
     kept = views.copy()
-    said, _ = without_background(views, GEOMETRY, "auto")
+    said, _ = without_background(Views(views, GEOMETRY), "auto")
     assert (views == kept).all(), said
     assert "subtracted: " not in said
 
@@ -84,17 +84,17 @@ def test_a_surface_is_not_sought_where_views_do_not_show_where_the_sample_is() -
     views, few = _views(DOME, POST) + BENT, np.arange(0, 60, 6)
     for part in (slice(0, 20), few):
         some = views[part].copy()
-        assert without_background(some, GEOMETRY.select(part), "auto") == ("", None)
+        assert without_background(Views(some, GEOMETRY.select(part)), "auto") == ("", None)
         assert (some == views[part]).all()
 
 
 def test_positive_air_is_told_and_taken_off_on_request_only() -> None:
     views = _views(DOME, POST) + np.float32(0.03)
     kept = views.copy()
-    said, _ = without_background(views, GEOMETRY, "auto")
+    said, _ = without_background(Views(views, GEOMETRY), "auto")
     assert (views == kept).all() and "may be weakly absorbing material all around the sample" in said
     assert "--air surface:0" in said
-    assert "subtracted: " in without_background(views, GEOMETRY, 0)[0]
+    assert "subtracted: " in without_background(Views(views, GEOMETRY), 0)[0]
     np.testing.assert_allclose(views, kept - 0.03, atol=0.002)
 
 
@@ -104,7 +104,7 @@ def test_views_held_out_lose_their_background_by_their_own_air() -> None:
     drift = np.linspace(0, -0.02, 60, dtype=np.float32)[:, None, None]
     views, used, unseen = clean + BENT + drift, np.arange(0, 60, 2), np.arange(1, 60, 10)
     others = views[unseen].copy()
-    without_background(views[used].copy(), GEOMETRY.select(used), "auto", Views(others, GEOMETRY.select(unseen)))
+    without_background(Views(views[used].copy(), GEOMETRY.select(used)), "auto", Views(others, GEOMETRY.select(unseen)))
     assert np.sqrt(np.mean((others - clean[unseen]) ** 2)) < 0.003
 
 
@@ -114,13 +114,13 @@ def test_a_positive_background_of_a_beam_brighter_than_its_flats_is_the_beams() 
     clean = _views(DOME)
     bent = _surface(0.03, -0.03)
     views = clean + bent
-    said, _ = without_background(views, GEOMETRY, "auto", levelled=-0.08)
+    said, _ = without_background(Views(views, GEOMETRY), "auto", levelled=-0.08)
     assert "a line through the air at the edges was subtracted (-0.080 in line integral); then" in said
     assert "beam subtracted: " in said
     np.testing.assert_allclose((views - clean).mean(axis=0), 0, atol=0.01)
     views = clean + bent
     for levelled in (0.0, 0.05):
-        said, _ = without_background(views, GEOMETRY, "auto", levelled=levelled)
+        said, _ = without_background(Views(views, GEOMETRY), "auto", levelled=levelled)
         assert "was not subtracted" in said
         assert ("a line through the air" in said) == (levelled > 0)
         np.testing.assert_array_equal(views, clean + bent)

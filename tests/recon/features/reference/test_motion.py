@@ -67,7 +67,7 @@ def _state(scene: Discs) -> tuple[VoxelProblem, Moved]:
     """The problem of 24 views of the scene, and the scene at rest as its reference."""
     data, geometry = scanned(scene, 24, 1e5)
     projector = Projector(geometry, Grid.matching(geometry))
-    problem, _ = scaled_problem(projector, Views(data, geometry), None, True, Watch(), Decisions(0), False)
+    problem, _ = scaled_problem(projector, Views(data, geometry), None, True, Watch(), Decisions(0))
     rest = replace(scene, turn=0.0, shift=(0.0, 0.0))
     volume = times_power(np.ascontiguousarray(rest.volume.transpose(1, 2, 0)), -problem.units.density)
     particles = particles_of(volume)
