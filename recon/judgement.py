@@ -86,7 +86,6 @@ def judge(
     views: Views,
     truth: Volume | None = None,
     *,
-    held_out: Views | None = None,
     aspects: Aspect = Aspect.RESIDUAL,
     seed: int = 0,
     time: TimeLeft = _ALWAYS,
@@ -102,6 +101,7 @@ def judge(
     Raises:
         ValueError: all projections are zero.
     """
+    held_out, views = views.unseen, views.seen
     figures = {} if truth is None else by_truth(truth.data, volume.data)
     along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
     odd, skipped, fitted = tuple[OddView, ...](), list[str](), Aspect.FIT in aspects

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from recon.auto import method_named
 from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
-from recon.base.masks import RayWeights
 from recon.base.method import (
     DataUse,
     Method,
@@ -26,6 +25,7 @@ from recon.base.method_kinds import Direct
 from recon.base.setting import Natural
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
+from recon.base.views import used_views
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, accepting
 from recon.prep.counts import Counts, line_integrals
@@ -93,7 +93,7 @@ def reconstruct(
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
     _warn_of_missing_wedge(chosen, geometry)
-    views = replace(views, reach=reach_of(views))
+    views = replace(views if "held_out" in chosen.takes else views.seen, reach=reach_of(views))
     _warn_of_half_acquisition(views)
     begin = control.now()
     problem = ReconProblem(views, grid or Grid.matching(geometry), use, int(seed), device)
@@ -102,7 +102,7 @@ def reconstruct(
     return replace(result, settings=dict(result.settings), method=by, seconds=seconds)
 
 
-def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
+def _warn_of_unknown(data: NDArray[np.float32], weights: Any) -> None:
     """Warn if values are not finite, except those with weight 0."""
     lost = sum(
         int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
@@ -207,6 +207,7 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
     """Line integrals with their weights and their geometry, as far as it can be used."""
     if isinstance(projections, Views):
         given = {"geometry": geometry, "use.weights": use.weights, "use.sample_radius": use.sample_radius}
+        given["use.held_out"] = use.held_out if len(use.held_out) else None
         if twice := [name for name, value in given.items() if value is not None]:
             raise ValueError(f"leave out {' and '.join(twice)}, because the projections are given as Views")
         _refuse_geometry(projections.geometry)
@@ -214,13 +215,15 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
     if geometry is None:
         raise ValueError("give the geometry of the projections; only Views contain it")
     _refuse_geometry(geometry)
+    used = used_views(geometry.n_views, use.held_out) if len(use.held_out) else None
     if not isinstance(projections, Counts):
-        return Views(_line_integrals(projections, geometry), geometry, use.weights)
+        return Views(_line_integrals(projections, geometry), geometry, use.weights, used=used)
     require_views(geometry, projections.counts, "counts")
     if use.weights is not None:
         require_views(geometry, use.weights, "weights")
     data, weights = line_integrals(projections)
-    return Views(_line_integrals(data, geometry), geometry, weights if use.weights is None else weights * use.weights)
+    weights = weights if use.weights is None else weights * use.weights
+    return Views(_line_integrals(data, geometry), geometry, weights, used=used)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

@@ -112,7 +112,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)
     geometry = prepared.geometry
-    known = prepared.measured is None and prepared.projections.floored <= _FLOORED
+    known = prepared.measured is None and prepared.corrected.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
     conditions = _conditions_of(prepared, whole=selection.asked.rows is None)
@@ -124,9 +124,9 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
 
 def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[ConsistencyCondition]:
     """The conditions that apply to this scan; `whole`: the data contain all detector rows."""
-    geometry, data = prepared.geometry, prepared.projections.data
+    geometry, data = prepared.geometry, prepared.seen.data
     some = spread(np.arange(len(data)), _VIEWS)
-    edges, frames = reach_of(prepared.views).edges, prepared.projections.view_ids
+    edges, frames = reach_of(prepared.seen).edges, prepared.ids
     wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
     conditions = list[ConsistencyCondition]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
@@ -145,8 +145,8 @@ def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[Consis
 
 def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[ConsistencyCondition]:
     """Conditions for parallel projections that show the whole sample, from a subset of the projections."""
-    geometry, data = prepared.geometry, prepared.projections.data
-    angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
+    geometry, data = prepared.geometry, prepared.seen.data
+    angles, frames = geometry.angles[some], prepared.ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
     shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
@@ -215,7 +215,7 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
     if not mass > 0:
         return np.inf, np.inf
     rows, cols = views[0].shape
-    air = [rows * columns for columns in prepared.projections.air_columns if columns]
+    air = [rows * columns for columns in prepared.corrected.air_columns if columns]
     pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / sum(air) if air else 0.0)
     slope = rows * cols**2 / 12 * float(np.sqrt(sum(1 / n for n in air))) if len(air) > 1 else 0.0
     # only these are read, because all together may not fit in memory

@@ -19,7 +19,7 @@ from beamline.projections.consistency import compare_with_flats, warn_of_inconsi
 from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey, with_filters_of
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections
 from beamline.projections.protocols import EstimatedStep, ScanStep, ViewStep
 from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
@@ -45,7 +45,8 @@ from recon.prep.projections import Projections
 from recon.voxels.beyond_field import reach_of, whole_reach
 from recon.voxels.projector import seen_rays
 
-_HELD_OUT_VIEWS = 16
+HELD_OUT_VIEWS = 16
+"""Largest number of projections that are held out if the selection leaves some out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ class DiskBuffer:
     """Line integrals on disk instead of in memory, for work in slabs.
 
     Attributes:
-        views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
+        views: float32 [view, row, col], at least `HELD_OUT_VIEWS` more than are chosen: takes the line integrals.
         batch: number of projections that are corrected at a time.
     """
 
@@ -114,7 +115,11 @@ def prepare_projections(
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
-    prepared = _with_held_out(prepared, plan, view_geometry, others, warn)
+    if others.size:
+        with suppress(NoViewError):
+            held_out = apply(plan, others, warn=warn)
+            room = None if buffer is None else buffer.views
+            prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), room)
     prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
     prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
@@ -126,28 +131,6 @@ def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry)
     steps = [step for step in in_order(scan.selection) if isinstance(step, EstimatedStep)]
     found = [step.estimated(scan, projections, geometry) for step in steps]
     return [step for step in found if step is not None]
-
-
-def _with_held_out(
-    prepared: PreparedProjections,
-    plan: ScanCorrectionPlan,
-    view_geometry: ViewGeometry,
-    others: NDArray[np.int64],
-    warn: Warn,
-) -> PreparedProjections:
-    """Add the line integrals of the held-out projections; nothing is added if there are none, or if none has
-    intensity.
-    """
-    if not others.size:
-        return prepared
-    with suppress(NoViewError):
-        held_out = apply(plan, others, warn=warn)
-        prepared = replace(
-            prepared,
-            held_out=Views(held_out.data, view_geometry.of(held_out.view_ids), held_out.weights),
-            held_out_ids=held_out.view_ids,
-        )
-    return prepared
 
 
 def require_usable(scan: SelectedScan) -> None:
@@ -183,7 +166,7 @@ def _chosen(
     if poses is not None:
         require_stated(poses, scan.source, used)
         rest = rest[poses.stated(rest)]
-    return used, spread(rest, _HELD_OUT_VIEWS)
+    return used, spread(rest, HELD_OUT_VIEWS)
 
 
 def _corrected(
@@ -212,7 +195,7 @@ def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases:
     done, steps = dict(prepared.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
     prepared = replace(prepared, done=done)  # a step has access to what the steps before it did
     for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(prepared, scan.source.table.angles[prepared.projections.view_ids], phases.progress)
+        done[step.name] = step.apply(prepared, scan.source.table.angles[prepared.ids], phases.progress)
         phases.progress(n, len(steps))
     return prepared
 
@@ -221,7 +204,7 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
     """Fill rays of weight 0 (see `ray_weights`), projection by projection and in place, as is done for pixels
     `masked` in all projections.
     """
-    data, geometry = prepared.projections.data, prepared.geometry
+    data, geometry = prepared.seen.data, prepared.geometry
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
         weights = np.ones(geometry.detector_shape, np.float32)
@@ -279,11 +262,10 @@ def assemble(
         return regions.weights(ids[views], within, binning, (part.stop - part.start, width))
 
     prepared = PreparedProjections(
-        projections=projections,
-        geometry=geometry,
+        lines=Views(projections.data, geometry, projections.weights, ids),
+        corrected=Corrected.of(projections),
         axis_col=axis[0],
         axis=axis[1],
-        held_out=None,
         n_projections=source.table.views.size,
         length_unit="px" if selection.pixel_size_mm is None else "mm",
         quantity=source.quantity,
@@ -304,8 +286,9 @@ def assemble(
 def with_reach(scan: SelectedScan, prepared: PreparedProjections) -> PreparedProjections:
     """The projections with the reach of the sample that they show; its radius is known only if the user gave it."""
     width = scan.selection.sample_width
-    views = Views(prepared.projections.data, prepared.geometry, prepared.shares)
-    return replace(prepared, reach=reach_of(views) if width is None else whole_reach(views, width / 2))
+    views = replace(prepared.seen, weights=prepared.shares, reach=None)
+    reach = reach_of(views) if width is None else whole_reach(views, width / 2)
+    return replace(prepared, lines=replace(prepared.lines, reach=reach))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
-from recon.base.arrays import F32, I64
+from recon.base.arrays import F32, I64, Mask
 from recon.base.geometry import Geometry
-from recon.base.masks import RayWeights
-from recon.base.reach import Reach
-from recon.base.view_data import Views
+from recon.base.view_data import RayWeights, Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.projections import Projections
@@ -24,42 +22,56 @@ from recon.voxels.projector import seen_rays
 
 
 @dataclass(frozen=True, eq=False)
+class Corrected:
+    """What the correction changed in projections; the attributes are those of `Projections`."""
+
+    floored: float
+    air: F32
+    masked: Mask
+    air_columns: tuple[int, int]
+    replaced: float
+    unmeasured: I64
+    spots_left: int
+
+    @classmethod
+    def of(cls, projections: Projections) -> Corrected:
+        return cls(**{each.name: getattr(projections, each.name) for each in fields(cls)})
+
+
+@dataclass(frozen=True, eq=False)
 class PreparedProjections:
-    """Line integrals ready for reconstruction.
+    """Line integrals ready for reconstruction, and where they come from.
 
     Attributes:
-        projections: line integrals of the projections used; their `view_ids` are rows in the file.
-        geometry: of these projections, binned; mm, or px if the pixel size is unknown.
+        lines: line integrals of all projections, those that are used first; `ids` are rows of the file, `used` is False
+            for projections that are held out. `weights` come from photon counts, inverse variances; None: photons were
+            not counted. `reach` is measured on the projections used. The geometry is binned; mm, or px if the pixel
+            size is unknown.
+        corrected: what the correction changed in the projections used.
         axis_col: rotation axis in columns of the full detector.
         axis: how the axis was found; None if it was given.
-        held_out: some projections that are not used, with weights as `projections.weights` of those used (None: the
-            weight of a usual ray of these); None if all are used.
-        held_out_ids: rows of the file of these projections; None: unknown.
         n_projections: how many projections the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
-        view_weights: float32 [view], less than 1 for projections with a warning of the monitor; None: 1 for all.
+        view_weights: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
         left_out: projections with an alarm of the monitor, or after a jump of the sample: the selection never includes
             them.
         flags: of all frames of the scan; None if the file has no flags.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
-        shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
+        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all 1.
         done: what each step did, by name, in the order of the steps.
         shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
             disk; None: use `shares`.
-        times: [view] time of the exposure of each projection in s; None: the method does not need it.
+        times: [view used] time of the exposure of each projection in s; None: the method does not need it.
         laws: the residuals of the consistency conditions, in words, by name.
-        reach: how far the sample goes beyond the field of view, as these projections show it; lengths are in the
-            geometry's unit.
         stretch: height of a pixel divided by its width. `geometry` has square pixels; slices are this much farther
             apart.
     """
 
-    projections: Projections
-    geometry: Geometry
+    lines: Views
+    corrected: Corrected
     axis_col: float
     axis: AxisEstimate | None
-    held_out: Views | None
     n_projections: int
     length_unit: str
     quantity: str
@@ -70,11 +82,41 @@ class PreparedProjections:
     shares: NDArray[np.float32] | None = None
     done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
-    held_out_ids: NDArray[np.int64] | None = None
     times: NDArray[np.float64] | None = None
-    reach: Reach | None = None
     stretch: float = 1.0
     laws: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def views(self) -> Views:
+        """All projections, with weights that are computed on request."""
+        return replace(self.lines, weights=self._ray_factors())
+
+    @property
+    def seen(self) -> Views:
+        """The projections used, with weights from photon counts only."""
+        return self.lines.seen
+
+    @property
+    def ids(self) -> I64:
+        """Rows of the file of the projections used."""
+        assert self.lines.ids is not None
+        return self.lines.ids[: self.n_used]
+
+    @property
+    def with_gaps(self) -> F32:
+        """The line integrals used, with NaN for pixels without data."""
+        known = {each.name: getattr(self.corrected, each.name) for each in fields(Corrected)}
+        return Projections(self.seen.data, self.ids, **known).measured
+
+    @property
+    def geometry(self) -> Geometry:
+        """The geometry of the projections used."""
+        return self.lines.geometry.select(slice(self.n_used))
+
+    @property
+    def n_used(self) -> int:
+        """Number of the projections used."""
+        return len(self.lines.data) - self.lines.held_out.size
 
     def stretched(self, volume: Volume) -> Volume:
         """A volume of `geometry`, resampled to the heights of its slices."""
@@ -87,27 +129,27 @@ class PreparedProjections:
     @property
     def box(self) -> Grid:
         """The box of the field of view, or one that contains all of the sample, as far as its reach was measured."""
-        grid = Grid.matching(self.geometry)
-        return grid if self.reach is None else self.reach.box(grid, self.geometry)
+        grid, reach = Grid.matching(self.geometry), self.lines.reach
+        return grid if reach is None else reach.box(grid, self.geometry)
 
     @property
     def on_disk(self) -> bool:
         """True if line integrals are stored on disk, with rays of zero weight replaced from their neighbours."""
-        return isinstance(self.projections.data, np.memmap)
+        return isinstance(self.lines.data, np.memmap)
 
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
         """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
-        def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
+        def cut(array: NDArray[Any] | None) -> Any:
             return None if array is None else array[..., rows, :]
 
-        whole = self.projections
+        whole = self.lines
         shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
+        part = whole.geometry.rows(rows.start, rows.stop) if whole.held_out.size else geometry
         return replace(
             self,
-            projections=replace(whole, data=whole.data[:, rows], masked=whole.masked[rows], weights=cut(whole.weights)),
-            geometry=geometry,
-            held_out=None if self.held_out is None else self.held_out.rows(rows),
+            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=cut(whole.weights)),
+            corrected=replace(self.corrected, masked=self.corrected.masked[rows]),
             measured=cut(self.measured),
             shares=shares,
             shares_of=None,
@@ -121,51 +163,79 @@ class PreparedProjections:
         return self.wanted(self.geometry.is_centred)
 
     def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
-        """The same projections, restricted to those that are wanted, bool [view]."""
+        """The same projections, restricted to those that are wanted, bool [view used]."""
         return self if views.all() else self.of_views(np.flatnonzero(views))
 
     def of_views(self, views: I64) -> PreparedProjections:
         """Some of the projections used, by number and in this order; held-out projections are unchanged."""
+        return self._of(self.lines.select(np.concatenate((views, self.lines.held_out))), views)
+
+    def _of(self, lines: Views, views: I64) -> PreparedProjections:
+        """These line integrals, of which those with the numbers `views` are used."""
 
         def some(array: Any) -> Any:
             return None if array is None else array[views]
 
-        whole, geometry = self.projections, self.geometry.select(views)
         return replace(
             self,
-            projections=replace(
-                whole,
-                data=whole.data[views],
-                view_ids=whole.view_ids[views],
-                air=whole.air[views],
-                weights=some(whole.weights),
-            ),
-            geometry=geometry,
+            lines=lines,
+            corrected=replace(self.corrected, air=self.corrected.air[views]),
             view_weights=some(self.view_weights),
             shares=some(self.shares),
             times=some(self.times),
         )
+
+    def holding_out(self, held: I64) -> PreparedProjections:
+        """The same projections with those of these numbers, sorted, held out; all of them are used before."""
+        used = np.setdiff1d(np.arange(self.n_used), held)
+        lines = self.lines.select(np.concatenate((used, held)))
+        return self._of(replace(lines, used=np.arange(len(lines.data)) < used.size), used)
+
+    def with_held_out(self, others: Projections, geometry: Geometry, room: F32 | None = None) -> PreparedProjections:
+        """The same projections, all of which are used, followed by others that are held out.
+
+        Args:
+            geometry: of the others.
+            room: array that begins with the line integrals of these projections and takes those of the others; None: a
+                new array.
+        """
+        lines, n, more = self.lines, len(self.lines.data), len(others.data)
+        if room is None:
+            data = np.concatenate((lines.data, others.data))
+        else:
+            data = room[: n + more]
+            data[n:] = others.data
+        weights: Any = None if lines.weights is None else np.concatenate((lines.weights, others.weights))
+        ids, used = np.concatenate((self.ids, others.view_ids)), np.arange(n + more) < n
+        together = lines.geometry.followed_by(geometry)
+        return replace(self, lines=Views(data, together, weights, ids, used, lines.reach))
+
+    @property
+    def without_held_out(self) -> PreparedProjections:
+        """The projections used alone."""
+        return replace(self, lines=self.lines.seen)
 
     @property
     def whole_views(self) -> I64:
         """Numbers of the projections in which every pixel measured something, except for pixels that are masked in
         all.
         """
-        return np.flatnonzero(~np.isin(self.projections.view_ids, self.projections.unmeasured[:, 0]))
+        return np.flatnonzero(~np.isin(self.ids, self.corrected.unmeasured[:, 0]))
 
     @property
     def unmeasured_rows(self) -> tuple[I64, I64]:
         """Detector rows, binned, that no ray measured; and those of them that lie between measured rows, such as a
         line that the camera does not read, and are interpolated.
         """
-        runs, (height, width) = self.projections.unmeasured, self.geometry.detector_shape
+        ids, (height, width) = self.ids, self.geometry.detector_shape
+        runs = self.corrected.unmeasured
         known = np.ones((height, width), np.bool_) if self.measured is None else self.measured
         # [row, col + 1], number of known pixels to the left
         before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))
-        _, row, left, right = runs[np.isin(runs[:, 0], self.projections.view_ids)].T  # of these projections
+        _, row, left, right = runs[np.isin(runs[:, 0], ids)].T  # of these projections
         lengths = before[row, right] - before[row, left]  # runs end at masked areas
-        unseen = np.bincount(row, lengths, height) >= before[:, -1] * self.projections.view_ids.size
-        lost = unseen | self.projections.masked.all(axis=1)
+        unseen = np.bincount(row, lengths, height) >= before[:, -1] * ids.size
+        lost = unseen | self.corrected.masked.all(axis=1)
         return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)
 
     @property
@@ -173,28 +243,9 @@ class PreparedProjections:
         """True if projections of a parallel beam see beyond the slices of the volume, because they are shifted along
         the axis or tilted.
         """
-        moved = np.ptp(self.geometry.shifts[:, 1]) > 0
-        return not self.geometry.is_cone and (bool(moved) or not self.geometry.is_straight)
-
-    @property
-    def views(self) -> Views:
-        """The projections used, with weights that are computed on request."""
-        weights: Any = self.ray_factors()
-        return Views(self.projections.data, self.geometry, weights, self.reach)
-
-    @property
-    def views_held_out(self) -> Views | None:
-        """The held-out projections, with weights that are computed on request; None if all projections are used."""
-        if self.held_out is None:
-            return None
-        weights, n = self.ray_factors(self.held_out.geometry.n_views), self.geometry.n_views
-        later: Any = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
-        return replace(self.held_out, weights=later)
-
-    def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
-        """Weights [view, row, col] from `ray_factors`, read-only."""
-        factors = self.ray_factors(others)
-        return None if factors is None else factors[...]
+        geometry = self.geometry
+        moved = np.ptp(geometry.shifts[:, 1]) > 0
+        return not geometry.is_cone and (bool(moved) or not geometry.is_straight)
 
     @property
     def without_warnings(self) -> PreparedProjections:
@@ -202,53 +253,34 @@ class PreparedProjections:
         shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
         return replace(self, view_weights=None, shares=shares, shares_of=None)
 
-    def ray_factors(self, others: int = 0) -> RayWeights | None:
-        """Weights [view, row, col], computed only on request; None if all rays have weight 1.
+    def _ray_factors(self) -> RayWeights | None:
+        """Weights of all projections, computed only on request; None if all rays have weight 1.
 
-        Args:
-            others: held-out projections, appended to these. Without weights of their own they get weight 1, the
-                weight of a usual ray of these.
+        Held-out projections have the weight of a usual ray of those used, unless their photons were counted, too.
         """
         factors: list[NDArray[np.float32]] = []
+        n, geometry = self.n_used, self.geometry
+        others = len(self.lines.data) - n
         if self.view_weights is not None:
             factors.append(_and_ones(self.view_weights, others)[:, None, None])
-        if (counted := self.projections.weights) is not None:
-            usual, unseen = counted.mean(where=counted > 0), None if self.held_out is None else self.held_out.weights
-            if unseen is not None and len(unseen) == others:
-                factors.append(np.concatenate((counted, unseen)) / usual)
-            else:
-                factors.append(_and_ones(counted / usual, others))
+        if (counted := self.lines.weights) is not None:
+            factors.append(counted / (used := counted[:n]).mean(where=used > 0))
         if self.measured is not None:
             factors.append(self.measured.astype(np.float32)[None])
         if self.leaves_slices:
-            seen = seen_rays(self.geometry, grid := Grid.matching(self.geometry))
-            held = np.ones((others, 1, 1), np.bool_)
-            if self.held_out is not None and others == self.held_out.geometry.n_views:
-                held = seen_rays(self.held_out.geometry, grid)
-            rays = np.broadcast_shapes(seen.shape[1:], held.shape[1:])
-            factors.append(np.concatenate([np.broadcast_to(part, (len(part), *rays)) for part in (seen, held)]))
-            factors[-1] = factors[-1].astype(np.float32)
+            grid = Grid.matching(geometry)
+            factors.append(seen_rays(self.lines.geometry, grid).astype(np.float32))
         if self.shares is not None:
             factors.append(_and_ones(self.shares, others))
         if not factors:
             return None
-        shape = (self.geometry.n_views + others, *self.geometry.detector_shape)
+        shape = (n + others, *geometry.detector_shape)
         return RayWeights(tuple(np.broadcast_to(factor, shape) for factor in factors))
 
 
 def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
     """The values of projections, and ones for others after them."""
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
-
-
-def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
-    """Used and held-out projections as one set, and the indices of the held-out projections in this set. The geometries
-    of both belong to the same set-up.
-    """
-    if held_out is None:
-        return projections, geometry, []
-    together = geometry.followed_by(held_out.geometry)
-    return np.concatenate((projections, held_out.data)), together, list(range(geometry.n_views, together.n_views))
 
 
 def hold_out(
@@ -263,23 +295,12 @@ def hold_out(
     Raises:
         ConfigError: fewer than two projections would be left.
     """
-    if prepared.held_out is not None:
+    if prepared.lines.held_out.size:
         return prepared
-    n = prepared.geometry.n_views
+    n = prepared.n_used
     count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
         raise ConfigError(f"{n} projections are too few to hold some out; choose more with --views, or {advice}.")
     # Neither the first nor the last: these have a neighbour on one side only.
-    held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
-    return with_views_held_out(prepared, held)
-
-
-def with_views_held_out(prepared: PreparedProjections, held: I64) -> PreparedProjections:
-    """The same projections with those of these numbers, sorted, held out."""
-    projections = prepared.projections
-    return replace(
-        prepared.of_views(np.setdiff1d(np.arange(prepared.geometry.n_views), held)),
-        held_out=Views(projections.data, prepared.geometry, projections.weights).select(held),
-        held_out_ids=projections.view_ids[held],
-    )
+    return prepared.holding_out(np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64))

@@ -61,9 +61,8 @@ def warn_of_the_field(scan: SelectedScan, prepared: PreparedProjections, warn: W
     """Warn of a sample beyond the field of view. If no air corrects the intensity, also warn of its changes and of
     the ring current.
     """
-    projections, geometry = prepared.projections, prepared.geometry
-    edges = reach_of(prepared.views).edges
-    unlevelled = not any(projections.air_columns)
+    geometry, edges = prepared.geometry, reach_of(prepared.seen).edges
+    unlevelled = not any(prepared.corrected.air_columns)
     if sides := edges.beyond():
         light = ""
         if unlevelled and scan.evidence.in_counts and scan.selection.step(Air).model != "none":
@@ -123,22 +122,22 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         first_row: row of the detector at which the (binned) rows begin.
     """
     what = "slice" if prepared.geometry.rows_show_slices else "row"
-    projections, (lost, between) = prepared.projections, prepared.unmeasured_rows
-    masked, runs = projections.masked.copy(), projections.unmeasured
+    corrected, (lost, between) = prepared.corrected, prepared.unmeasured_rows
+    masked, runs = corrected.masked.copy(), corrected.unmeasured
     masked[lost] = False
-    unseen, runs = areas(projections.masked) & masked, runs[~np.isin(runs[:, 1], lost)]
+    unseen, runs = areas(corrected.masked) & masked, runs[~np.isin(runs[:, 1], lost)]
     if runs.size:
         frames, within = np.unique(runs[:, 0]), first_row + np.arange(binning)
         rows = spans((binning * np.unique(runs[:, 1])[:, None] + within).ravel().tolist(), 4)
         ends = np.unique(runs[:, 2:], axis=0) * binning
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
-            f"In {count(frames.size, 'projection')} of {projections.view_ids.size} "
+            f"In {count(frames.size, 'projection')} of {prepared.n_used} "
             f"({frames_text(frames)}), pixels of columns {cols} and rows {rows} contain no data and are "
             "ignored. Either the images were shifted or rotated before (zeros or NaN at a border), or "
             "something opaque other than the sample stood in the beam, such as a post or a clamp."
         )
-    if n := projections.spots_left:
+    if n := corrected.spots_left:
         large = "Shield the detector against scattered and direct X-rays: bright spots larger than 3 x 3 pixels"
         warn(Note(f"{large} ({count(n, 'pixel')} brighter than the open beam) are not removed and make streaks."))
     shares = (
@@ -153,13 +152,13 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
             "of the detector's pixels are dead or hot. They were replaced with values of neighbouring pixels.",
         ),
         (
-            projections.replaced,
+            corrected.replaced,
             Note,
             "of the pixels were zingers (bright spots in one projection only) or not finite. They were "
             "replaced with values of neighbouring pixels.",
         ),
         (
-            projections.floored,
+            corrected.floored,
             str,
             "of the pixels transmit less than the smallest transmission that is used (--floor). The true "
             "attenuation there is at least what the volume shows, unless the darks are too high.",

@@ -32,7 +32,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
         settings: of the fit, or a method: a dataclass.
         others: seed, start and similar values, by name.
     """
-    data = np.ascontiguousarray(prepared.projections.data, np.float32)
+    data = np.ascontiguousarray(prepared.seen.data, np.float32)
     out: dict[str, Value] = {
         "projections": hashlib.sha256(data.data).hexdigest(),
         "n_views": prepared.geometry.n_views,

@@ -73,7 +73,7 @@ def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableVi
                 continue
             if done[step.name].sentence:
                 live.tell_done({step.name: done[step.name]})
-                state.fit.replace_views(prepared.centred.projections.measured)
+                state.fit.replace_views(prepared.centred.with_gaps)
     return with_reach(scan, replace(prepared, done=done))
 
 

@@ -249,9 +249,9 @@ def _for_method(
         channels.warn(
             "--cluster was not used, because the volume fits into memory. With a smaller --memory it is made in slabs."
         )
-    if options.method.stops_early and prepared.held_out is None:
+    if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n = prepared.projections.view_ids.size
+        n = prepared.n_used
         message = (
             f"{prepared.n_projections - n} of {prepared.n_projections} projections are held out to decide when to stop"
         )

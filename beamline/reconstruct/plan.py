@@ -20,7 +20,7 @@ from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.prepare import DiskBuffer, prepare_projections
+from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import SelectedScan, check_axis
 from beamline.reconstruct.memory import (
@@ -118,8 +118,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     """
     geometry = prepared.geometry
     method, shares = options.method, prepared.shares
-    differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
-    weighted, reach = differ if method.weighs else shares is not None, prepared.reach
+    differ = not plan.slabs or prepared.views.weights is not None or prepared.shares_of is not None
+    weighted, reach = differ if method.weighs else shares is not None, prepared.lines.reach
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         reach=reach if method.knows_outside else None,
@@ -239,16 +239,17 @@ def prepare_within(
         )
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
-        shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
+        shape = (needs.geometry.n_views + HELD_OUT_VIEWS, *needs.geometry.detector_shape)
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
 
     prepared = prepare_projections(
         scan, warn, buffer, lambda geometry: refuse_geometry(scan, options, plan, geometry), phases
     )
     if "times" in options.method.takes:
-        prepared = replace(prepared, times=times_of(scan.source, prepared.projections.view_ids, warn))
+        prepared = replace(prepared, times=times_of(scan.source, prepared.ids, warn))
     if options.method.knows_outside:
-        prepared = replace(prepared, reach=whole_reach(prepared.views))
+        reach = whole_reach(prepared.views.seen)
+        prepared = replace(prepared, lines=replace(prepared.lines, reach=reach))
     return prepared, of_views(scan.source, options, plan, prepared)
 
 

@@ -205,7 +205,7 @@ def parameters_of(result: Reconstruction, prepared: PreparedProjections, context
         "axis_col": prepared.axis_col,
         **_axis_parameters(prepared.axis),
         "views": selection.views,
-        "view_frames": prepared.projections.view_ids,
+        "view_frames": prepared.ids,
         "view_angles_deg": np.degrees(geometry.angles),
         "n_views": geometry.n_views,
         "n_projections": prepared.n_projections,
@@ -219,9 +219,9 @@ def parameters_of(result: Reconstruction, prepared: PreparedProjections, context
         "quantity": prepared.quantity,
         **done,
         **_pose_parameters(geometry),
-        "floored_fraction": float(prepared.projections.floored),
-        "masked_fraction": float(prepared.projections.masked.mean()),
-        "replaced_fraction": float(prepared.projections.replaced),
+        "floored_fraction": float(prepared.corrected.floored),
+        "masked_fraction": float(prepared.corrected.masked.mean()),
+        "replaced_fraction": float(prepared.corrected.replaced),
         "filter": context.filter,
         "seed": context.seed,
         **_flat("", result.settings),
@@ -229,7 +229,7 @@ def parameters_of(result: Reconstruction, prepared: PreparedProjections, context
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
     }
-    parts = np.unique(prepared.projections.unmeasured[:, 0]), prepared.unmeasured_rows[0]
+    parts = np.unique(prepared.corrected.unmeasured[:, 0]), prepared.unmeasured_rows[0]
     unmeasured = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
     parameters |= {name: numbers for name, numbers in unmeasured if numbers.size}
     if prepared.view_weights is not None:

@@ -199,11 +199,11 @@ def box_around_sample(scan: SelectedScan) -> Region:
     unlearnt = (type(step)() for step in geometry_steps(selection))
     look = scan.selecting(replace(selection.asked, views=views, binning=side * coarse).with_steps(*unlearnt))
     prepared = prepare_projections(look, lambda warning: None)  # they come again, of the views used
-    data, geometry = prepared.projections.data, prepared.geometry
+    data, geometry = prepared.seen.data, prepared.geometry
     grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
-    if cut := reach_of(prepared.views).beyond:
+    if cut := reach_of(prepared.seen).beyond:
         where = " and the ".join(cut)
         return _uncut(
             height, across, f"the sample extends beyond the field of view at the {where}, so it has no edge there"

@@ -278,7 +278,7 @@ def _doubts(
 
 def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     """Pictures of a corrected projection, a sinogram, the search for the axis, and the poses."""
-    data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
+    data, geometry, unit, axis = prepared.seen.data, prepared.geometry, prepared.length_unit, prepared.axis
     yield Picture(
         "Projection",
         f"One corrected projection: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air should "

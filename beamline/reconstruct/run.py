@@ -16,14 +16,13 @@ import numpy as np
 import recon
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
-from beamline.projections.prepared import PreparedProjections, with_held_out
+from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
 from beamline.storage.disk_file import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
-from recon.base.arrays import F32
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
@@ -56,16 +55,15 @@ def run_on(
 def views_for(method: Method, prepared: PreparedProjections) -> tuple[Views, DataUse]:
     """The projections, and how they are used, in the form that the method expects."""
     prepared = prepared.wanted(method.views_wanted(prepared.geometry))
-    data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
-    if "held_out" in method.takes:
-        data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    weights, times = _weights(method, prepared, len(held_out)), prepared.times if "times" in method.takes else None
-    return Views(data, geometry, weights, prepared.reach), DataUse(held_out=held_out, times=times)
+    views = prepared.views if "held_out" in method.takes else prepared.views.seen
+    return _weighed(method, prepared, views), DataUse(times=prepared.times if "times" in method.takes else None)
 
 
-def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -> F32 | None:
-    """Weights of the rays for a method. In data on disk, rays of weight 0 were filled, as a direct method does it."""
-    return prepared.ray_weights(held_out) if method.weighs or not prepared.on_disk else None
+def _weighed(method: Method, prepared: PreparedProjections, views: Views) -> Views:
+    """The projections with the weights of the rays for a method, in memory. In data on disk, rays of weight 0 were
+    filled, as a direct method does it."""
+    unweighed = views.weights is None or (prepared.on_disk and not method.weighs)
+    return replace(views, weights=None if unweighed else views.weights[...])
 
 
 def without_outside(prepared: PreparedProjections, result: Reconstruction) -> PreparedProjections:
@@ -74,14 +72,13 @@ def without_outside(prepared: PreparedProjections, result: Reconstruction) -> Pr
     """
     if result.outside is None:
         return prepared
-    for first in range(0, prepared.geometry.n_views, _AT_ONCE):
+    lines = prepared.lines
+    for first in range(0, len(lines.data), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        prepared.projections.data[some] -= result.outside(prepared.geometry.select(some))
-    if (held := prepared.held_out) is not None:
-        held = replace(held, data=held.data - result.outside(held.geometry))
-    assert prepared.reach is not None
-    within = replace(prepared.reach, sample=None, tall=False, measured=True)
-    return replace(prepared, held_out=held, reach=within)
+        lines.data[some] -= result.outside(lines.geometry.select(some))
+    assert lines.reach is not None
+    within = replace(lines.reach, sample=None, tall=False, measured=True)
+    return replace(prepared, lines=replace(lines, reach=within))
 
 
 _AT_ONCE = 32  # projections that are computed together
@@ -204,7 +201,7 @@ def deviation_by_slabs(
         slab = parts[n]
         rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
         part = prepared.of_rows(rows, geometry)
-        if not part.projections.data.any():
+        if not part.seen.data.any():
             continue
         here = Volume(np.ascontiguousarray(volume.data[slab.slices]), box)
         bars = _bars(method, part, options, here, decided, control)
@@ -222,6 +219,6 @@ def _bars(
     method: Method, prepared: PreparedProjections, options: ReconOptions, volume: Volume, decided: DecisionValues,
     control: RunControl,
 ) -> ErrorBars | None:  # fmt: skip
-    views = Views(prepared.projections.data, prepared.geometry, _weights(method, prepared))
+    views = _weighed(method, prepared, prepared.views.seen)
     problem = ReconProblem(views, volume.grid, seed=options.seed, device=options.device)
     return error_bars(method, problem, volume, decided, replace(control, decide=None))

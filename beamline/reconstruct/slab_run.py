@@ -164,7 +164,7 @@ class _SlabJob:
         control = replace(self.control, decide=decide, on_progress=listen)
         rows, geometry, box = part_of(self.prepared.geometry, self.grid, slab.slices)
         part = self.prepared.of_rows(rows, geometry)
-        if not part.projections.data.any():
+        if not part.seen.data.any():
             return None, ""
         in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)
         try:
@@ -226,9 +226,9 @@ def _provenance(prepared: PreparedProjections, options: ReconOptions) -> dict[st
         rows = prepared.geometry.detector_shape[0]
         for first in range(0, rows, _WEIGHED):
             end = min(first + _WEIGHED, rows)
-            some = prepared.of_rows(slice(first, end), prepared.geometry.rows(first, end)).ray_weights()
+            some = prepared.of_rows(slice(first, end), prepared.geometry.rows(first, end)).views.seen.weights
             if some is not None:
-                weights.update(np.ascontiguousarray(some).data)
+                weights.update(np.ascontiguousarray(some[...]).data)
     others: dict[str, Value] = {
         "method": options.method.name, "seed": options.seed, "device": options.device, "program": version(),
     }  # fmt: skip
@@ -273,7 +273,7 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
     """Numbers of the slabs, beginning with the slab whose rows show the most material."""
-    data = prepared.projections.data
+    data = prepared.seen.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
     absorption = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
     best = int(np.argmax(absorption))

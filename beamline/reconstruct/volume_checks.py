@@ -83,7 +83,7 @@ def check_volume(
     progress = context.phases.progress
     judgement = judge(
         result.volume, prepared.views, truth,
-        held_out=prepared.views_held_out, aspects=aspects, seed=context.seed, time=time, progress=progress,
+        aspects=aspects, seed=context.seed, time=time, progress=progress,
     )  # fmt: skip
     metrics: dict[str, dict[str, float]] = {result.method: {**judgement.figures, "seconds": result.seconds}}
     hiding = _structure(result, judgement)
@@ -95,9 +95,7 @@ def check_volume(
             before = clock.now()
             fbp = _fbp(result, prepared, target, context)
             seconds, residual = clock.now() - before, aspects & Aspect.RESIDUAL
-            of_fbp = judge(
-                fbp, prepared.views, truth, held_out=prepared.views_held_out, aspects=residual, progress=progress
-            ).figures
+            of_fbp = judge(fbp, prepared.views, truth, aspects=residual, progress=progress).figures
             volumes = {BASELINE: fbp, **volumes}
             metrics = {BASELINE: {**of_fbp, "seconds": seconds}, **metrics}
         else:
@@ -123,9 +121,9 @@ def _aspects(result: Reconstruction, prepared: PreparedProjections, context: Rep
     if context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
-        show_more = prepared.reach is not None and prepared.reach.sample is not None
+        show_more = prepared.lines.reach is not None and prepared.lines.reach.sample is not None
     else:
-        show_more = bool(reach_of(prepared.views).beyond)
+        show_more = bool(reach_of(prepared.seen).beyond)
     if show_more:
         return Aspect.STRAY
     return Aspect.STRAY | Aspect.RESIDUAL | (Aspect.FIT if fitted else Aspect(0))
@@ -210,7 +208,7 @@ def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, con
     """The warning about projections that do not fit the volume, with frames and pixels of the worst; empty if none."""
     if not odd:
         return ""
-    frames, binning = prepared.projections.view_ids, context.selection.binning
+    frames, binning = prepared.ids, context.selection.binning
     first_row = (context.selection.rows or (0, 0))[0]
     places = [
         f"frame {frames[each.view]}, rows {first_row + each.rows[0] * binning} ... "
@@ -231,7 +229,7 @@ def _fbp(result: Reconstruction, prepared: PreparedProjections, target: OutputPa
     context.phases.enter("FBP for comparison", "slices")
     grid, on_disk = result.volume.grid, isinstance(result.volume.data, np.memmap)
     out = scratch_array(target.output.parent, grid.shape) if on_disk else None
-    lines, progress = prepared.projections.data, context.phases.progress
+    lines, progress = prepared.seen.data, context.phases.progress
     volume = direct(lines, prepared.geometry, grid, context.filter, progress, out)
     if (gain := density_gain(prepared.geometry)) != 1:
         volume *= np.float32(gain)

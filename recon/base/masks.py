@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -17,20 +14,6 @@ from recon.base.jit import njit
 Image = NDArray[np.float32]
 Fill = tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.intp]]
 """For each pixel [row, col] its ring, counted from outside (0: not masked); rows and columns in the order of rings."""
-
-
-@dataclass(frozen=True, eq=False)
-class RayWeights:
-    """Weights of rays [view, row, col] as a product; only the requested part is computed.
-
-    Attributes:
-        factors: at least one array, float32 [view, row, col] after numpy.broadcast_to.
-    """
-
-    factors: tuple[Image, ...]
-
-    def __getitem__(self, part: Any) -> Image:
-        return functools.reduce(np.multiply, (factor[part] for factor in self.factors))
 
 
 def plan_fill(mask: Mask) -> Fill:

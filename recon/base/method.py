@@ -152,7 +152,7 @@ class ReconProblem:
 
     Attributes:
         views: line integrals with the weights of their rays.
-        use: how the projections are used; its weights are those of `views`.
+        use: how the projections are used; its weights and its held-out projections are those of `views`.
     """
 
     views: Views
@@ -162,7 +162,8 @@ class ReconProblem:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "use", replace(self.use, weights=self.views.weights))
+        held_out = tuple(self.views.held_out.tolist())
+        object.__setattr__(self, "use", replace(self.use, weights=self.views.weights, held_out=held_out))
 
     @property
     def projections(self) -> F32:

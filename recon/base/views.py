@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import re
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,20 +130,15 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
 
 
-def used_and_kept_back(
-    n_views: int, held_out: tuple[int, ...], early_stop: bool
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of the projections that a fit uses, and of the held-out ones, ascending.
+def used_views(n_views: int, held_out: Sequence[int]) -> NDArray[np.bool_]:
+    """[view] False for the projections with these numbers, which are held out.
 
     Raises:
-        ValueError: a number is not that of a projection, all projections are held out, or none is and `early_stop`
-            needs some.
+        ValueError: a number is not that of a projection, or all projections are held out.
     """
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
         raise ValueError(f"held_out must be projection numbers 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
     if kept_back.size >= n_views:
         raise ValueError(f"all {n_views} projections are held out, so none is left for the fit; hold out fewer")
-    if early_stop and not kept_back.size:
-        raise ValueError("early_stop needs held-out projections; state some with held_out")
-    return np.setdiff1d(np.arange(n_views), kept_back), kept_back
+    return ~np.isin(np.arange(n_views), kept_back)

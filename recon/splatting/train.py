@@ -19,7 +19,6 @@ from recon.base.masks import usual_weight
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.ray_width import NO_WIDTH
 from recon.base.view_data import Views
-from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
@@ -82,15 +81,17 @@ class _FitViews:
                 f"{problem.geometry.width} into account",
                 stacklevel=3,
             )
-        used, apart = used_and_kept_back(problem.geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         views = problem.views.masked()
+        if method.early_stop and not views.held_out.size:
+            raise ValueError("early_stop needs held-out projections; state some with held_out")
         # only ratios of weights matter, because total variation has its own weight
         if (rays := views.weights) is not None:
             views = replace(views, weights=rays / np.float32(usual_weight(rays, views.data)))
-        blank = apart[~views.data[apart].any(axis=(1, 2))]
+        kept_back = views.unseen
+        blank = views.held_out[~views.data[views.held_out].any(axis=(1, 2))]
         if blank.size:
             raise ValueError(f"held_out: projections {blank.tolist()} are zero everywhere; hold out others")
-        measured, start = views.select(used), method.gaussians
+        measured, start = views.seen, method.gaussians
         geometry = _of_steps(measured.geometry, problem.device)
         pixel_grid = Grid.for_fit(_of_steps(views.geometry, problem.device), problem.grid)
         usual = default_count(geometry, pixel_grid.voxel_size)
@@ -102,7 +103,6 @@ class _FitViews:
         )  # fmt: skip
         seen = join_pixels(replace(measured, geometry=geometry), joined)
         field = Grid.for_fit(seen.geometry, problem.grid, wider=problem.wide)
-        kept_back = views.select(apart) if apart.size else None
         return cls(replace(problem, views=measured), kept_back, joined, seen, field, count)
 
     def unseen(self, problem: FitProblem, settings: FitSettings, unit: float) -> FitProblem | None:
@@ -223,7 +223,7 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
     settings, state = run.settings, run.state
     record = {
         **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
-        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": tuple(problem.use.held_out),
+        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": problem.use.held_out,
         "device": problem.device, "finish": sweeps, "joined_pixels": views.joined,
         "tv_weight": tv_weight(settings, run.fitting, state.limit), "tv_size": tv_size(settings, views.field),
         **(decide.settings if sweeps else {}),

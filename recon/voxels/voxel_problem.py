@@ -231,7 +231,7 @@ class VoxelProblem:
         projector, rays = self.units.projector(self.projector, 1), self.weight
         data = times_power(projection_images(self.views).copy(), self.units.integral)
         weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
-        views = Views(data, projector.geometry, weights, self.reach)
+        views = Views(data, projector.geometry, weights, reach=self.reach)
         return ReconProblem(views, projector.grid, device=projector.device)
 
     @property

@@ -14,11 +14,12 @@ from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrectionPlan
 from beamline.projections.growing import FedCorrection, feed
 from beamline.projections.prepare import DiskBuffer, prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.views import select
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.prep.projections import Projections, merge_and_empty
 
 
@@ -54,6 +55,7 @@ def prepared_views(
     n = geometry.n_views
     masked = np.zeros(geometry.detector_shape, np.bool_)
     whole = Projections(data, np.arange(n), 0.0, np.ones(n, np.float32), masked, weights=weights)
-    return PreparedProjections(whole, geometry, geometry.axis_col, None, **{
-        "held_out": None, "n_projections": n, "length_unit": "mm", "quantity": "counts", **more
+    lines = Views(data, geometry, weights, np.arange(n))
+    return PreparedProjections(lines, Corrected.of(whole), geometry.axis_col, None, **{
+        "n_projections": n, "length_unit": "mm", "quantity": "counts", **more
     })  # fmt: skip

@@ -76,7 +76,7 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     assert geometry.period == pytest.approx(2 * np.pi)
     grid = Grid.matching(geometry)
-    volume = fdk(prepared.projections.data, geometry, grid, "hann")
+    volume = fdk(prepared.seen.data, geometry, grid, "hann")
     z, y, x = grid.coordinates()
     inside = ((z[:, None, None] - CENTRE[2]) ** 2 + (y[:, None] - CENTRE[1]) ** 2 + (x - CENTRE[0]) ** 2) < 0.12**2
     assert volume[inside].mean() == pytest.approx(MU, rel=0.03)

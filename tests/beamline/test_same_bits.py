@@ -167,12 +167,11 @@ def _spied(module: str, found: dict[str, str]) -> Any:
     write = __import__(module, fromlist=["write_result"]).write_result
 
     def noted(made: Any, prepared: Any, *rest: Any, **named: Any) -> Any:
-        views, geometry = prepared.projections, prepared.geometry
-        weights = prepared.ray_weights()
+        views, apart, geometry = prepared.views.seen, prepared.views.unseen, prepared.geometry
         found["line integrals"] = _digest(views.data)
-        found["views"] = _digest(views.view_ids, geometry.angles, geometry.shifts, np.float64(geometry.axis_col))
-        found["weights"] = "" if weights is None else _digest(weights)
-        found["held out"] = "" if prepared.held_out is None else _digest(prepared.held_out.data)
+        found["views"] = _digest(views.ids, geometry.angles, geometry.shifts, np.float64(geometry.axis_col))
+        found["weights"] = "" if views.weights is None else _digest(views.weights[...])
+        found["held out"] = "" if apart is None else _digest(apart.data)
         return write(made, prepared, *rest, **named)
 
     return patch(f"{module}.write_result", noted)

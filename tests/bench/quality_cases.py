@@ -155,8 +155,8 @@ def diamond(folder: Path, views: int) -> Case:
 
     with SourceOptions(folder / "diamond_24737_parallel_91x135x160.h5").open() as source:
         prepared = prepare_projections(select(source, Selection(rows=(65, 97), axis_col=85.75)), lambda _: None)
-    data, rays = np.asarray(prepared.projections.data), prepared.without_warnings.ray_weights()
-    rays = np.ones_like(data) if rays is None else np.broadcast_to(rays, data.shape)
+    data, rays = np.asarray(prepared.seen.data), prepared.without_warnings.views.seen.weights
+    rays = np.ones_like(data) if rays is None else rays[...]
     judges = np.arange(3, 91, 6)
     others = np.setdiff1d(np.arange(91), judges)
     chosen = others[np.linspace(0, others.size - 1, views).round().astype(int)]

@@ -39,7 +39,7 @@ def _scan(name: str, quantity: str | None = None, **chosen: object) -> Views:
     """Corrected views of a scan file."""
     with SourceOptions(_DATA / name, quantity=quantity).open() as source:  # type: ignore[arg-type]
         prepared = prepare_projections(select(source, Selection(**chosen)), lambda warning: None)  # type: ignore[arg-type]
-    return np.ascontiguousarray(prepared.projections.data, np.float32), prepared.geometry
+    return np.ascontiguousarray(prepared.seen.data, np.float32), prepared.geometry
 
 
 def _walnut(views: int, rows: int, binning: int = 1) -> Views:

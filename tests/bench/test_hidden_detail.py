@@ -45,7 +45,7 @@ def _volume(path: Path, rows: slice, name: str) -> F32:
     with warnings.catch_warnings(), open_scan(path) as scan:
         warnings.simplefilter("ignore")
         prepared = prepare_projections(select(scan, Selection(steps=(Rings(rings),))), lambda _: None)
-    data = np.ascontiguousarray(prepared.projections.data[:, rows])
+    data = np.ascontiguousarray(prepared.seen.data[:, rows])
     geometry = prepared.geometry.rows(rows.start, rows.start + data.shape[1])
     return recon.reconstruct(data, geometry, method, grid=recon.Grid.matching(geometry)).volume.data
 

@@ -32,7 +32,7 @@ METHODS = {"FISTA-TV": recon.FistaTv(), "r2": recon.R2(), "SIRT": recon.Sirt()}
 def _volume(shared_data: Path, method: recon.Method, air: str) -> NDArray[np.float32]:
     with open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as scan:
         prepared = prepare_projections(select(scan, Selection(steps=(Air(air),))), lambda _: None)
-    return recon.reconstruct(prepared.projections.data, prepared.geometry, method).volume.data
+    return recon.reconstruct(prepared.seen.data, prepared.geometry, method).volume.data
 
 
 def mass(volume: NDArray[np.float32]) -> float:

@@ -98,7 +98,7 @@ class TrialData(TrialScan):
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[dict[str, float], list[float]]:
         """Figures of merit of a volume, and the squared residual of each held-out projection."""
         truth = None if self.truth is None else Volume(self.truth, made.grid)
-        judged = judge(made, self.prepared.views, truth, held_out=self.prepared.views_held_out)
+        judged = judge(made, self.prepared.views, truth)
         figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
         if (reference := self.references.get(trial.method)) is not None:
             figures["psnr_all"] = metrics.psnr(reference, made.data)
@@ -120,12 +120,12 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
         return middle
     angles = prepared.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
-    geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
+    whole, apart = prepared.lines, middle.without_held_out.lines
     weights: F32 | None = whole.weights
-    lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
+    data = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
     weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
-    means = replace(middle.projections, data=lines, weights=weights)
-    return replace(middle, projections=means, geometry=geometry)
+    means = replace(apart, data=data, geometry=replace(apart.geometry, angles=angles), weights=weights)
+    return replace(middle, lines=means)
 
 
 def run_trial(

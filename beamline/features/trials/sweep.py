@@ -166,12 +166,14 @@ class SweptScan(TrialScan):
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
         """The residual of the held-out projections, as this trial corrects them, and its square in each projection."""
         used = self._used
-        assert used is not None and used.held_out is not None and used.held_out_ids is not None and self._views
-        projector, data = Projector(used.held_out.geometry, made.grid), used.held_out.data
+        assert used is not None and self._views is not None
+        apart = used.lines.unseen
+        assert apart is not None and apart.ids is not None
+        projector, data = Projector(apart.geometry, made.grid), apart.data
         data = data if used.measured is None else np.where(used.measured, data, np.float32(np.nan))
         model = projector.forward(np.asarray(made.data))
         unseen = UnseenViews(
-            used.held_out_ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
+            apart.ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
         )
         self.unseen[trial.label] = unseen
         squares = squares_left(unseen.model, unseen.data, None, unseen.resolution)
@@ -226,14 +228,13 @@ def middle_axis(selections: Sequence[Selection]) -> float | None:
 
 def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProjections:
     """The same views about the axis of the selection."""
-    assert prepared.held_out is not None and selection.axis_col is not None
-    unseen, n = prepared.held_out, selection.binning
-    axis_col = (selection.axis_col - (n - 1) / 2) / n
+    assert selection.axis_col is not None
+    lines, n = prepared.lines, selection.binning
+    geometry = replace(lines.geometry, axis_col=(selection.axis_col - (n - 1) / 2) / n)
     return replace(
         prepared,
-        geometry=replace(prepared.geometry, axis_col=axis_col),
+        lines=replace(lines, geometry=geometry),
         axis_col=selection.axis_col,
-        held_out=replace(unseen, geometry=replace(unseen.geometry, axis_col=axis_col)),
     )
 
 

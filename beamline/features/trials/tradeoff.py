@@ -75,7 +75,7 @@ def planned_study(
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
     references = tuple(trial(method, whole) for method in dict.fromkeys((BASELINE, *scan.methods)))
-    data = replace(data, prepared=replace(data.prepared, held_out=None))
+    data = replace(data, prepared=data.prepared.without_held_out)
     return Planned(partial(with_references, data, references), table)
 
 

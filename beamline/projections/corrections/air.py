@@ -108,12 +108,12 @@ class Air:
     ) -> StepDone:
         from recon.base.masks import areas
 
-        air = views.projections.air
+        air = views.corrected.air
         levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
         sentence, terms = without_background(
-            views.views, self.surface, views.held_out, areas(views.projections.masked), levelled
+            views.seen, self.surface, views.lines.unseen, areas(views.corrected.masked), levelled
         )  # fmt: skip
-        line = any(views.projections.air_columns)
+        line = any(views.corrected.air_columns)
         nothing = (
             "no polynomial subtracted, only a straight line through the air at the edges"
             if line

@@ -22,6 +22,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.features.iterative.methods import Sirt
 from splatline_cluster import Cluster, WorkersLostError, connected
@@ -58,7 +59,7 @@ def test_the_work_of_a_lost_worker_is_done_again(two: Cluster, tmp_path: Path) -
     use, control = DataUse(), RunControl(decide=Decisions(0))
     method = DiesOnce(iterations=3, marker=str(tmp_path / "died"))
     grid = Grid.matching(views)
-    found = two.reconstruct(data, views, method, grid=grid, seed=0, device="cpu", use=use, control=control)
+    found = two.reconstruct(Views(data, views), method, grid=grid, seed=0, device="cpu", use=use, control=control)
     assert (tmp_path / "died").exists()
     np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, views, Sirt(iterations=3)).volume.data)
 
@@ -108,7 +109,7 @@ def test_a_slab_that_nobody_returns_is_an_error_and_not_left_to_another_method()
     rest = {"grid": Grid.matching(views), "seed": 0, "device": "cpu", "use": DataUse(), "control": RunControl()}
     for error in (killed, CancelledError("gone")):
         with pytest.raises(WorkersLostError, match="was lost, or several workers"):
-            Cluster(1, Losing(error)).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
+            Cluster(1, Losing(error)).reconstruct(Views(np.zeros((2, 1, 4), np.float32), views), Sirt(), **rest)  # type: ignore[arg-type]
     assert not issubclass(WorkersLostError, DataError)
 
 
@@ -132,7 +133,7 @@ def test_without_any_worker_it_ends_after_the_time_stated() -> None:
         ):
             pytest.fail("there is nobody to do anything")
         with pytest.raises(WorkersLostError, match=r"for 0\.2 s"):
-            Cluster(1, client, patience=0.2).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
+            Cluster(1, client, patience=0.2).reconstruct(Views(np.zeros((2, 1, 4), np.float32), views), Sirt(), **rest)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("spec", ["local", "local:0", "slurm", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])

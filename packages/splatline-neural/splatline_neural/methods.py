@@ -143,7 +143,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
             f"the width of rays ({geometry.width}) is ignored, because a neural field supports only thin rays",
             stacklevel=2,
         )
-    used = np.setdiff1d(np.arange(geometry.n_views), np.asarray(problem.use.held_out, int))
+    used = np.setdiff1d(np.arange(geometry.n_views), problem.views.held_out)
     given = problem.views.masked()
     data, weights = given.data, given.weights
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)

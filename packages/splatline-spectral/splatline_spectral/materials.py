@@ -186,18 +186,18 @@ def joined(
         selection = replace(selection, axis_col=parts[0].axis_col)
     if parts[0].length_unit != "mm":
         raise ConfigError("The scans must state the pixel size, because the spectra are in 1/mm. Nothing was written.")
-    first, weights = parts[0].geometry, [part.ray_weights() for part in parts]
+    first, weights = parts[0].geometry, [part.views.seen.weights for part in parts]
     geometry = first
     for number, own in enumerate((part.geometry for part in parts[1:]), 2):
         _refuse_unlike(first, own, number, _PIXELS_ALIKE if registered else 1e-6)
         displaced = np.array([own.axis_col - first.axis_col, 0.0])
         own = replace(own, pixel_pitch=first.pixel_pitch, shifts=own.shifts + displaced)
         geometry = geometry.followed_by(own)
-    data = np.concatenate([part.projections.data for part in parts])
+    data = np.concatenate([part.seen.data for part in parts])
     weight = None
     if any(each is not None for each in weights):
-        shapes = [part.projections.data.shape for part in parts]
-        filled = [np.ones(shape) if each is None else each for each, shape in zip(weights, shapes, strict=True)]
+        shapes = [part.seen.data.shape for part in parts]
+        filled = [np.ones(shape) if each is None else each[...] for each, shape in zip(weights, shapes, strict=True)]
         broad = [np.broadcast_to(each, shape) for each, shape in zip(filled, shapes, strict=True)]
         weight = np.concatenate(broad).astype(np.float32)
         data = np.where(weight > 0, data, np.float32(0))

@@ -301,7 +301,8 @@ def parts_of(
                 "the memory"
             )
         prepared = prepare_projections(picked, warn)
-    views, order = prepared.views, np.argsort(np.mod(prepared.geometry.angles, prepared.geometry.period), kind="stable")
+    views, geometry = prepared.views.seen, prepared.geometry
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     in_pixels = facts.get("pixel_pitch_unit") == "px"
     scale = 1.0 if in_pixels else prepared.geometry.sample_pitch / record.grid.voxel_size  # to the volume's unit
     volumes = []

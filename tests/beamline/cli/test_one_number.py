@@ -35,11 +35,12 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     prepared = prepare_projections(select(source, Selection(views="every:3", axis_col=20.7)), lambda _: None)
     prepared = replace(prepared, view_weights=None)
     grid = Grid.matching(prepared.geometry)
-    volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
-    by_recon = judge(volume, prepared.views, held_out=prepared.views_held_out).figures["residual_held_out"]
-    assert prepared.held_out is not None and prepared.held_out_ids is not None
-    projector, ids = Projector(prepared.held_out.geometry, grid), prepared.held_out_ids
-    model, data = (projection_lines(each) for each in (projector.forward(volume.data), prepared.held_out.data))
+    volume = Volume(direct(prepared.seen.data, prepared.geometry, grid, "hann"), grid)
+    by_recon = judge(volume, prepared.views).figures["residual_held_out"]
+    apart = prepared.lines.unseen
+    assert apart is not None
+    projector, ids = Projector(apart.geometry, grid), apart.ids
+    model, data = (projection_lines(each) for each in (projector.forward(volume.data), apart.data))
     scores = sweep.scores_of({"a 1": sweep.UnseenViews(ids, data, model, projector.resolution, "")})
     assert scores is not None
     by_tradeoff, _ = trials.TrialData(prepared).measured(trial, volume)

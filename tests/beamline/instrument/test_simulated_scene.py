@@ -114,7 +114,7 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
     assert (geometry.is_cone, geometry.axis_col, geometry.axis_row) == (True, 21.0, 15.5)
     grid = Grid.matching(geometry)
     assert grid.voxel_size == pytest.approx(4.6e-3)
-    volume = fdk(prepared.projections.data, geometry, grid, "hann")
+    volume = fdk(prepared.seen.data, geometry, grid, "hann")
     weights = np.clip(volume, 10.0, None) - 10.0  # streaks are far below a third of 30/mm
     z, y, x = grid.coordinates()
     for axis, expected in ((x, 0.06), (y[:, None], 0.0), (z[:, None, None], 0.01)):

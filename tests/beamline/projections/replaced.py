@@ -79,5 +79,5 @@ class Blocks:
 def decibels(source: ArraySource, scale: float = 1.0) -> tuple[float, list[str]]:
     """PSNR of the FBP volume as a reconstruction makes it, and the messages."""
     found, told = prepare(source, Selection(axis_col=AXIS))
-    right, made = truth(scale), fbp(found.projections.data, found.geometry, filter="hann")
+    right, made = truth(scale), fbp(found.seen.data, found.geometry, filter="hann")
     return float(20 * np.log10(right.max() / np.sqrt(np.mean((made - right) ** 2)))), told

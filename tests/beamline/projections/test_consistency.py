@@ -34,9 +34,9 @@ def stretched() -> tuple[PreparedProjections, list[str]]:
 
 def told(views: np.ndarray, axis_col: float = AXIS, angles: np.ndarray = ANGLES) -> list[str]:
     scan, sentences = stretched()[0], list[str]()
-    projections = replace(scan.projections, data=views.astype(np.float32))
     geometry = Geometry.parallel(angles, VIEWS.shape[1:], axis_col=axis_col)
-    scan = replace(scan, projections=projections, geometry=geometry)
+    lines = replace(scan.lines, data=views.astype(np.float32), geometry=geometry, reach=None)
+    scan = replace(scan, lines=lines)
     whole = ScanSelection(asked=Selection(), shape=VIEWS.shape[1:], path=Path("scan.h5"), axis_col=axis_col)
     warn_of_inconsistency(scan, whole, sentences.append)
     return sentences

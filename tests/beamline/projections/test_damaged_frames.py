@@ -43,7 +43,7 @@ def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, i
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
     buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7) if on_disk else None
     prepared, told = prepare(path, replace(SELECTION, rows=rows), buffer)
-    np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
+    np.testing.assert_array_equal(prepared.ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
     said = " ".join(told)
     assert (
         ("frame 9 differs" in said and "frames 20-21 differ" in said) if on_disk else "frames 9, 20-21 differ" in said
@@ -53,7 +53,7 @@ def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, i
 
 def test_flags_ignore_uses_them_and_says_so(tmp_path: Path) -> None:
     prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), IGNORE)
-    assert prepared.projections.view_ids.size == 45
+    assert prepared.ids.size == 45
     assert "frame 9 differs from the stored checksum" in said and "used anyway" in said
 
 
@@ -64,7 +64,7 @@ def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
     spoilt, told = prepare(scan(tmp_path, 1, 3), SELECTION)
     assert "frames 1, 3 differ" in told[0] and "left out" in told[0]
     # One count is in the last pixel of the good second flat: 1/20000 of the light, half of it in the mean.
-    np.testing.assert_allclose(spoilt.projections.data, good.projections.data, atol=1e-4)
+    np.testing.assert_allclose(spoilt.seen.data, good.seen.data, atol=1e-4)
 
 
 @pytest.mark.parametrize(("rows", "kind"), others_slow([(FLATS, "flats"), (DARKS, "darks")]))
@@ -72,4 +72,4 @@ def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple
     path = scan(tmp_path, *rows, bit=0)
     with pytest.raises(DataError, match=f"all {kind} are damaged"):
         prepare(path, SELECTION)
-    assert prepare(path, IGNORE)[0].projections.view_ids.size == 45
+    assert prepare(path, IGNORE)[0].ids.size == 45

@@ -59,10 +59,10 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     """The likelihood chosen by itself, with the gain that the flats show."""
     behind = 0.3 * EXACT.max() < EXACT
     counted, logarithm = (prepare(scan(10), PLAIN.with_steps(Preparation(noise=way)))[0] for way in ("auto", "log"))
-    weights = counted.ray_weights()
-    assert weights is not None and logarithm.ray_weights() is None
-    assert abs(np.average((counted.projections.data - EXACT)[behind], weights=weights[behind])) < 0.03
-    assert np.mean((logarithm.projections.data - EXACT)[behind]) > 0.1
+    weights = counted.views.weights[...]
+    assert logarithm.views.weights is None
+    assert abs(np.average((counted.seen.data - EXACT)[behind], weights=weights[behind])) < 0.03
+    assert np.mean((logarithm.seen.data - EXACT)[behind]) > 0.1
     assert "10" in counted.done["noise"].sentence and logarithm.done["noise"].sentence == ""
 
 
@@ -94,20 +94,14 @@ def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
 def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
     prepared, _ = prepare(scan(20), PLAIN.with_steps(Preparation(noise="counts")))
     held = hold_out(prepared, 9, advice="")
-    weights = prepared.ray_weights()
-    left = held.ray_weights(3)
-    assert weights is not None and left is not None and held.projections.weights is not None
-    assert left.shape == (len(EXACT) - 5 + 3, *SCAN.shape)
-    assert held.held_out is not None and len(held.held_out.data) == 5
-    assert (left[-3:] == 1).all()  # other views than held
-    alike = held.ray_weights(5)
-    assert alike is not None
-    apart = np.setdiff1d(np.arange(len(EXACT)), held.projections.view_ids - prepared.projections.view_ids[0])
+    weights, alike = prepared.views.weights[...], held.views.weights[...]
+    assert held.lines.unseen is not None and len(held.lines.unseen.data) == 5
+    apart = np.setdiff1d(np.arange(len(EXACT)), held.ids - prepared.ids[0])
     both = np.concatenate((np.delete(weights, apart, 0), weights[apart]))
     np.testing.assert_allclose(alike / alike.mean(), both / both.mean(), rtol=1e-5)
-    rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).held_out
-    assert rows is not None and rows.weights is not None and held.held_out.weights is not None
-    np.testing.assert_array_equal(rows.weights, held.held_out.weights[:, 2:6])
+    rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).lines.unseen
+    assert rows is not None
+    np.testing.assert_array_equal(rows.weights, held.lines.unseen.weights[:, 2:6])
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:

@@ -13,7 +13,6 @@ from beamline.projections import axis as axis_module
 from beamline.projections.corrections.air import Air
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse
 from recon.base.views import spread_views
 from recon.prep.align import AxisEstimate
 from tests.beamline.array_source import ArraySource, counted
@@ -29,11 +28,11 @@ def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> Non
     path = write_exchange(tmp_path / "scan.h5", SCAN)
     prepared, warnings = prepare(path, FOUND)
     # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
-    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+    np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals(), atol=1e-4)
     assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
     assert prepared.geometry.axis_col == prepared.axis_col
     np.testing.assert_allclose(prepared.geometry.angles, SCAN.angles)
-    assert prepared.held_out is None
+    assert prepared.lines.unseen is None
     assert (prepared.length_unit, prepared.quantity, prepared.n_projections) == ("mm", "counts", 45)
     assert warnings == []
 
@@ -61,7 +60,7 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
     # Counts are averaged, then the logarithm taken.
     transmission = np.exp(-SCAN.line_integrals())[:, : shape[0] * binning, : shape[1] * binning]
     mean = transmission.reshape(45, shape[0], binning, shape[1], binning).mean(axis=(2, 4))
-    np.testing.assert_allclose(prepared.projections.data, -np.log(mean), atol=1e-4)
+    np.testing.assert_allclose(prepared.seen.data, -np.log(mean), atol=1e-4)
 
 
 def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
@@ -76,9 +75,9 @@ def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     prepared, _ = prepare(path, replace(GIVEN, views="first:10"))
     assert prepared.geometry.n_views == 10
     assert prepared.n_projections == 45
-    np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
-    assert prepared.held_out is not None
-    data, geometry = prepared.held_out.data, prepared.held_out.geometry
+    np.testing.assert_array_equal(prepared.ids, np.arange(4, 14))  # 2 darks and 2 flats come first
+    assert prepared.lines.unseen is not None
+    data, geometry = prepared.lines.unseen.data, prepared.lines.unseen.geometry
     assert data.shape == (16, 4, 40)
     assert geometry.angles.min() >= SCAN.angles[10]
     np.testing.assert_allclose(data, replace(SCAN, angles=geometry.angles).line_integrals(), atol=1e-4)
@@ -104,7 +103,7 @@ def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
     data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
     angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
     prepared, told = prepare(ArraySource(data, [2, 1] + [0] * n + [1], angles), GIVEN)
-    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+    np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals(), atol=1e-4)
     assert told == []
 
 
@@ -127,7 +126,7 @@ def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(fla
     prepared, told = prepare(exposed(flats), replace(GIVEN, binning=binning))
     shape = (45, 4 // binning, binning, 40 // binning, binning)
     expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
-    np.testing.assert_allclose(prepared.projections.data, expected, atol=1e-5)
+    np.testing.assert_allclose(prepared.seen.data, expected, atol=1e-5)
     assert told == []
 
 
@@ -138,7 +137,7 @@ def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     source.table.exposures[source.table.kinds == (0 if unknown == "flats" else 1)] = 7.0
     source.table.exposures[source.table.kinds == 2] = np.nan
     prepared, told = prepare(source, GIVEN)
-    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
+    np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals(), atol=1e-5)
     assert told == []
 
 
@@ -149,7 +148,7 @@ def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None
     prepared, warnings = prepare(path, FOUND)
     assert prepared.geometry.n_views == 43
     np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
-    np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
+    np.testing.assert_allclose(prepared.seen.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
     assert any(
         "2 of 45 projections have no finite pixel and are left out (first: frame 7)" in text for text in warnings
     )
@@ -162,9 +161,9 @@ def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     prepared, _ = prepare(path, Selection(), quantity="line_integrals")
     assert prepared.quantity == "line_integrals"
     left, right = data[3, 1, 19], data[3, 1, 21]
-    assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
-    data[3, 1, 20] = prepared.projections.data[3, 1, 20]
-    np.testing.assert_array_equal(prepared.projections.data, data)
+    assert prepared.seen.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
+    data[3, 1, 20] = prepared.seen.data[3, 1, 20]
+    np.testing.assert_array_equal(prepared.seen.data, data)
 
 
 def _estimate(value: float, confident: bool) -> AxisEstimate:
@@ -204,7 +203,7 @@ def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, t
     assert prepared.axis_col == pytest.approx(expected, abs=tolerance)
     assert prepared.axis is not None
     assert prepared.axis.confident
-    assert np.isfinite(prepared.projections.data).all()
+    assert np.isfinite(prepared.seen.data).all()
 
 
 @pytest.mark.parametrize("views", [1000, 1800, 2161])
@@ -227,8 +226,8 @@ def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wal
     assert lost in warnings
     assert prepared.measured is not None and not prepared.measured[:, :12].any() and prepared.measured[:, 12:].all()
     assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)
-    use = DataUse(prepared.ray_weights())
-    volume = recon.reconstruct(prepared.projections.data, prepared.geometry, "fista-tv", use=use).volume
+    views = replace(prepared.views, weights=prepared.views.weights[...])
+    volume = recon.reconstruct(views, method="fista-tv").volume
     truth = scan.truth(volume.grid)
     assert volume.data.max() < 1.5 * truth.max()
     assert float(volume.data[truth == 0].mean()) < 0.1 * float(truth[truth > 0].mean())

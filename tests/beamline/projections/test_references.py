@@ -62,10 +62,10 @@ def source(
 def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str) -> None:
     prepared, (line,) = prepare(source(end=end), SELECTION)
     # A mean of three flats with noise of 1 % is right to 0.6 %; a bad group would be off by far more.
-    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=0.03)
+    np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals(), atol=0.03)
     assert line.startswith(said) and line.endswith(f"The other {said.split()[1]} are used instead.")
     spoilt, told = prepare(source(end=end), ACCEPT)
-    assert np.abs(spoilt.projections.data - SCAN.line_integrals()).max() > 0.1
+    assert np.abs(spoilt.seen.data - SCAN.line_integrals()).max() > 0.1
     assert told[0].startswith("--references accept: ")
 
 

@@ -109,7 +109,7 @@ def volume(path: Path) -> Volume:
     """By the direct method, in mm."""
     prepared, _ = prepare(path, Selection(steps=(Air("none"),)))
     assert prepared.length_unit == "mm"
-    return prepared.stretched(recon.reconstruct(prepared.projections.data, prepared.geometry, "fbp").volume)
+    return prepared.stretched(recon.reconstruct(prepared.seen.data, prepared.geometry, "fbp").volume)
 
 
 def psnr(path: Path) -> float:

@@ -29,7 +29,7 @@ def stack(path: Path, values: np.ndarray, dtype: Any = np.float32) -> Path:
 
 
 def lines(path: Path, **facts: Any) -> np.ndarray:
-    return prepare(path, SELECTION, **FACTS, **facts)[0].projections.data
+    return prepare(path, SELECTION, **FACTS, **facts)[0].seen.data
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
@@ -70,4 +70,4 @@ def test_files_of_other_systems_state_it_likewise(tmp_path: Path, kind: str) -> 
     else:
         write_nxtomo(path, light, np.zeros(len(LINES), int), np.degrees(SCAN.angles))
     prepared, _ = prepare(path, SELECTION, quantity="transmission")
-    np.testing.assert_allclose(prepared.projections.data, LINES, atol=1e-5)
+    np.testing.assert_allclose(prepared.seen.data, LINES, atol=1e-5)

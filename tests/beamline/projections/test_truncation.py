@@ -40,11 +40,11 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
 @pytest.mark.parametrize("radius", others_slow([45.0, 90.0, 180.0]))
 def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
     found, (line,) = prepare(scan(radius), SELECTION)
-    assert found.projections.air_columns == (0, 0)
+    assert found.corrected.air_columns == (0, 0)
     assert line.startswith(
         "The sample extends beyond the left and right edge of the field of view (line integral there: "
     )
-    volume = fbp(found.projections.data, found.geometry, filter="hann")[1]
+    volume = fbp(found.seen.data, found.geometry, filter="hann")[1]
     c = (np.arange(64) - 31.5)[None]
     middle = volume[np.hypot(c, c.T) < 28].mean()
     assert middle == pytest.approx(MU, rel=0.1)
@@ -98,8 +98,8 @@ def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_curren
 )
 def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: float) -> None:
     as_taken, told = prepare(scan(120.0, 1.8 * light), SELECTION)
-    mean = as_taken.projections.data.mean()
-    more = prepare(scan(120.0, 1.8 * light / 1.1), SELECTION)[0].projections.data.mean() - mean
+    mean = as_taken.seen.data.mean()
+    more = prepare(scan(120.0, 1.8 * light / 1.1), SELECTION)[0].seen.data.mean() - mean
     (line,) = (line for line in told if "no detector column shows air" in line)
     assert more == pytest.approx(0.095, abs=0.002)
     share = re.search(r"0.095 too large \((\d+)% of the mean", line)
@@ -114,8 +114,8 @@ def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: fl
 def test_a_beam_that_is_not_that_of_its_flats_is_levelled_by_its_air(light: np.ndarray | float) -> None:
     """As of Diamond's scan, whose one flat is brighter than the open beam; its air is no thinner at the edges."""
     found, told = prepare(scan(20.0, light), SELECTION)
-    assert told == [] and min(found.projections.air_columns) > 0
-    assert abs(found.projections.data[:, :, :5].mean()) < 0.005
+    assert told == [] and min(found.corrected.air_columns) > 0
+    assert abs(found.seen.data[:, :, :5].mean()) < 0.005
 
 
 def test_a_full_turn_about_an_axis_beside_the_middle_is_cut_on_purpose() -> None:

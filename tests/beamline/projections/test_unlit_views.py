@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.beamline.corrected.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import apply, line_integrals_of, survey
@@ -16,7 +17,6 @@ from beamline.projections.views import select
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import feed_batches, prepare
-from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 
 FIRST = 6  # row of the first view, behind three darks and three flats
@@ -40,10 +40,10 @@ def scan(unlit: list[int], value: float | None, scale: float = 1.0) -> ArraySour
 def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | None) -> None:
     found, told = prepare(scan(unlit, value), SELECTION)
     lit = np.setdiff1d(np.arange(VIEWS), unlit)
-    np.testing.assert_array_equal(found.projections.view_ids, FIRST + lit)
+    np.testing.assert_array_equal(found.ids, FIRST + lit)
     np.testing.assert_allclose(found.geometry.angles, ANGLES[lit])
     assert sum("had no beam: the shutter was closed" in line for line in told) == 1
-    np.testing.assert_allclose(found.projections.data, line_integrals()[lit], atol=0.12)
+    np.testing.assert_allclose(found.seen.data, line_integrals()[lit], atol=0.12)
 
 
 def test_more_than_half_of_the_views_are_refused() -> None:
@@ -56,7 +56,7 @@ def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     source = scan(unlit, 0.0)
     at_once = line_integrals_of(select(source, SELECTION), frames)
     in_slabs, told = prepare(source, SELECTION, DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7))
-    np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)
+    np.testing.assert_array_equal(in_slabs.seen.data, at_once.data)
     assert len([line for line in told if "3 projections of 45 (frames 9, 36-37) had no beam" in line]) == 1
     plan = survey(select(source, SELECTION).with_steps(Air("none")))
     fed, _ = feed_batches(plan, np.array_split(frames, 5), warn=told.append)

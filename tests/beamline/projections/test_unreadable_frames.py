@@ -81,8 +81,8 @@ def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     with scan.open() as source:
         prepared, told = prepare(source, SELECTION.with_steps(Preparation(flags)))
     views = np.setdiff1d(np.arange(6, len(FRAMES)), spoilt)
-    assert prepared.projections.view_ids.tolist() == views.tolist()
-    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)
+    assert prepared.ids.tolist() == views.tolist()
+    np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals()[views - 6], atol=1e-3)
     said = " ".join(told)
     assert "frames cannot be read and are left out: 9, 20-21." in said and "are left out: 1, 4." in said
     with pytest.raises(DataError, match="cannot be read"):

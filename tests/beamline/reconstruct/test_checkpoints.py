@@ -37,9 +37,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
 
 def _flipped(prepared: PreparedProjections) -> PreparedProjections:
     """One bit of one pixel is another."""
-    data = prepared.projections.data.copy()
+    data = prepared.seen.data.copy()
     data.view(np.uint32)[3, 1, 7] ^= 1
-    return replace(prepared, projections=replace(prepared.projections, data=data))
+    return replace(prepared, lines=replace(prepared.lines, data=data))
 
 
 def _turned(prepared: PreparedProjections) -> PreparedProjections:

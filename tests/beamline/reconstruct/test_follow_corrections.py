@@ -153,12 +153,12 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
         whole = prepare_projections(select(source, selection), told.append)
     # Flats of another light that no air corrects are told of.
     assert not told or ((air, gain) == ("none", 1.3) and all("in line integral" in each for each in told))
-    np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
-    np.testing.assert_array_equal(judged[0].projections.view_ids, whole.projections.view_ids)
+    np.testing.assert_array_equal(judged[0].seen.data, whole.seen.data)
+    np.testing.assert_array_equal(judged[0].ids, whole.ids)
     model = fits[0]._stage
     assert isinstance(model, Growing)
     problem = model.problem
-    np.testing.assert_array_equal(np.stack(problem.images), whole.projections.data / problem.scale)
+    np.testing.assert_array_equal(np.stack(problem.images), whole.seen.data / problem.scale)
     again = [event for event in events if event.event == "state" and event.data["state"] == "correcting"]
     assert [event.data["message"].split(",")[0] for event in again] == ["Correcting all projections again"]
 
@@ -199,12 +199,12 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     join([tmp_path / "scan.h5", tmp_path / "rest.h5"], tmp_path / "joined.h5")
     with open_scan(tmp_path / "joined.h5") as joined:
         whole = prepare_projections(select(joined, selection), lambda said: None)
-    assert whole.projections.view_ids.size == 30
-    np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
-    np.testing.assert_array_equal(judged[0].projections.view_ids, whole.projections.view_ids)
+    assert whole.ids.size == 30
+    np.testing.assert_array_equal(judged[0].seen.data, whole.seen.data)
+    np.testing.assert_array_equal(judged[0].ids, whole.ids)
     np.testing.assert_array_equal(judged[0].geometry.angles, whole.geometry.angles)
     assert [part.view_ids.size for part in live] == [12, 30]
-    np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
+    np.testing.assert_allclose(live[1].data, whole.seen.data, atol=1e-6)
     states = [event.data for event in events if event.event == "state" and event.data["state"] == "correcting"]
     begins, has_parts = [data["message"] for data in states]
     assert "the next part of the run starts" in begins and "the run has several parts" in has_parts

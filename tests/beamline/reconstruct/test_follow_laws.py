@@ -126,8 +126,8 @@ def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[
     with open_scan(tmp_path / "scan.h5") as source:
         whole = prepare_projections(select(source, Selection(axis_col=SCAN.axis_col)), lambda sentence: None)
     for n, (data, geometry, _) in zip((10, 20, 30), laws.asked, strict=True):
-        np.testing.assert_allclose(data[: n - 1], whole.projections.data[: n - 1], atol=1e-6)
-        assert data[n - 1] == pytest.approx(whole.projections.data[n - 1], abs=0.1)  # provisional
+        np.testing.assert_allclose(data[: n - 1], whole.seen.data[: n - 1], atol=1e-6)
+        assert data[n - 1] == pytest.approx(whole.seen.data[n - 1], abs=0.1)  # provisional
         np.testing.assert_array_equal(geometry.angles, whole.geometry.angles[:n])
 
 

@@ -20,6 +20,7 @@ from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 from tests.beamline.prepared_views import prepare
@@ -60,7 +61,7 @@ def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(
     cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, axis_col=SCAN.axis_col)
     grid = Grid.matching(cone)
     data = Projector(cone, grid).forward(SCAN.truth(grid))
-    prepared = replace(scan[0], projections=replace(scan[0].projections, data=data), geometry=cone, held_out=None)
+    prepared = replace(scan[0], lines=Views(data, cone, ids=scan[0].ids))
     made = recon.reconstruct(data, cone, recon.OsSirtTv(iterations=3))
     done, _ = _written(made, (prepared, scan[1]), tmp_path / "out.h5")
     assert ("fbp" in done) is compared

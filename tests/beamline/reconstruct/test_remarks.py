@@ -37,8 +37,8 @@ def _made(
     for view, height in specks.items():
         data[view, 10:14, 22:26] += height
     prepared = prepared_views(data, geometry)
-    frames = replace(prepared.projections, view_ids=FIRST_FRAME + np.arange(40))
-    return Reconstruction(volume, {}, method=method, seconds=1.0), replace(prepared, projections=frames)
+    lines = replace(prepared.lines, ids=FIRST_FRAME + np.arange(40))
+    return Reconstruction(volume, {}, method=method, seconds=1.0), replace(prepared, lines=lines)
 
 
 def warnings_of(made: Reconstruction, prepared: PreparedProjections, selection: Selection = Selection()) -> list[str]:  # noqa: B008
@@ -106,13 +106,13 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
     """Whatever method ended before it had begun, and whatever density it began from; also of a sample that is wider
     than the field, of whose views the right volume leaves more than a uniform one."""
     made, prepared = _made(rng, {}, method)
-    truth, data = made.volume.data, prepared.projections.data
+    truth, data = made.volume.data, prepared.seen.data
     if wider:
         around = Volume(np.ones((24, 144, 144), np.float32), replace(made.volume.grid, shape=(24, 144, 144)))
         _, y, x = around.grid.coordinates()
         around.data[:, np.hypot(y[:, None], x) < 24] = 0
         data = data + project(replace(around, data=0.02 * around.data), prepared.geometry)
-        prepared = replace(prepared, projections=replace(prepared.projections, data=data))
+        prepared = replace(prepared, lines=replace(prepared.lines, data=data))
     blank = np.float32(0.7 * truth.mean())
     volume = replace(made.volume, data=amount * truth + (1 - amount) * blank)
     judgement = judge(volume, prepared.views, aspects=Aspect.RESIDUAL | Aspect.FIT)
@@ -136,7 +136,7 @@ def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None
     scatter = np.sqrt(1 - f.sum() ** 2 / (f.size * (f**2).sum()))
     left = {}
     for name, data in {"one": shadow, "two": factors * shadow, "within others": factors * (shadow + 30)}.items():
-        views = replace(prepared, projections=replace(prepared.projections, data=data))
+        views = replace(prepared, lines=replace(prepared.lines, data=data))
         found = judge(full, views.views, aspects=Aspect.RESIDUAL | Aspect.FIT).along_rows
         assert found is not None
         left[name] = found

@@ -178,7 +178,7 @@ def test_the_sample_is_where_the_geometry_says(moved_by: str, wide_scan: Path, t
     """The ball's image in the frames of the simulator, beside the column that the shifts predict."""
     scan = wide_scan if moved_by == "simulated" else run_scan(asked(*WIDE, motor(-1.0)), tmp_path, []).path
     views, told = prepared(scan)
-    geometry, data = views.geometry, views.projections.data
+    geometry, data = views.geometry, views.seen.data
     assert geometry.shifts[:, 0] == pytest.approx([0.0] * VIEWS + [COLS * step for step in np.repeat(STEPS, 2)])
     assert not geometry.shifts[:, 1].any()
     u = (X * np.cos(geometry.angles) + Y * np.sin(geometry.angles)) / PIXEL
@@ -218,7 +218,7 @@ def test_stepped_views_of_another_program_come_by_poses(wide_scan: Path, tmp_pat
     views, _ = prepared(wide_scan)
     assert other.geometry.shifts == pytest.approx(views.geometry.shifts)
     assert other.centred.geometry.n_views == VIEWS
-    assert other.projections.data == pytest.approx(views.projections.data)
+    assert other.seen.data == pytest.approx(views.seen.data)
 
 
 @pytest.mark.slow

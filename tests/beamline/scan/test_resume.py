@@ -110,7 +110,7 @@ def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path
     with open_scan(run / "joined.h5") as source:
         selection = Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore")))
         prepared = prepare_projections(select(source, selection), lambda said: None)
-    assert len(prepared.projections.data) == VIEWS
+    assert len(prepared.seen.data) == VIEWS
 
 
 def _aborted(runs: Path, *overrides: str, at: int) -> Path:
@@ -151,7 +151,7 @@ def test_references_of_the_end_alone_are_taken(
     with open_scan(run / "joined.h5") as source:
         scan = select(source, Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore", "accept"))))
         prepared = prepare_projections(scan, lambda said: None)
-    assert len(prepared.projections.data) == VIEWS
+    assert len(prepared.seen.data) == VIEWS
     with pytest.raises(ConfigError, match="all projections, darks and flats that were planned"):
         go_on(run)
 

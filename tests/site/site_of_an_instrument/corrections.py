@@ -26,5 +26,5 @@ class Lift:
         return StepMemory()
 
     def apply(self, views: Any, angles: Any, progress: Callable[[int, int], None]) -> StepDone:
-        views.projections.data[...] += self.by
+        views.lines.data[...] += self.by
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")

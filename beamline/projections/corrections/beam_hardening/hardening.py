@@ -100,11 +100,9 @@ class Hardening:
     ) -> StepDone:
         if self.model is None:
             return StepDone(_clearly_seen(views), {"hardening": "not corrected"})
-        curve, sentence = curve_of(views.projections.data, views.geometry, self)
+        curve, sentence = curve_of(views.seen.data, views.geometry, self)
         if curve is not None:
-            curve.linearise(views.projections.data, views.projections.weights)
-            if views.held_out is not None:
-                curve.linearise(views.held_out.data)
+            curve.linearise(views.lines.data, views.lines.weights)
         return StepDone(sentence, {"hardening": sentence})
 
 
@@ -182,9 +180,9 @@ def _clearly_seen(views: PreparedProjections) -> str:
     from recon.voxels.beyond_field import reach_of
     from recon.voxels.field_edges import busiest_rows
 
-    data, geometry = views.centred.projections.data, views.centred.geometry
+    data, geometry = (ordinary := views.centred).seen.data, ordinary.geometry
     plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
-    if not plain or geometry.n_views < _FEWEST or reach_of(views.views).beyond:
+    if not plain or geometry.n_views < _FEWEST or reach_of(ordinary.seen).beyond:
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
     if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _AS_EVEN:

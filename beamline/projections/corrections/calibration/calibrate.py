@@ -240,7 +240,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     from recon.features.calibration.gains import NEAR_AXIS, learn_gains
 
     try:
-        learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
+        learnt = learn_gains(views.seen.data, views.geometry, views.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Omit --calibrate gains, or give --rings instead.") from error
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
@@ -253,10 +253,8 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     if not learnt.confirmed:
         sentence = f"Pixel sensitivities were not corrected: {judged}."
         return StepDone(sentence, {"learnt_gains": sentence, **values})
-    for view in views.projections.data:
+    for view in views.lines.data:
         view -= learnt.pixels
-    if views.held_out is not None:
-        views.held_out.data[...] -= learnt.pixels
     sentence = (
         f"Pixel sensitivities were corrected by {float(learnt.pixels.std()):.4f} in line integral (standard "
         f"deviation); {judged}. Columns within {NEAR_AXIS:g} of the axis were not corrected, because a wrong "

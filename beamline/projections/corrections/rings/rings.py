@@ -48,11 +48,10 @@ class Rings:
     ) -> StepDone:
         from recon.features.rings import remove_rings_in_place, rings_seen
 
-        data, axis_col = views.projections.data, views.geometry.axis_col
+        data, axis_col = views.seen.data, views.geometry.axis_col
         if self.way == "none":
             sentence = rings_seen(data, angles, axis_col)
             return StepDone(sentence, {"rings": self.way, **({"rings_seen": sentence} if sentence else {})})
         stripes, sentence = remove_rings_in_place(data, angles, self.way, axis_col)
-        if views.held_out is not None:
-            views.held_out.data[...] -= stripes
+        views.lines.data[views.n_used :] -= stripes
         return StepDone(sentence, {"rings": self.way, **({"rings_removed": sentence} if sentence else {})})

@@ -64,7 +64,7 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
         prepared = prepare_projections(select(source, chosen), _silent)
     grid = Grid.matching(prepared.geometry)
     assert (grid.shape, grid.centre) == (truth.grid.shape, pytest.approx(truth.grid.centre))
-    volume = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")
+    volume = (fdk if overrides else fbp)(prepared.seen.data, prepared.geometry, grid, "hann")
     for found, stands in zip(_centroid(volume, grid), _centroid(truth.values, truth.grid), strict=True):
         assert found == pytest.approx(stands, abs=0.15 * 0.012)
     assert _centroid(truth.labels * np.float32(4), truth.grid) == pytest.approx(

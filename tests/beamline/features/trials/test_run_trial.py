@@ -47,16 +47,13 @@ def run(trial: MethodTrial, data: TrialData, control: RunControl | None = None) 
 @pytest.mark.parametrize("method", ["fbp", "fista-tv", "sirt"])
 def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) -> None:
     """Whatever stands for them in the views that are used, and in those held out."""
-    assert data.prepared.held_out is not None
     measured = np.ones((4, 40), np.bool_)
     measured[:, :5] = False
     figures = []
     for filled in (0.0, 3.0):
-        used, unseen = data.prepared.projections.data.copy(), data.prepared.held_out
-        used[:, :, :5] = filled
-        views = replace(data.prepared.projections, data=used)
-        held = replace(unseen, data=np.where(measured, unseen.data, np.float32(filled)))
-        given = replace(data.prepared, projections=views, held_out=held, measured=measured)
+        lines = data.prepared.lines
+        lines = replace(lines, data=np.where(measured, lines.data, np.float32(filled)))
+        given = replace(data.prepared, lines=lines, measured=measured)
         trial = MethodTrial("method", method, data.geometry.n_views)
         found = run(trial, replace(data, prepared=given))
         figures.append([*found.metrics.values(), *found.squared_residuals])
@@ -67,11 +64,12 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
     found = run(MethodTrial("method", "fbp", data.geometry.n_views), data)
-    expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
-    assert data.truth is not None and data.prepared.held_out is not None
+    expected = fbp(data.prepared.seen.data, data.geometry, filter="hann")
+    apart = data.prepared.lines.unseen
+    assert data.truth is not None and apart is not None
     assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
     volume = Volume(expected, Grid.matching(data.geometry))
-    unseen, geometry = data.prepared.held_out.data, data.prepared.held_out.geometry
+    unseen, geometry = apart.data, apart.geometry
     resolution = ViewResolution.of(geometry, volume.grid)
     seen = at_voxel_resolution(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
     left = np.linalg.norm(project(volume, geometry) - seen) / np.linalg.norm(unseen)
@@ -84,9 +82,10 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
 def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
     """Spoiling them changes its residual and nothing else."""
     trial = MethodTrial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
-    assert data.prepared.held_out is not None
-    unseen = data.prepared.held_out
-    spoilt = replace(data, prepared=replace(data.prepared, held_out=replace(unseen, data=2 * unseen.data)))
+    lines = data.prepared.lines
+    assert lines.held_out.size and lines.used is not None
+    twice = np.where(lines.used[:, None, None], lines.data, 2 * lines.data)
+    spoilt = replace(data, prepared=replace(data.prepared, lines=replace(lines, data=twice)))
     kept, other = (run(trial, d).metrics for d in (data, spoilt))
     assert kept["psnr"] == other["psnr"] and kept["residual_held_out"] < other["residual_held_out"]
 
@@ -99,7 +98,7 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     """On a clock that goes on by a tenth of a second whenever it is asked."""
     ticks = itertools.count()
     trial = MethodTrial("method", method, 27, seconds_asked=8.0)
-    alone = replace(data, prepared=replace(data.prepared, held_out=None))
+    alone = replace(data, prepared=data.prepared.without_held_out)
     found = run(trial, alone, RunControl(now=lambda: 0.1 * next(ticks)))
     own_length = not by_name(method).ended_by(8.0)
     assert (0 if own_length else 0.6 * 8) < found.seconds < 1.1 * 8

@@ -108,8 +108,8 @@ def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any
     whole, *rows = (data for _, data in seen)
     mean = rows[3]  # after three of single views: two views side by side
     assert mean.geometry.n_views == 180
-    light = np.exp(-whole.prepared.projections.data.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
-    np.testing.assert_allclose(mean.prepared.projections.data, -np.log(light), atol=1e-5)
+    light = np.exp(-whole.prepared.seen.data.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
+    np.testing.assert_allclose(mean.prepared.seen.data, -np.log(light), atol=1e-5)
     np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("trials_started", "done", len(rows))

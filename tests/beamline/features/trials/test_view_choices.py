@@ -100,7 +100,7 @@ def test_a_mean_of_views_is_that_of_their_light(window: int, offset: float) -> N
     mean = averaged(prepared_views(views, Geometry.parallel(angles, (2, 3))), ViewChoice("", groups.tolist()))
     light = np.exp(-views.astype(np.longdouble))
     expected = [-np.log(sum(light[g] for g in group) / window) for group in groups]
-    np.testing.assert_allclose(mean.projections.data, np.array(expected, np.float64), rtol=3e-6, atol=1e-5)
+    np.testing.assert_allclose(mean.seen.data, np.array(expected, np.float64), rtol=3e-6, atol=1e-5)
     np.testing.assert_allclose(mean.geometry.angles, [angles[group].mean() for group in groups])
 
 

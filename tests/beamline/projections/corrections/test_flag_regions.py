@@ -86,8 +86,8 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     path = write_flagged(tmp_path / "scan.h5", frames_of(data), {}, flags=[alarm, half])
     prepared, told = prepare(path, Selection(axis_col=data.axis_col, steps=(Air("none"),)))
     assert prepared.geometry.n_views == 30 and prepared.left_out == 0 and prepared.view_weights is None
-    rays = prepared.ray_weights(2)
-    assert rays is not None and rays.shape == (32, 4, 40)
+    rays = prepared.views.weights[...]
+    assert rays.shape == (30, 4, 40)
     assert (rays[4, :, 10:12] == 0).all() and (rays[5, :, 10:12] == WARNED_SHARE).all()
     assert (rays != 1).any(axis=(1, 2)).sum() == 2
     assert "2 are flagged in a region" in told[0]

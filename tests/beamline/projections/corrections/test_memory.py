@@ -18,7 +18,7 @@ from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.preparation import Preparation
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepMemory
@@ -28,6 +28,7 @@ from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.prep.projections import Projections
 from recon.prep.resample import Distortion
 from recon.voxels.direct import Fbp
@@ -99,7 +100,8 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep) -> Non
     def work() -> None:
         data, ones = views.astype(np.float32), np.ones(n, np.float32)
         found = Projections(data, np.arange(n), 0.0, ones, np.zeros((rows, cols), bool))
-        prepared = PreparedProjections(found, part.geometry, (cols - 1) / 2, None, None, n, "px", "counts")
+        lines = Views(data, part.geometry, None, np.arange(n))
+        prepared = PreparedProjections(lines, Corrected.of(found), (cols - 1) / 2, None, n, "px", "counts")
         assert step.apply(prepared, angles, lambda n, of: None).sentence
 
     assert 0.25 * step.memory(part).alone < peak(work) - 4 * views.size < step.memory(part).alone

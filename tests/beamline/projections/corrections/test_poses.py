@@ -71,7 +71,7 @@ def error(found: PreparedProjections, axes: np.ndarray = AXES) -> float:
     """Of FBP, relative, in the frame of the whole detector."""
     grid = Grid.matching(found.geometry)
     truth = smooth_ball(grid, axes, CENTRE)
-    made = direct(found.projections.data, found.geometry, grid, "hann")
+    made = direct(found.seen.data, found.geometry, grid, "hann")
     return float(np.linalg.norm(made - truth) / np.linalg.norm(truth))
 
 
@@ -90,7 +90,7 @@ def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(
     for name in ("angles", "shifts", "roll", "tilt"):
         np.testing.assert_allclose(getattr(found.geometry, name), getattr(posed(), name), atol=1e-12)
     assert error(found) < 0.2 < 0.5 * error(plain)
-    np.testing.assert_array_equal(found.projections.data, plain.projections.data)
+    np.testing.assert_array_equal(found.seen.data, plain.seen.data)
     assert found.done["poses"].sentence.startswith("40 poses from")
 
 
@@ -120,7 +120,7 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     found, of_arrays = (prepared(path, file, **selected) for file in (text, tmp_path / "vectors.npz"))
     np.testing.assert_allclose(vectors_of(found.geometry), vectors_of(of_arrays.geometry), atol=1e-12)
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
-    left = found.projections.data - shadow_of_pixels(found.geometry, pixels)
+    left = found.seen.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
     assert found.done["poses"].sentence == f"The geometry comes from {text}: vectors of 40 projections."
 
@@ -174,11 +174,11 @@ def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, o
     turns = TURNS * (4, 1)  # pivot about the detector's middle, not the rows' one
     path = scan(tmp_path, posed(turns))
     found = prepared(path, table(tmp_path, f"view,{COLUMNS}", np.arange(N), *SHIFTS.T, *turns.T), **selected)
-    left = found.projections.data - shadow_of_pixels(found.geometry, round(found.geometry.pixel_pitch / PITCH))
+    left = found.seen.data - shadow_of_pixels(found.geometry, round(found.geometry.pixel_pitch / PITCH))
     assert np.abs(left).max() < 0.02 and np.sqrt(np.mean(left**2)) < 0.002
     assert found.geometry.n_views == (N // 2 if "views" in selected else N)
-    if found.held_out is not None:
-        data, views = found.held_out.data, found.held_out.geometry
+    if found.lines.unseen is not None:
+        data, views = found.lines.unseen.data, found.lines.unseen.geometry
         np.testing.assert_allclose(data, ellipsoid_shadow(views, AXES, CENTRE), atol=0.012)
 
 
@@ -186,11 +186,11 @@ def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, o
 def test_rays_outside_the_slices_weigh_nothing_also_of_views_held_out(tmp_path: Path) -> None:
     path = scan(tmp_path, posed(), AXES * (1, 1, 20))
     found = prepared(path, every(tmp_path), rows=(8, 16), views="every:2")
-    assert found.held_out is not None
-    n, others = found.geometry.n_views, found.held_out.geometry.n_views
-    weights, grid = found.ray_weights(others), Grid.matching(found.geometry)
-    assert weights is not None and weights.shape[0] == n + others and 0 < weights.mean() < 1
-    np.testing.assert_array_equal(weights[n:] > 0, seen_rays(found.held_out.geometry, grid))
+    assert found.lines.unseen is not None
+    n, others = found.geometry.n_views, found.lines.unseen.geometry.n_views
+    weights, grid = found.views.weights[...], Grid.matching(found.geometry)
+    assert weights.shape[0] == n + others and 0 < weights.mean() < 1
+    np.testing.assert_array_equal(weights[n:] > 0, seen_rays(found.lines.unseen.geometry, grid))
     assert not weights[n:].all()
 
 
@@ -209,7 +209,7 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
     with pytest.raises(DataError, match=r"for 20 of.*frame 5, at 31.5 degrees.*--views"):
         prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
     found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
-    assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out.geometry.n_views <= 10
+    assert found.geometry.n_views == 20 and found.lines.unseen is not None and found.lines.unseen.geometry.n_views <= 10
 
 
 @pytest.mark.parametrize(
@@ -299,7 +299,7 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
         scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)
     )
     assert found.axis_col == pytest.approx(AXIS, abs=0.15)
-    left = found.projections.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
+    left = found.seen.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
     assert np.abs(left).max() < 0.02
 
 

@@ -44,7 +44,7 @@ def _quality(prepared: PreparedProjections) -> float:
     """dB of the volume by FBP, in what all views of all these scans see."""
     grid = Grid.matching(prepared.geometry)
     inside = np.s_[4:-4, 8:-8, 8:-8]
-    return psnr(fbp(prepared.projections.data, prepared.geometry, grid)[inside], _truth(grid.shape)[inside])
+    return psnr(fbp(prepared.seen.data, prepared.geometry, grid)[inside], _truth(grid.shape)[inside])
 
 
 def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
@@ -86,7 +86,7 @@ def test_no_tilt_changes_nothing() -> None:
     plain, _ = prepare(_source(1.5), SELECTION)
     zero, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
     assert not said and _tilt(zero)[0] == "" and zero.measured is None
-    np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
+    np.testing.assert_array_equal(zero.seen.data, plain.seen.data)
     found, said = prepare(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
     assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
 
@@ -95,7 +95,7 @@ def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
     prepared, _ = prepare(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
     assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
     assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
-    weights = prepared.ray_weights()
+    weights = prepared.views.weights[...]
     assert weights is not None and not weights[:, ~prepared.measured].any()
 
 

@@ -84,7 +84,7 @@ def _lines(path: Path, options: Selection, cols: tuple[int, int] | None = None) 
     from beamline.projections.prepare import prepare_projections
 
     with open_scan(SourceOptions(path, cols=cols)) as source:
-        return prepare_projections(select(source, options), lambda said: None).projections.data
+        return prepare_projections(select(source, options), lambda said: None).seen.data
 
 
 def test_line_integrals_are_those_of_a_narrower_detector(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def test_views_and_axis_of_nabu_are_ours(tmp_path: Path) -> None:
     rows = np.array(theirs.get_frames_indices("projections"))
     views = np.array([theirs.get_frame(row) for row in rows], np.float32)
     flatfield.FlatField(views.shape, theirs.flats, theirs.darks, radios_indices=rows).normalize_radios(views)
-    assert np.abs(-np.log(views) - ours.projections.data).max() < VIEWS_APART
+    assert np.abs(-np.log(views) - ours.seen.data).max() < VIEWS_APART
     assert abs(ours.axis_col - AXIS) < AXIS_APART
     for method in ("centered", "octave-accurate", "sliding-window"):
         assert abs(estimators.estimate_cor(method, theirs) - ours.axis_col) < AXIS_APART, method
@@ -171,7 +171,7 @@ def test_a_full_turn_beside_the_middle_is_half_a_field_of_view(tmp_path: Path) -
     theirs = analyzer.analyze_dataset(str(path))
     assert theirs.is_halftomo
     with open_scan(path) as source:
-        views = prepare_projections(select(source, Selection()), lambda _: None).projections.data
+        views = prepare_projections(select(source, Selection()), lambda _: None).seen.data
     ours = recon.find_axis(views, FULL.angles).value
     found = estimators.estimate_cor("sliding-window", theirs, cor_options={"side": "right"})
     assert abs(found - FULL.axis) < WIDE_AXIS_APART

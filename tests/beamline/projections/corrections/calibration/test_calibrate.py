@@ -46,7 +46,7 @@ def prepared(path: Path, *steps: PrepStep, **selected: object) -> PreparedProjec
 
 def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path) -> None:
     found, plain = prepared(scan, LEARN), prepared(scan)
-    np.testing.assert_array_equal(found.projections.data, plain.projections.data)
+    np.testing.assert_array_equal(found.seen.data, plain.seen.data)
     rest, axis = knowable(found.geometry.shifts - JUMP, found.geometry.angles)
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
@@ -63,7 +63,7 @@ def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
     assert found.geometry.detector_shape == (10, 24) and found.geometry.n_views == N // 2
     rest, _ = knowable(found.geometry.shifts - JUMP[::2] / 2, found.geometry.angles)
     assert np.sqrt(np.mean(rest**2)) < 0.1
-    assert found.held_out is not None and found.held_out.geometry.shifts.any()
+    assert found.lines.unseen is not None and found.lines.unseen.geometry.shifts.any()
 
 
 @pytest.mark.parametrize(("off", "given", "told"), [(0.0, None, False), (2.0, None, True), (2.0, AXIS, False)])

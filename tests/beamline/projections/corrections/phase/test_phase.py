@@ -106,9 +106,9 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
     )
     length = float(sentence.split("over ")[1].split(" pixels")[0])
     by_hand = replace(Phase(), length=length)
-    np.testing.assert_allclose(found.projections.data, _prepared(source, by_hand).projections.data, atol=2e-3)
+    np.testing.assert_allclose(found.seen.data, _prepared(source, by_hand).seen.data, atol=2e-3)
     still = _prepared(source, Phase(None))
-    assert found.projections.data.min() > 0.5 * still.projections.data.min()  # less light beyond the open beam
+    assert found.seen.data.min() > 0.5 * still.seen.data.min()  # less light beyond the open beam
     source.energy_kev, source.pixel_size_mm = 25.0, 4.6e-3
     ratio = _prepared(source, Phase(distance_mm=30.0)).done["phase"].sentence.split("delta/beta ")[1]
     assert float(ratio.split(" at 25 keV, 30 mm")[0]) == pytest.approx((length / 0.0748) ** 2, rel=0.03)
@@ -116,7 +116,7 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
 
 def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
     found, still = (_prepared(_rimmed(0.0), *steps) for steps in ((), (Phase(None),)))
-    np.testing.assert_array_equal(found.projections.data, still.projections.data)
+    np.testing.assert_array_equal(found.seen.data, still.seen.data)
     assert found.done["phase"].sentence == "" and dict(found.done["phase"].parameters or {}) == {
         "phase": "not retrieved"
     }
@@ -126,7 +126,7 @@ def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.Monkey
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: None)
     found = _prepared(_rimmed(0.8))
     assert "--phase auto found no filter" in found.done["phase"].sentence
-    np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
+    np.testing.assert_array_equal(found.seen.data, _prepared(_rimmed(0.8), Phase(None)).seen.data)
 
 
 def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,7 +135,7 @@ def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: p
     found = _prepared(_rimmed(0.8))
     sentence = found.done["phase"].sentence
     assert "over 1.4 pixels would lower the residual in held-out projections by 8%" in sentence
-    np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
+    np.testing.assert_array_equal(found.seen.data, _prepared(_rimmed(0.8), Phase(None)).seen.data)
 
 
 @pytest.mark.slow

@@ -87,7 +87,7 @@ def test_line_integrals_are_those_of_the_scan(tmp_path: Path) -> None:
     longer: dict[str, Any] = {"ReferenceData__Image": np.full(SCAN.shape, 2 * BEAM, "<f4")}
     longer["ReferenceData__ImageInfo__ExpTimes"] = np.float32(1)
     found, told = prepare(write_compound(tmp_path / "s.txrm", streams(**longer)), Selection(axis_col=SCAN.axis_col))
-    np.testing.assert_allclose(found.projections.data, SCAN.line_integrals(), atol=2e-3)
+    np.testing.assert_allclose(found.seen.data, SCAN.line_integrals(), atol=2e-3)
     assert found.geometry.pixel_pitch == pytest.approx(0.0065) and told == []
 
 
