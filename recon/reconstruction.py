@@ -206,9 +206,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
 def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry | None, use: DataUse) -> Views:
     """Line integrals with their weights and their geometry, as far as it can be used."""
     if isinstance(projections, Views):
-        given = {"geometry": geometry, "use.weights": use.weights, "use.sample_radius": use.sample_radius}
-        given["use.held_out"] = use.held_out if len(use.held_out) else None
-        if twice := [name for name, value in given.items() if value is not None]:
+        given = {
+            "geometry": geometry is not None,
+            "use.weights": use.weights is not None,
+            "use.held_out": len(use.held_out) > 0,
+            "use.sample_radius": use.sample_radius is not None,
+        }
+        if twice := [name for name, is_given in given.items() if is_given]:
             raise ValueError(f"leave out {' and '.join(twice)}, because the projections are given as Views")
         _refuse_geometry(projections.geometry)
         return replace(projections, data=_line_integrals(projections.data, projections.geometry))

@@ -205,7 +205,8 @@ class PreparedProjections:
         else:
             data = room[: n + more]
             data[n:] = others.data
-        weights: Any = None if lines.weights is None else np.concatenate((lines.weights, others.weights))
+        counted: Any = others.weights
+        weights = None if lines.weights is None else np.concatenate((lines.weights, counted))
         ids, used = np.concatenate((self.ids, others.view_ids)), np.arange(n + more) < n
         together = lines.geometry.followed_by(geometry)
         return replace(self, lines=Views(data, together, weights, ids, used, lines.reach))

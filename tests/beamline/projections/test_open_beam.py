@@ -45,7 +45,7 @@ def plan_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrectionPlan:
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:
     source = scan(20)
-    found = prepare(source, PLAIN.with_steps(Preparation(noise="counts", gain=GAIN)))[0].projections
+    found = prepare(source, PLAIN.with_steps(Preparation(noise="counts", gain=GAIN)))[0].seen
     darks, flats, views = source.read(slice(10)), source.read(slice(10, 30)), source.read(slice(30, None))
     variance = float(np.median(darks.var(axis=0, ddof=1)))
     data, weights = line_integrals(Counts(views, flats.mean(axis=0), darks.mean(axis=0), GAIN, variance))

@@ -13,7 +13,6 @@ from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import run_trial as module
 from beamline.features.trials.run_trial import TrialData, run_trial
 from beamline.features.trials.trial import MethodTrial, Outcome
-from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
@@ -36,7 +35,7 @@ def data() -> TrialData:
     integrals = SCAN.line_integrals().astype(np.float32)
     held = np.arange(3, 30, 9)
     half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
-    prepared = with_views_held_out(prepared_views(integrals, views), held)
+    prepared = prepared_views(integrals, views).holding_out(held)
     return TrialData(prepared, half.truth(Grid.matching(views)))
 
 
