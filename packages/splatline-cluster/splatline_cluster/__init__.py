@@ -18,8 +18,9 @@ from distributed import Client, Future, KilledWorker, LocalCluster
 
 import recon
 from beamline.core.errors import BeamlineError, ConfigError
-from recon import Reconstruction, RunControl, Views
+from recon import Reconstruction, RunControl
 from recon.base.method import Method
+from recon.base.view_data import Views
 
 _CONNECT_TIMEOUT = 30  # s to wait for a scheduler, and for its first worker
 _PATIENCE = 60.0  # s to wait if all workers have left

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.beamline.corrected.replaced import BEAM, VIEWS, Blocks, decibels, line_integrals
 
 from beamline.core.errors import DataError
 from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
+from tests.beamline.projections.replaced import BEAM, VIEWS, Blocks, decibels, line_integrals
 from tests.slow_cases import others_slow
 
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION

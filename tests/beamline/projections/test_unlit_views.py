@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.beamline.corrected.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import apply, line_integrals_of, survey
@@ -17,6 +16,7 @@ from beamline.projections.views import select
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import feed_batches, prepare
+from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 
 FIRST = 6  # row of the first view, behind three darks and three flats

@@ -15,6 +15,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, origin_of
 from beamline.storage.writers.recon_file import Checkpoint, write_checkpoint
+from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of
@@ -42,17 +43,21 @@ def _flipped(prepared: PreparedProjections) -> PreparedProjections:
     return replace(prepared, lines=replace(prepared.lines, data=data))
 
 
+def _seen_by(prepared: PreparedProjections, geometry: Geometry) -> PreparedProjections:
+    return replace(prepared, lines=replace(prepared.lines, geometry=geometry))
+
+
 def _turned(prepared: PreparedProjections) -> PreparedProjections:
     angles = prepared.geometry.angles.copy()
     angles[4] += 1e-9
-    return replace(prepared, geometry=prepared.geometry.at(angles))
+    return _seen_by(prepared, prepared.geometry.at(angles))
 
 
 CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], FitSettings, dict[str, Any]]] = {
     "projections": (_flipped, SETTINGS, OTHERS),
     "angles": (_turned, SETTINGS, OTHERS),
-    "axis_col": (lambda p: replace(p, geometry=replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
-    "pixel_pitch": (lambda p: replace(p, geometry=replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
+    "axis_col": (lambda p: _seen_by(p, replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
+    "pixel_pitch": (lambda p: _seen_by(p, replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
     "length_unit": (lambda p: replace(p, length_unit="px"), SETTINGS, OTHERS),
     "loss": (lambda p: p, replace(SETTINGS, loss="l2"), OTHERS),
     "kernel": (lambda p: p, replace(SETTINGS, kernel=OTHER), OTHERS),
