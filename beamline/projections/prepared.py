@@ -132,11 +132,6 @@ class PreparedProjections:
         grid, reach = Grid.matching(self.geometry), self.lines.reach
         return grid if reach is None else reach.box(grid, self.geometry)
 
-    @property
-    def on_disk(self) -> bool:
-        """True if line integrals are stored on disk, with rays of zero weight replaced from their neighbours."""
-        return isinstance(self.lines.data, np.memmap)
-
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
         """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
@@ -168,7 +163,7 @@ class PreparedProjections:
 
     def of_views(self, views: I64) -> PreparedProjections:
         """Some of the projections used, by number and in this order; held-out projections are unchanged."""
-        return self._of(self.lines.select(np.concatenate((views, self.lines.held_out))), views)
+        return self._of(self.lines.using(views), views)
 
     def _of(self, lines: Views, views: I64) -> PreparedProjections:
         """These line integrals, of which those with the numbers `views` are used."""
@@ -186,10 +181,8 @@ class PreparedProjections:
         )
 
     def holding_out(self, held: I64) -> PreparedProjections:
-        """The same projections with those of these numbers, sorted, held out; all of them are used before."""
-        used = np.setdiff1d(np.arange(self.n_used), held)
-        lines = self.lines.select(np.concatenate((used, held)))
-        return self._of(replace(lines, used=np.arange(len(lines.data)) < used.size), used)
+        """The same projections with those of these numbers, sorted, held out; all of them were used before."""
+        return self._of(self.lines.holding_out(held), np.setdiff1d(np.arange(self.n_used), held))
 
     def with_held_out(self, others: Projections, geometry: Geometry, room: F32 | None = None) -> PreparedProjections:
         """The same projections, all of which are used, followed by others that are held out.
@@ -210,11 +203,6 @@ class PreparedProjections:
         ids, used = np.concatenate((self.ids, others.view_ids)), np.arange(n + more) < n
         together = lines.geometry.followed_by(geometry)
         return replace(self, lines=Views(data, together, weights, ids, used, lines.reach))
-
-    @property
-    def without_held_out(self) -> PreparedProjections:
-        """The projections used alone."""
-        return replace(self, lines=self.lines.seen)
 
     @property
     def whole_views(self) -> I64:

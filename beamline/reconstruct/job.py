@@ -25,8 +25,9 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import RegionOfRows
 from beamline.reconstruct.run import deviation_by_slabs, deviation_of, run_on, without_outside
 from beamline.reconstruct.scan_facts import ScanFacts
-from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
+from beamline.reconstruct.slab_run import RunMethod, SlabWorkers, in_slabs
 from drivers.base.clock import Clock
+from recon.base.arrays import F64
 from recon.base.decisions import Decisions, Stop
 from recon.base.geometry import Geometry
 from recon.base.method import (
@@ -38,6 +39,7 @@ from recon.base.method import (
 )
 from recon.base.method_kinds import Series
 from recon.base.slabs import Slab
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import Fit
@@ -178,13 +180,13 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
 
 
 def runner_of(
-    options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
-) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
+    options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct, times: F64 | None = None
+) -> RunMethod:
     """`run_on` with the seed and device of the options. Errors of the method name the scan file."""
 
-    def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
+    def run(method: Method, views: Views, grid: Grid, control: RunControl) -> Reconstruction:
         with refused(options, f" by {method.name}"):
-            return run_on(method, prepared, grid, options.seed, control, options.device, reconstruct)
+            return run_on(method, views, grid, options.seed, control, options.device, reconstruct, times)
 
     return run
 
@@ -238,14 +240,15 @@ def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Rec
     method = job.options.method_for(job.prepared.geometry)
     method = {each.name: each for each in method.alternatives}.get(result.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
-    given = result.volume, method, job.prepared, job.options
 
     why = "their computation was stopped"
     try:
         if job.slabs:
-            deviation = deviation_by_slabs(*given, job.slabs, decided.made, control, job.say)
+            deviation = deviation_by_slabs(
+                result.volume, method, job.prepared, job.options, job.slabs, decided.made, control, job.say
+            )
         else:
-            deviation = deviation_of(*given, decided.made, control)
+            deviation = deviation_of(result.volume, method, job.prepared.views, job.options, decided.made, control)
     except ValueError as error:  # do not discard a volume that may have taken hours
         deviation, why = None, str(error)
     if deviation is None:
@@ -280,7 +283,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
         now=job.channels.clock.now,
         decide=decided if options.uncertainty else None,
     )
-    result = runner_of(options)(method, prepared, job.grid, control)
+    result = runner_of(options, times=prepared.times)(method, prepared.views, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
     if "held_out" in method.takes:

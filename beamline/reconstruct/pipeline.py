@@ -219,7 +219,9 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         before_report = Stop()
         if (limit := options.method.time_limit) is not None:
             started = channels.started, channels.worked
-            method, before_report = fit_within(options.method, limit, prepared, options.target, started, clock, warn)
+            method, before_report = fit_within(
+                options.method, limit, prepared.geometry, options.target, started, clock, warn
+            )
             options = replace(options, method=method)
         yield Job(
             options,

@@ -23,6 +23,7 @@ from beamline.storage.disk_file import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
+from recon.base.arrays import F64
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
@@ -36,33 +37,36 @@ from recon.splatting.fit_method import Fit
 
 def run_on(
     method: Method,
-    prepared: PreparedProjections,
+    views: Views,
     grid: Grid,
     seed: int,
     control: RunControl,
     device: str = "cpu",
     reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
+    times: F64 | None = None,
 ) -> Reconstruction:
     """Run a method on these projections (and the held-out ones if it uses them) until it ends or is stopped.
+
+    Args:
+        times: time of the exposure of each projection in s, for a method that makes volumes in time.
 
     Raises:
         ValueError: the method cannot use these projections.
     """
-    views, use = views_for(method, prepared)
+    views, use = views_for(method, views), DataUse(times=times if "times" in method.takes else None)
     return reconstruct(views, method=method, grid=grid, seed=seed, device=device, use=use, control=control)
 
 
-def views_for(method: Method, prepared: PreparedProjections) -> tuple[Views, DataUse]:
-    """The projections, and how they are used, in the form that the method expects."""
-    prepared = prepared.wanted(method.views_wanted(prepared.geometry))
-    views = prepared.views if "held_out" in method.takes else prepared.views.seen
-    return _weighed(method, prepared, views), DataUse(times=prepared.times if "times" in method.takes else None)
+def views_for(method: Method, views: Views) -> Views:
+    """The projections in the form that the method expects, with their weights in memory.
 
-
-def _weighed(method: Method, prepared: PreparedProjections, views: Views) -> Views:
-    """The projections with the weights of the rays for a method, in memory. In data on disk, rays of weight 0 were
-    filled, as a direct method does it."""
-    unweighed = views.weights is None or (prepared.on_disk and not method.weighs)
+    In data on disk, rays of weight 0 were filled, as a direct method does it. So such a method gets no weights.
+    """
+    wanted = method.views_wanted(views.seen.geometry)
+    if not wanted.all():
+        views = views.using(np.flatnonzero(wanted))
+    views = views if "held_out" in method.takes else views.seen
+    unweighed = views.weights is None or (isinstance(views.data, np.memmap) and not method.weighs)
     return replace(views, weights=None if unweighed else views.weights[...])
 
 
@@ -91,7 +95,7 @@ _MEASURING = 0.05  # fraction of the time limit for checks of the volume; they a
 def fit_within(
     method: Method,
     limit: float,
-    prepared: PreparedProjections,
+    geometry: Geometry,
     target: OutputPaths,
     started: tuple[float, float],
     clock: Clock,
@@ -106,7 +110,7 @@ def fit_within(
         limit: time limit of the call in s.
         started: time at which the call started, by the clock, and the CPU time in s used by then.
     """
-    grid, pages = Grid.matching(prepared.geometry), target.report is not None
+    grid, pages = Grid.matching(geometry), target.report is not None
     spent = clock.now() - started[0]
     busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
     after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
@@ -165,15 +169,14 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
 
 
 def deviation_of(
-    volume: Volume, method: Method, prepared: PreparedProjections, options: ReconOptions, decided: DecisionValues,
-    control: RunControl,
+    volume: Volume, method: Method, views: Views, options: ReconOptions, decided: DecisionValues, control: RunControl
 ) -> Volume | None:  # fmt: skip
     """The standard deviation of each voxel of a volume in memory; None if `control` stopped it.
 
     Raises:
         ValueError: as `recon.error_bars.error_bars`.
     """
-    bars = _bars(method, prepared, options, volume, decided, control)
+    bars = _bars(method, views, options, volume, decided, control)
     if control.stop():  # a direct method does not ask
         return None
     return None if bars is None else Volume(bars.deviation, volume.grid)
@@ -200,7 +203,7 @@ def deviation_by_slabs(
     for done, n in enumerate(busiest_first(prepared, grid, parts), 1):
         slab = parts[n]
         rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
-        part = prepared.of_rows(rows, geometry)
+        part = prepared.of_rows(rows, geometry).views
         if not part.seen.data.any():
             continue
         here = Volume(np.ascontiguousarray(volume.data[slab.slices]), box)
@@ -216,9 +219,8 @@ def deviation_by_slabs(
 
 
 def _bars(
-    method: Method, prepared: PreparedProjections, options: ReconOptions, volume: Volume, decided: DecisionValues,
-    control: RunControl,
+    method: Method, views: Views, options: ReconOptions, volume: Volume, decided: DecisionValues, control: RunControl
 ) -> ErrorBars | None:  # fmt: skip
-    views = _weighed(method, prepared, prepared.views.seen)
+    views = views_for(method, views.seen)
     problem = ReconProblem(views, volume.grid, seed=options.seed, device=options.device)
     return error_bars(method, problem, volume, decided, replace(control, decide=None))

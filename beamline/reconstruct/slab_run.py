@@ -25,6 +25,7 @@ from beamline.storage.writers.partial_volume import PartialVolume, create_partia
 from recon.base.decisions import Decisions
 from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.methods import FistaTv
 
@@ -34,7 +35,7 @@ _WEIGHED = 16  # rows whose weights are made at a time
 _LOOK = 0.5  # s between two checks of slabs under way
 
 T = TypeVar("T")
-RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]  # Reconstructs views on a grid
+RunMethod = Callable[[Method, Views, Grid, RunControl], Reconstruction]  # Reconstructs views on a grid
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ class _SlabJob:
         listen = _of_all(self.control, self.begin, done, slab, slices)
         control = replace(self.control, decide=decide, on_progress=listen)
         rows, geometry, box = part_of(self.prepared.geometry, self.grid, slab.slices)
-        part = self.prepared.of_rows(rows, geometry)
+        part = self.prepared.of_rows(rows, geometry).views
         if not part.seen.data.any():
             return None, ""
         in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)

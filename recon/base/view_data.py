@@ -78,6 +78,17 @@ class Views:
         """The projections that are held out; None: all are used."""
         return None if self.used is None or self.used.all() else self._those(~self.used)
 
+    def using(self, numbers: NDArray[np.integer]) -> Views:
+        """Only the projections used with these numbers, counted among those used, and in this order; those that are
+        held out stay."""
+        used = np.arange(len(self.data)) if self.used is None else np.flatnonzero(self.used)
+        return self.select(np.concatenate((used[numbers], self.held_out)))
+
+    def holding_out(self, held: NDArray[np.integer]) -> Views:
+        """The same projections with those of these numbers held out and last; all of them were used before."""
+        used = np.setdiff1d(np.arange(len(self.data)), held)
+        return replace(self.select(np.concatenate((used, held))), used=np.arange(len(self.data)) < used.size)
+
     def _those(self, wanted: Mask | None) -> Views:
         if wanted is None or wanted.all():
             return replace(self, used=None)

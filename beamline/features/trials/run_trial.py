@@ -17,12 +17,12 @@ from beamline.core.errors import user_message
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.features.trials.trial import MethodTrial, Outcome, TrialTable
 from beamline.features.trials.view_choices import ViewChoice
-from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
+from recon.base.view_data import Views
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.judgement import contrast_in, judge
@@ -36,7 +36,7 @@ class TrialRun(NamedTuple):
     """What a trial runs: a method on projections, for a volume on this grid."""
 
     method: Method
-    prepared: PreparedProjections
+    views: Views
     grid: Grid
     seed: int
     device: str = "cpu"
@@ -67,15 +67,15 @@ class TrialData(TrialScan):
     """The data that all trials of a scan share.
 
     Attributes:
-        prepared: the projections that may be used, and the held-out projections that no trial uses. Weights from the
-            monitor are removed, because trials are compared with equal weight for all rays.
+        views: the projections that may be used, and the held-out projections that no trial uses. They have no weights
+            from the monitor, because trials are compared with equal weight for all rays.
         truth: the ground truth [z, y, x] on Grid.matching(geometry).
         references: further volumes on the same grid that trials are compared with, by method.
         regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None if there are none.
         seed: random seed of all trials.
     """
 
-    prepared: PreparedProjections
+    views: Views
     truth: F32 | None = None
     references: Mapping[str, F32] = field(default_factory=dict)
     regions: NDArray[np.int8] | None = None
@@ -84,21 +84,21 @@ class TrialData(TrialScan):
     @property
     def geometry(self) -> Geometry:
         """Geometry of the projections that may be used."""
-        return self.prepared.geometry
+        return self.views.seen.geometry
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
         """The method of a trial, and its projections."""
         if trial.choice is None:
             angles, period = self.geometry.angles, self.geometry.period
-            views = self.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
+            views = self.views.using(parse_views(f"fixed:{trial.views}", angles, period=period))
         else:
-            views = averaged(self.prepared, trial.choice)
+            views = averaged(self.views, trial.choice)
         return TrialRun(trial.build(), views, Grid.matching(self.geometry), self.seed)
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[dict[str, float], list[float]]:
         """Figures of merit of a volume, and the squared residual of each held-out projection."""
         truth = None if self.truth is None else Volume(self.truth, made.grid)
-        judged = judge(made, self.prepared.views, truth)
+        judged = judge(made, self.views, truth)
         figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
         if (reference := self.references.get(trial.method)) is not None:
             figures["psnr_all"] = metrics.psnr(reference, made.data)
@@ -108,24 +108,22 @@ class TrialData(TrialScan):
         return figures, [] if judged.held_out is None else judged.held_out.left.tolist()
 
 
-def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
+def averaged(views: Views, choice: ViewChoice) -> Views:
     """The projections of a row of a study, each the mean of a window of projections.
 
     The transmissions are averaged, -log(mean(exp(-p))), not the logarithms, as in a longer exposure. The weight of a
     ray is the smallest weight in its window.
     """
     groups = np.array(choice.groups)
-    middle = prepared.of_views(groups[:, choice.window // 2])
+    middle = views.using(groups[:, choice.window // 2])
     if choice.window == 1:
         return middle
-    angles = prepared.geometry.angles[groups].mean(axis=1)
+    angles = views.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
-    whole, apart = prepared.lines, middle.without_held_out.lines
-    weights: F32 | None = whole.weights
-    data = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
-    weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
-    means = replace(apart, data=data, geometry=replace(apart.geometry, angles=angles), weights=weights)
-    return replace(middle, lines=means)
+    lines = np.stack([math.log(choice.window) - logsumexp(-views.data[group], axis=0) for group in groups])
+    weights = None if views.weights is None else np.stack([views.weights[group].min(axis=0) for group in groups])
+    apart = middle.seen
+    return replace(apart, data=lines, geometry=replace(apart.geometry, angles=angles), weights=weights)
 
 
 def run_trial(
@@ -136,15 +134,16 @@ def run_trial(
 ) -> tuple[Outcome, F32 | None]:
     """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x] (None if it failed)."""
     try:
-        method, prepared, grid, seed, device = data.asked_by(trial)
-        trial = replace(trial, views=prepared.geometry.n_views)
-        warm_up(method, prepared.geometry, device=device)  # so that compilation is in no trial's time
+        method, views, grid, seed, device = data.asked_by(trial)
+        geometry = views.seen.geometry
+        trial = replace(trial, views=geometry.n_views)
+        warm_up(method, geometry, device=device)  # so that compilation is in no trial's time
         reset_peak_memory()
         before = cpu()
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             in_time = control if trial.seconds_asked is None else control.by(control.now() + trial.seconds_asked)
-            result = run_on(method, prepared, grid, seed, in_time, device)
+            result = run_on(method, views, grid, seed, in_time, device)
         cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
         figures, squared = data.measured(trial, result.volume)
     except (ValueError, MemoryError) as error:

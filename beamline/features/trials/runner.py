@@ -103,7 +103,7 @@ def opened_scan(
     by = HELD_OUT if truth is None else "psnr"
     facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
     table = TrialTable(name, title, (), by, machine(), facts, asked.command)
-    return TrialData(prepared, truth, seed=asked.seed), table
+    return TrialData(prepared.views, truth, seed=asked.seed), table
 
 
 def _run_and_show(slices: SliceSheet, data: TrialScan, trial: MethodTrial) -> tuple[Outcome, F32 | None]:

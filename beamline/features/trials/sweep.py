@@ -20,7 +20,7 @@ from beamline.features.trials.run_trial import TrialRun, TrialScan
 from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, TrialTable
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.views import select
 from beamline.reconstruct.job import compile_kernels
@@ -30,6 +30,7 @@ from beamline.report.sheets import COLUMNS, SliceSheet
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, I64
 from recon.base.empirical import ONE_IN
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
 from recon.voxels.choice import Prediction, TrialChoice
@@ -135,8 +136,8 @@ class SweptScan(TrialScan):
         self._first = repr(trials[0].options.source)
         self._axis = middle_axis([trial.options.selection for trial in trials])
         self._of_axes = self._axis is not None
-        self._views: tuple[str, Selection, PreparedProjections] | None = None
-        self._used: PreparedProjections | None = None
+        self._views: tuple[str, Selection, Views] | None = None
+        self._used: Views | None = None
         self.unseen: dict[str, UnseenViews] = {}
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
@@ -145,20 +146,21 @@ class SweptScan(TrialScan):
         options, asked = trial.options, trial.options.selection
         views = self._corrected(options)
         self._used = views if asked.axis_col is None or not self._of_axes else _about(views, asked)
-        compile_kernels(options, self._used.geometry, self._sink, self._clock)
-        method, grid = options.method_for(self._used.geometry), Grid.matching(views.geometry)
+        geometry = self._used.seen.geometry
+        compile_kernels(options, geometry, self._sink, self._clock)
+        method, grid = options.method_for(geometry), Grid.matching(views.seen.geometry)
         return TrialRun(method, self._used, grid, options.seed, options.device)
 
-    def _corrected(self, options: ReconOptions) -> PreparedProjections:
+    def _corrected(self, options: ReconOptions) -> Views:
         asked, source_words = options.selection, repr(options.source)
         its_own = not self._of_axes and (asked.axis_col is not None or source_words != self._first)
         wanted = asked if its_own else replace(asked, axis_col=self._axis)
         if self._views is None or self._views[:2] != (source_words, wanted):
             with options.source.open() as source:
-                views = prepare_projections(select(source, wanted), Warnings(self._sink, self._clock))
-            views = hold_out(views, ONE_IN, advice="take a scan with more projections")
+                prepared = prepare_projections(select(source, wanted), Warnings(self._sink, self._clock))
+            views = hold_out(prepared, ONE_IN, advice="take a scan with more projections").views
             if wanted.axis_col is None and source_words == self._first:
-                self._axis = views.axis_col
+                self._axis = prepared.axis_col
                 wanted = replace(wanted, axis_col=self._axis)
             self._views = source_words, wanted, views
         return self._views[2]
@@ -167,10 +169,10 @@ class SweptScan(TrialScan):
         """The residual of the held-out projections, as this trial corrects them, and its square in each projection."""
         used = self._used
         assert used is not None and self._views is not None
-        apart = used.lines.unseen
+        apart = used.unseen
         assert apart is not None and apart.ids is not None
         projector, data = Projector(apart.geometry, made.grid), apart.data
-        data = data if used.measured is None else np.where(used.measured, data, np.float32(np.nan))
+        data = data if apart.weights is None else np.where(apart.weights[...] > 0, data, np.float32(np.nan))
         model = projector.forward(np.asarray(made.data))
         unseen = UnseenViews(
             apart.ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
@@ -226,16 +228,11 @@ def middle_axis(selections: Sequence[Selection]) -> float | None:
     return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
 
 
-def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProjections:
-    """The same views about the axis of the selection."""
+def _about(views: Views, selection: Selection) -> Views:
+    """The same projections about the axis of the selection."""
     assert selection.axis_col is not None
-    lines, n = prepared.lines, selection.binning
-    geometry = replace(lines.geometry, axis_col=(selection.axis_col - (n - 1) / 2) / n)
-    return replace(
-        prepared,
-        lines=replace(lines, geometry=geometry),
-        axis_col=selection.axis_col,
-    )
+    n = selection.binning
+    return replace(views, geometry=replace(views.geometry, axis_col=(selection.axis_col - (n - 1) / 2) / n))
 
 
 def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tuple[TrialChoice, bool] | None:

@@ -75,7 +75,7 @@ def planned_study(
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
     references = tuple(trial(method, whole) for method in dict.fromkeys((BASELINE, *scan.methods)))
-    data = replace(data, prepared=data.prepared.without_held_out)
+    data = replace(data, views=data.views.seen)
     return Planned(partial(with_references, data, references), table)
 
 

@@ -43,7 +43,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     model, data = (projection_lines(each) for each in (projector.forward(volume.data), apart.data))
     scores = sweep.scores_of({"a 1": sweep.UnseenViews(ids, data, model, projector.resolution, "")})
     assert scores is not None
-    by_tradeoff, _ = trials.TrialData(prepared).measured(trial, volume)
+    by_tradeoff, _ = trials.TrialData(prepared.views).measured(trial, volume)
     assert sweep.shares_of(scores[0])[0] == pytest.approx(by_recon, rel=1e-5)
     assert by_tradeoff["residual_held_out"] == pytest.approx(by_recon, rel=1e-5)
     swept = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7")

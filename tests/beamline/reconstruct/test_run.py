@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -21,7 +20,6 @@ from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.splatting.r2 import R2
-from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
 
@@ -30,17 +28,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 40))
 
 
-def _prepared() -> PreparedProjections:
-    return prepared_views(np.ones((VIEWS.n_views, *VIEWS.detector_shape), np.float32), VIEWS)
-
-
 def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, float, list[str]]:
     """What the fit gets, what report and writing get, and what was said."""
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), Path("out.html") if report else None)
     started = 100.0, time.process_time() - spent  # all of the machine is ours
     method, before_report = fit_within(
-        R2(seconds=seconds), seconds, _prepared(), target, started, SteppedClock(100.0 + spent), said.append
+        R2(seconds=seconds), seconds, VIEWS, target, started, SteppedClock(100.0 + spent), said.append
     )
     assert method.time_limit is not None
     return method.time_limit, 100.0 + seconds - before_report.deadline, said

@@ -194,7 +194,7 @@ def test_the_sample_is_where_the_geometry_says(moved_by: str, wide_scan: Path, t
 
 def test_direct_methods_leave_them_out_and_others_get_them(wide_scan: Path) -> None:
     views, _ = prepared(wide_scan)
-    assert [views_for(method, views)[0].geometry.n_views for method in (Fbp(), FistaTv())] == [VIEWS, VIEWS + 8]
+    assert [views_for(method, views.views).geometry.n_views for method in (Fbp(), FistaTv())] == [VIEWS, VIEWS + 8]
 
 
 def test_stepped_views_of_another_program_come_by_poses(wide_scan: Path, tmp_path: Path) -> None:

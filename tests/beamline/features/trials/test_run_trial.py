@@ -16,12 +16,12 @@ from beamline.features.trials.trial import MethodTrial, Outcome
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
+from recon.base.view_data import RayWeights, Views
 from recon.base.volume import Grid, Volume
 from recon.methods import by_name, names_of_trials
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
-from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -35,8 +35,7 @@ def data() -> TrialData:
     integrals = SCAN.line_integrals().astype(np.float32)
     held = np.arange(3, 30, 9)
     half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
-    prepared = prepared_views(integrals, views).holding_out(held)
-    return TrialData(prepared, half.truth(Grid.matching(views)))
+    return TrialData(Views(integrals, views).holding_out(held), half.truth(Grid.matching(views)))
 
 
 def run(trial: MethodTrial, data: TrialData, control: RunControl | None = None) -> Outcome:
@@ -50,21 +49,21 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
     measured[:, :5] = False
     figures = []
     for filled in (0.0, 3.0):
-        lines = data.prepared.lines
-        lines = replace(lines, data=np.where(measured, lines.data, np.float32(filled)))
-        given = replace(data.prepared, lines=lines, measured=measured)
+        lines = np.where(measured, data.views.data, np.float32(filled))
+        weights = RayWeights((np.broadcast_to(measured.astype(np.float32), lines.shape),))
+        given = replace(data.views, data=lines, weights=weights)
         trial = MethodTrial("method", method, data.geometry.n_views)
-        found = run(trial, replace(data, prepared=given))
+        found = run(trial, replace(data, views=given))
         figures.append([*found.metrics.values(), *found.squared_residuals])
     np.testing.assert_array_equal(figures[0], figures[1])
-    blind = run(trial, replace(data, prepared=replace(given, measured=None)))
+    blind = run(trial, replace(data, views=replace(given, weights=None)))
     assert blind.metrics["residual_held_out"] > 1.2 * found.metrics["residual_held_out"]
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
     found = run(MethodTrial("method", "fbp", data.geometry.n_views), data)
-    expected = fbp(data.prepared.seen.data, data.geometry, filter="hann")
-    apart = data.prepared.lines.unseen
+    expected = fbp(data.views.seen.data, data.geometry, filter="hann")
+    apart = data.views.unseen
     assert data.truth is not None and apart is not None
     assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
     volume = Volume(expected, Grid.matching(data.geometry))
@@ -81,10 +80,10 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
 def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
     """Spoiling them changes its residual and nothing else."""
     trial = MethodTrial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
-    lines = data.prepared.lines
+    lines = data.views
     assert lines.held_out.size and lines.used is not None
     twice = np.where(lines.used[:, None, None], lines.data, 2 * lines.data)
-    spoilt = replace(data, prepared=replace(data.prepared, lines=replace(lines, data=twice)))
+    spoilt = replace(data, views=replace(lines, data=twice))
     kept, other = (run(trial, d).metrics for d in (data, spoilt))
     assert kept["psnr"] == other["psnr"] and kept["residual_held_out"] < other["residual_held_out"]
 
@@ -97,7 +96,7 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     """On a clock that goes on by a tenth of a second whenever it is asked."""
     ticks = itertools.count()
     trial = MethodTrial("method", method, 27, seconds_asked=8.0)
-    alone = replace(data, prepared=data.prepared.without_held_out)
+    alone = replace(data, views=data.views.seen)
     found = run(trial, alone, RunControl(now=lambda: 0.1 * next(ticks)))
     own_length = not by_name(method).ended_by(8.0)
     assert (0 if own_length else 0.6 * 8) < found.seconds < 1.1 * 8

@@ -36,7 +36,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[MethodTrial, TrialData]]
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
         figures, _ = data.measured(trial, Volume(volume, grid))
         assert trial.choice is not None
-        found.append((trial, replace(data, prepared=averaged(data.prepared, trial.choice))))
+        found.append((trial, replace(data, views=averaged(data.views, trial.choice))))
         return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0), volume
 
     monkeypatch.setattr(runner, "run_trial", trial)
@@ -108,8 +108,8 @@ def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any
     whole, *rows = (data for _, data in seen)
     mean = rows[3]  # after three of single views: two views side by side
     assert mean.geometry.n_views == 180
-    light = np.exp(-whole.prepared.seen.data.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
-    np.testing.assert_allclose(mean.prepared.seen.data, -np.log(light), atol=1e-5)
+    light = np.exp(-whole.views.data.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
+    np.testing.assert_allclose(mean.views.data, -np.log(light), atol=1e-5)
     np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("trials_started", "done", len(rows))

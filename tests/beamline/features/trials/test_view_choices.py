@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beamline.features.trials.run_trial import averaged
 from beamline.features.trials.view_choices import STUDIES, ViewChoice, ViewSet
 from recon.base.geometry import Geometry
-from tests.beamline.prepared_views import prepared_views
+from recon.base.view_data import Views
 
 HALF_TURN = np.radians(np.arange(1800) * 0.1)
 
@@ -97,10 +97,10 @@ def test_a_mean_of_views_is_that_of_their_light(window: int, offset: float) -> N
     views = (rng.random((7, 2, 3)) * 3 + offset).astype(np.float32)
     angles = np.sort(rng.random(7))
     groups = np.arange(3)[:, None] + np.arange(window)
-    mean = averaged(prepared_views(views, Geometry.parallel(angles, (2, 3))), ViewChoice("", groups.tolist()))
+    mean = averaged(Views(views, Geometry.parallel(angles, (2, 3))), ViewChoice("", groups.tolist()))
     light = np.exp(-views.astype(np.longdouble))
     expected = [-np.log(sum(light[g] for g in group) / window) for group in groups]
-    np.testing.assert_allclose(mean.seen.data, np.array(expected, np.float64), rtol=3e-6, atol=1e-5)
+    np.testing.assert_allclose(mean.data, np.array(expected, np.float64), rtol=3e-6, atol=1e-5)
     np.testing.assert_allclose(mean.geometry.angles, [angles[group].mean() for group in groups])
 
 
