@@ -91,6 +91,8 @@ FOR_PACKAGES = {
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
     "beamline.storage.readers.open": ("open_scan", "scan_format"),
     "beamline.storage.readers.reference_files": ("load_images",),
+    "beamline.storage.scan_file": ("ScanFile", "opened"),
+    "beamline.storage.writers.layout": ("ANGLE", "COUNT_TIME", "KIND", "TIME"),
     "beamline.storage.writers.nxtomo": ("ScanInfo",),
     "beamline.storage.writers.recon_file": ("new_plot",),
     "beamline.storage.volumes.files": ("opened_volume", "write_volume"),
