@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean, lit
 from beamline.storage import datasets, hdf5, scan_file
-from beamline.storage.flag_legend import read_legend
+from beamline.storage.flag_legend import read_flags, read_legend
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.writers import layout
 
 
@@ -56,20 +57,20 @@ class Recording:
     def progress(self) -> ScanProgress:
         n, scan = self._scan.committed(), self._scan
         newest = _json_number(scan.values(layout.TIME, n - 1)) if n else None
-        return ScanProgress(n, datasets.text_of(scan.item(layout.STATUS)) if scan.finished else "running", newest)
+        return ScanProgress(n, datasets.text(scan.values(layout.STATUS)) if scan.finished else "running", newest)
 
     def facts(self) -> dict[str, Any]:
         """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
         scan = self._scan
         axis = datasets.dataset(scan.file, layout.AXIS_COL)
         return {
-            "sample": scan.text("/entry/sample/name"),
-            "title": scan.text("/entry/title"),
+            "sample": datasets.text_at(scan.file, "/entry/sample/name"),
+            "title": datasets.text_at(scan.file, "/entry/title"),
             "shape": self.shape,
             "preview_bin": self.preview_bin,
-            "pixel_mm": scan.number(f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS),
+            "pixel_mm": datasets.scalar(scan.file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS),
             "axis_col": None if axis is None else _json_number(axis[()]),
-            "monitored": scan.text("/entry/record/plan") not in ("", "{}"),
+            "monitored": datasets.text_at(scan.file, "/entry/record/plan") not in ("", "{}"),
             "checks": [
                 {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(scan.file)
             ],
@@ -83,7 +84,7 @@ class Recording:
 
     def flags(self) -> list[dict[str, Any]]:
         """Each flag of each frame: frame, check, whether it is an alarm, score, region [row, row, col, col] or null."""
-        frame_flags = self._scan.flags(self.progress().frames)
+        frame_flags = read_flags(self._scan.file, self.progress().frames)
         listed = []
         for frame in np.flatnonzero(frame_flags.flagged):
             bits = int(frame_flags.bits[frame])
@@ -133,7 +134,7 @@ class Recording:
         Returns:
             [view, col / bin] of at most 1024 columns, the frames, and the binning.
         """
-        views = self._scan.table(self.progress().frames).views
+        views = frames_in(self._scan.file, self.progress().frames).views
         views = views[views >= first]
         packed = self._scan.data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._scan.data, 1)
@@ -163,7 +164,7 @@ class Recording:
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Means of the first darks and flats, at most eight each; None until there are some of both."""
         if self._dark_and_flat is None:
-            table = self._scan.table(frames)
+            table = frames_in(self._scan.file, frames)
             darks, flats = table.darks[:8], table.flats[:8]
             if darks.size == 0 or flats.size == 0:
                 return None

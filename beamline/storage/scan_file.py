@@ -12,16 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.flag_legend import FrameFlags, read_flags
-from beamline.storage.frame_table import FrameTable
-from beamline.storage.recorded_frames import frames_in
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import ScanEnding, ending_in
 
 
 class ScanFile:
@@ -70,40 +64,12 @@ class ScanFile:
         """True if no more frames will come."""
         return bool(self.values(layout.FINISHED))
 
-    @property
-    def ending(self) -> ScanEnding:
-        """How the scan ended, as far as the file states."""
-        return ending_in(self.file)
-
-    def table(self, n: int) -> FrameTable:
-        """The table of the first n frames, without flags; see `frames_in`."""
-        return frames_in(self.file, n)
-
-    def flags(self, n: int) -> FrameFlags:
-        """The monitor's flags of the first n frames."""
-        return read_flags(self.file, n)
-
-    def item(self, path: str) -> h5py.Dataset:
-        """A dataset as it is now. Do not keep it: see `data`. Raises KeyError without it."""
+    def values(self, path: str, part: Any = ()) -> Any:
+        """Values of a dataset as it is now: all of them, or a part, such as a row or a slice of the rows. KeyError: it
+        does not exist."""
         item = self.file[path]
         hdf5.look_again(item)
-        return item
-
-    def values(self, path: str, part: Any = ()) -> Any:
-        """Values of a dataset as it is now: all of them, or a part, such as a row or a slice of the rows."""
-        return self.item(path)[part]
-
-    def text(self, path: str) -> str:
-        """A dataset as text; "" if it is missing."""
-        return datasets.text_at(self.file, path)
-
-    def number(self, path: str, units: dict[str, float]) -> float | None:
-        """A number in the unit of this program; None if the file does not state it."""
-        return datasets.scalar(self.file, path, units)
-
-    def read(self, rows: NDArray[np.int64], part: slice, out: NDArray[Any]) -> None:
-        """Fill out [frame, row, col] with a part of the rows of these frames, in that order; see `read_frames`."""
-        datasets.read_frames(self.data, rows, part, out)
+        return item[part]
 
     def close(self) -> None:
         with suppress(RuntimeError, OSError, ValueError):

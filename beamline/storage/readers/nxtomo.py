@@ -7,10 +7,8 @@ is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -47,19 +45,6 @@ from beamline.storage.superblock import marked_as_being_written
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
-
-_T = TypeVar("_T")
-
-
-def _guarded(method: Callable[[NexusSource], _T]) -> Callable[[NexusSource], _T]:
-    """The method, with h5py's errors as DataError."""
-
-    @wraps(method)
-    def read(self: NexusSource) -> _T:
-        with hdf5.readable(self.path):
-            return method(self)
-
-    return read
 
 
 class NexusSource(ScanSource):
@@ -121,7 +106,7 @@ class NexusSource(ScanSource):
     def finished(self) -> bool:
         return not any(map(marked_as_being_written, {self.path, Path(self._places.data.file.filename)}))
 
-    @_guarded
+    @hdf5.guarded
     def refresh(self) -> int:
         places, keys, ended = self._places, self._places.keys, self.finished
         hdf5.look_again(keys)
@@ -156,7 +141,7 @@ class NexusSource(ScanSource):
         return datasets.bytes_unpacked(self._places.data)
 
     @property
-    @_guarded
+    @hdf5.guarded
     def attributes(self) -> dict[str, str | float | int]:
         """Further metadata: sample, title, times."""
         facts = stated_facts(self._places.entry, self.table.exposures)

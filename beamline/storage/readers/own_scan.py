@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,29 +15,17 @@ from beamline.monitor.digest import has_checksum
 from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5, scan_file
 from beamline.storage.datasets import require_real
+from beamline.storage.flag_legend import read_flags
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.parts import gaps_in, require_joined
 from beamline.storage.readers.base import WHOLE, ScanSource, frame_indices
 from beamline.storage.readers.nexus import read_energy
 from beamline.storage.readers.nxtomo import format_of, quantity_of, stated_facts
-from beamline.storage.recorded_frames import decisions_in, pass_ends_in
+from beamline.storage.recorded_frames import decisions_in, frames_in, pass_ends_in
 from beamline.storage.scan_file import ScanFile
 from beamline.storage.structure import drawn_on
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import RUNNING, ScanEnding
-
-_T = TypeVar("_T")
-
-
-def _guarded(method: Callable[[OwnScan], _T]) -> Callable[[OwnScan], _T]:
-    """The method, with h5py's errors as DataError."""
-
-    @wraps(method)
-    def read(self: OwnScan) -> _T:
-        with hdf5.readable(self.path):
-            return method(self)
-
-    return read
+from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(ScanSource):
@@ -51,13 +37,13 @@ class OwnScan(ScanSource):
         self.path, self._scan, self._damaged = scan.path, scan, set[int]()
         self._checksums: NDArray[np.int64] | None = None
         self._check()
-        self.shape, self.dtype = scan.shape, scan.dtype
-        self.format = format_of(entry)
-        self.quantity = quantity_of(scan.text("/entry/record/quantity"), scan.data.id.dtype)
-        self.energy_kev, self.axis_col = read_energy(entry), scan.number(layout.AXIS_COL, {"pixel": 1.0})
-        self.pixel_size_mm = scan.number(f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS)
+        self.shape, self.dtype, self.format = scan.shape, scan.dtype, format_of(entry)
+        self.quantity = quantity_of(datasets.text_at(entry, "record/quantity"), scan.data.id.dtype)
+        self.energy_kev = read_energy(entry)
+        self.axis_col = datasets.scalar(file, layout.AXIS_COL, {"pixel": 1.0})
+        self.pixel_size_mm = datasets.scalar(file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS)
         self.cone = self._cone()
-        self.plan = json_object(scan.text("/entry/record/plan")) or {}
+        self.plan = json_object(datasets.text_at(entry, "record/plan")) or {}
         self.table = FrameTable.of(np.zeros(0))
         self.refresh()
         devices = (file.get("/entry/instrument/devices") or {}).values()
@@ -77,8 +63,8 @@ class OwnScan(ScanSource):
             )
 
     def _cone(self) -> tuple[float, float] | None:
-        sod = self._scan.number(layout.SOURCE_DISTANCE, datasets.LENGTH_UNITS)
-        beyond = self._scan.number(f"{layout.DETECTOR}/distance", datasets.LENGTH_UNITS)
+        places = layout.SOURCE_DISTANCE, f"{layout.DETECTOR}/distance"
+        sod, beyond = (datasets.scalar(self._scan.file, each, datasets.LENGTH_UNITS) for each in places)
         if sod is None or beyond is None:
             return None
         if sod <= 0 or beyond < 0:
@@ -89,13 +75,13 @@ class OwnScan(ScanSource):
             )
         return sod, sod + beyond
 
-    @_guarded
+    @hdf5.guarded
     def refresh(self) -> int:
         scan, known = self._scan, len(self.table)
         if (n := scan.committed()) > known or not n or self.finished:
-            flags = scan.flags(n)
+            flags = read_flags(scan.file, n)
             stated = self.plan or flags.flagged.any()  # a copy has none to say
-            self.table = replace(scan.table(n), flags=flags if stated else None)
+            self.table = replace(frames_in(scan.file, n), flags=flags if stated else None)
         else:  # of frames that were there nothing else is used before the end
             self.table = replace(self.table, pass_ends=pass_ends_in(scan.file))
         self.decisions, self._checksums = decisions_in(scan.file), self._stored_checksums(n)
@@ -108,15 +94,15 @@ class OwnScan(ScanSource):
         return values[:n].astype(np.int64) if listed else None
 
     @property
-    @_guarded
+    @hdf5.guarded
     def finished(self) -> bool:
         return self._scan.finished
 
     @property
-    @_guarded
+    @hdf5.guarded
     def attributes(self) -> dict[str, str | float | int]:
         """Further metadata: sample, title, times, status, missing triggers, why the scan ended early."""
-        ending, reason = self._scan.ending, self.ending.reason
+        ending, reason = ending_in(self._scan.file), self.ending.reason
         facts = stated_facts(self._scan.file[layout.ENTRY], self.table.exposures)
         if self._scan.data.is_virtual:
             facts["parts"] = ", ".join(name for name, _ in drawn_on(self._scan.data.id.get_create_plist()))
@@ -124,9 +110,9 @@ class OwnScan(ScanSource):
         return facts | ({"ended": reason} if reason else {})
 
     @property
-    @_guarded
+    @hdf5.guarded
     def ending(self) -> ScanEnding:
-        ending = self._scan.ending
+        ending = ending_in(self._scan.file)
         own = {"reason": ending.reason or ended_by(self.decisions)}
         return replace(
             ending, **({"missing": gaps_in(self.path, self._scan.file)} if ending.status == RUNNING else own)
@@ -140,11 +126,11 @@ class OwnScan(ScanSource):
         indices, height = frame_indices(frames, len(self.table)), len(range(self.shape[0])[rows])
         out = np.empty((indices.size, height, self.shape[1]), self.dtype)
         if 2 * height < self.shape[0] or not self.checksummed:
-            self._scan.read(indices, rows, out)
+            datasets.read_frames(self._scan.data, indices, rows, out)
             return out
         whole = np.empty((1, *self.shape), self.dtype)
         for view, row in zip(out, indices, strict=True):
-            self._scan.read(np.array([row]), WHOLE, whole)
+            datasets.read_frames(self._scan.data, np.array([row]), WHOLE, whole)
             if self._checksums is not None and not has_checksum(whole[0], int(self._checksums[row])):
                 self._damaged.add(int(row))
             view[:] = whole[0, rows]

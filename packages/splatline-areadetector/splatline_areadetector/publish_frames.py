@@ -169,7 +169,5 @@ class RunFrames:
 
 
 def _read(file: ScanFile, row: int) -> PublishedFrame:
-    counts = np.empty((1, *file.shape), file.dtype)
-    file.read(np.array([row]), slice(None), counts)
     kind, angle, at, exposure = (file.values(path, row) for path in (KIND, ANGLE, TIME, COUNT_TIME))
-    return PublishedFrame(counts[0], row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
+    return PublishedFrame(file.data[row], row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
