@@ -107,7 +107,7 @@ FOR_PACKAGES = {
         "TriggerSource", "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
-    "drivers.epics.channel": ("ProcessVariable", "open_channel"),
+    "drivers.epics.channel": ("ProcessVariable", "open_channel", "waited"),
     "drivers.stages.settings": ("StageDriver", "StageSettings"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),
