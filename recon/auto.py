@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from recon.base.choices import AUTO, Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.registry import LibraryError
@@ -19,7 +19,7 @@ from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
 from recon.voxels.half_voxels import with_halves
 from recon.voxels.held_out import LEAST_VIEWS
-from recon.voxels.iterative import TrialWatch, VoxelMethod, Watch, scaled_problem, threads_for
+from recon.voxels.iterative import VoxelMethod, scaled_problem, threads_for, watched
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial, TrialSettings
 
@@ -142,9 +142,9 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     # In a slab, progress counts only slices.
     silent = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(_sweeps(each) for each in candidates)
-    watch = Watch(on_trial=TrialWatch(silent, problem.geometry.n_views, sweeps))
+    go_on = GoesOn(trials=watched(silent, problem.geometry.n_views, sweeps).trials)
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide)
+    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, go_on, decide)
     return Trial.of(scan, TrialSettings(all_rows, control.now))
 
 

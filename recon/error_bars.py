@@ -11,14 +11,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from recon.base.arrays import F32, some_values
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import names_where
 from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
-from recon.voxels.iterative import VoxelMethod, Watch, solve_views
+from recon.voxels.iterative import VoxelMethod, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.projector import Projector
@@ -163,27 +163,27 @@ def _refitted(
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight, and their decisions; None: it was stopped."""
     refit = method.refit(_SHARE)
-    sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
+    sweeps, begin, done = refit.iterations, control.now(), 0
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     given = problem.views.masked()
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
     def progress(iteration: int, residual: float) -> bool:
-        nonlocal done, stopped
+        nonlocal done
         done += 1
         control.report_progress(done, 2 * sweeps, begin, problem.geometry.n_views, "sweeps of error bars")
-        stopped = stopped or control.stop()
-        return stopped
+        return not control.stop()
 
+    go_on = GoesOn(progress)
     volumes: list[F32] = []
     for sign in (1, -1):
         trusted = given.weighed(1 + np.float32(sign * _EXTRA) * signs)
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
-            refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(progress),
+            refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, go_on=go_on,
             decide=decide,
         )  # fmt: skip
-        if stopped:
+        if not go_on.going:
             return None
         follow = decide.made
         volumes.append(refitted.data)

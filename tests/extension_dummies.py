@@ -128,7 +128,7 @@ READER = Extension(
     {"beamline/storage/readers/npy_stack.py": site("readers")},
     (
         (
-            "beamline/storage/readers/open.py",
+            "beamline/storage/readers/formats.py",
             '    "dxchange",',
             '    "npy_stack",',
         ),

@@ -13,6 +13,7 @@ import click
 from beamline.cli.options import POSITIVE, Declared, NameChoice, WholeRange, declared, option, parsed, together
 from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
+from beamline.reconstruct.combinations import EXCLUDED
 from recon.assess.time_model import PRESETS, parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
@@ -148,42 +149,24 @@ def slabs_resumed(path: Path | None) -> Path | None:
     return path if path is not None and is_partial(path) else None
 
 
-SLABS_RESUMED = "resume of slabs"
-"""Name for `--resume` with a partial volume, because other rules apply to it than to a checkpoint."""
-_OF_ONE_VOLUME = {
-    "roi": "a box can be cut only from a single volume",
-    "truth": "a ground truth can be compared only with a single volume",
-    "uncertainty": "error bars are computed only for a single volume",
-    **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes cannot be reconstructed in slabs"),
-}
-"""Options that cannot be combined with several volumes (in time, or of materials)."""
-
-_FINISHED = {"follow": "it needs a finished scan"}
-_PLANNED = {"quality": "--quality already sets it"}
-_BY_SECONDS = {"follow": "it needs a finished scan; use --seconds"}
-NOT_WITH_SLABS = {"follow": "a running scan cannot be reconstructed in slabs, because everything must stay in memory"}
-NOT_WITH_ERROR_BARS = dict.fromkeys(
-    ("follow", "budget", "seconds"), "error bars need the complete scan, and time for two further fits"
-)
-
 _STEPS = option(
     "--steps",
     setting="steps",
-    excludes={"seconds": "give one of them", **_PLANNED},
+    excludes=EXCLUDED["steps"],
     type=WholeRange(min=1),
     help=f"Number of steps of the Gaussian fit (r2). Default: {DEFAULT_STEPS}.",
 )
 _GAUSSIANS = option(
     "--gaussians",
     setting="gaussians",
-    excludes=_PLANNED,
+    excludes=EXCLUDED["gaussians"],
     type=WholeRange(min=1),
     help="Number of Gaussians at the start of the fit (r2). Default: chosen from the size of the detector.",
 )
 _FINISH = option(
     "--finish",
     setting="finish",
-    excludes={**_PLANNED, **_FINISHED},
+    excludes=EXCLUDED["finish"],
     type=WholeRange(min=0),
     help="Number of iterations on the voxel volume after the Gaussian fit; they restore edges, cracks and pores. 0: "
     "none. Default: 8 with total variation, then PnP-DCT steps if these predict held-out projections better.",
@@ -220,7 +203,7 @@ _LEVELS = option(
 _ALLOW_NEGATIVE = option(
     "--allow-negative",
     setting="allow_negative",
-    excludes=_FINISHED,
+    excludes=EXCLUDED["allow-negative"],
     is_flag=True,
     help=(
         "Do not set negative voxels to zero, neither in the method nor in the voxel refinement (--finish). Use this "
@@ -231,12 +214,7 @@ _ALLOW_NEGATIVE = option(
 _WITH_REFERENCE = option(
     "--reference",
     argument="reference",
-    excludes={
-        **_FINISHED,
-        "volumes": "a reference helps to reconstruct a single volume",
-        "uncertainty": "error bars are not calibrated for it",
-        "roi": "the motion of the sample is estimated in all of the field",
-    },
+    excludes=EXCLUDED["reference"],
     type=click.Path(path_type=Path),
     metavar="GOOD",
     help="Volume of the same sample from an earlier, careful scan, or that scan itself, which is then reconstructed "
@@ -248,7 +226,7 @@ _IN_TIME = together(
         "--volumes",
         former="--time",
         setting="volumes",
-        excludes={**_FINISHED, **_OF_ONE_VOLUME},
+        excludes=EXCLUDED["volumes"],
         type=WholeRange(min=2),
         metavar="N",
         help="For a sample that changes during the scan: reconstruct N volumes at equal time steps, from one fit of "
@@ -285,7 +263,7 @@ method_options = together(
     option(
         "--seconds",
         setting="seconds",
-        excludes=_PLANNED,
+        excludes=EXCLUDED["seconds"],
         type=POSITIVE,
         help="Time limit in seconds for the whole command, instead of --steps. Reading, correction, report and writing "
         "take the time they need; the fit gets the rest. If nothing is left for the fit, a warning says when the "
@@ -294,7 +272,7 @@ method_options = together(
     option(
         "--budget",
         argument="budget",
-        excludes={"quality": "give one of them", **_BY_SECONDS},
+        excludes=EXCLUDED["budget"],
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
         help="Time limit of the reconstruction itself, without reading and correction: auto does not try methods that "
@@ -303,7 +281,7 @@ method_options = together(
     option(
         "--quality",
         argument="quality",
-        excludes=_BY_SECONDS,
+        excludes=EXCLUDED["quality"],
         type=NameChoice(list(PRESETS)),
         help="Preset. For r2: number of steps and of Gaussians (preview: 125 steps and half the Gaussians; standard: "
         "400 steps; best: 1500 steps). For auto: preview tries only fbp and fista-tv; best tries all methods and "
@@ -313,7 +291,7 @@ method_options = together(
     option(
         "--start",
         setting="start",
-        excludes=_FINISHED,
+        excludes=EXCLUDED["start"],
         type=NameChoice(get_args(Start)),
         help="Volume from which the initial Gaussians are sampled. tv: slower, but without the streaks of few "
         "projections. published: FBP with a plain ramp filter, sampled and weighted as in the paper. Default: fbp; for "
@@ -337,7 +315,7 @@ method_options = together(
     option(
         "--device",
         argument="device",
-        excludes=_FINISHED,
+        excludes=EXCLUDED["device"],
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
@@ -347,7 +325,7 @@ method_options = together(
     option(
         "--early-stop",
         setting="early_stop",
-        excludes=_FINISHED,
+        excludes=EXCLUDED["early-stop"],
         is_flag=True,
         help="Stop the fit when the residual in the held-out projections no longer falls. Every tenth projection is "
         "held out, unless --views already leaves some out.",
@@ -357,7 +335,7 @@ method_options = together(
     option(
         "--checkpoint",
         argument="checkpoints",
-        excludes=_FINISHED,
+        excludes=EXCLUDED["checkpoint"],
         of_one_call=True,
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
@@ -367,7 +345,7 @@ method_options = together(
     option(
         "--resume",
         argument="checkpoints",
-        excludes=_FINISHED,
+        excludes=EXCLUDED["resume"],
         of_one_call=True,
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.method_options import (
-    SLABS_RESUMED,
     method_with,
     refuse_other_methods,
     settings_of,
@@ -30,6 +29,7 @@ from beamline.core.recon_events import FitReached
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import safe_name
+from beamline.reconstruct.combinations import SLABS_RESUMED
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME, WITH_REFERENCE, streams

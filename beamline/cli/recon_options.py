@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.method_options import NOT_WITH_ERROR_BARS, NOT_WITH_SLABS, SLABS_RESUMED, method_options
+from beamline.cli.method_options import method_options
 from beamline.cli.options import (
     NOT_NEGATIVE,
     MethodChoice,
@@ -24,6 +24,7 @@ from beamline.cli.options import (
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, config_option, heading
 from beamline.cli.selection_options import selection_options
 from beamline.core.text import memory_size
+from beamline.reconstruct.combinations import EXCLUDED
 from beamline.storage.volumes import suffixes_text
 from recon.base.choices import AUTO
 from recon.base.registry import in_folders
@@ -71,7 +72,7 @@ unfinished_option = option(
 )
 memory_option = option(
     "--memory",
-    excludes=NOT_WITH_SLABS,
+    excludes=EXCLUDED["memory"],
     metavar="SIZE",
     callback=parsed(memory_size),
     help="Memory that may be used, for example 8G or 500M. A parallel-beam scan that needs more is kept on the disk of "
@@ -120,7 +121,7 @@ recon_options = together(
     heading(OUTPUT),
     option(
         "--uncertainty",
-        excludes=NOT_WITH_ERROR_BARS,
+        excludes=EXCLUDED["uncertainty"],
         is_flag=True,
         help="Also write the standard deviation of each voxel, estimated by fitting two halves of the projections "
         "again. For auto, r2, fista-tv, discrete, pnp-dct and fbp; needs .h5 output.",
@@ -144,7 +145,7 @@ recon_options = together(
     heading(DATA),
     option(
         "--follow",
-        excludes={SLABS_RESUMED: "slabs can be resumed only for a finished scan"},
+        excludes=EXCLUDED["follow"],
         of_one_call=True,
         is_flag=True,
         help="Reconstruct a scan while it is running. Methods that need all projections wait for the end of the scan.",
@@ -170,7 +171,7 @@ recon_options = together(
     memory_option,
     option(
         "--cluster",
-        excludes=NOT_WITH_SLABS,
+        excludes=EXCLUDED["cluster"],
         of_one_call=True,
         metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
@@ -181,10 +182,7 @@ recon_options = together(
     option(
         "--roi",
         "region",
-        excludes={
-            "follow": "it needs a finished scan",
-            "truth": ("a ground truth can be compared only with the whole volume"),
-        },
+        excludes=EXCLUDED["roi"],
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
         help="Write only this box of voxels; the indices are those of the full volume. Only detector rows that see the "
@@ -202,7 +200,7 @@ recon_options = together(
     option(
         "--dry-run",
         "dry",
-        excludes={"follow": "the time of a running scan is not known", "budget": "it prints the time of every method"},
+        excludes=EXCLUDED["dry-run"],
         of_one_call=True,
         is_flag=True,
         help="Print the memory, time and disk space that the reconstruction needs, and stop. Nothing is computed.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean, lit
-from beamline.storage import datasets, hdf5
+from beamline.storage import datasets, hdf5, scan_file
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.recorded_frames import frames_in
 from beamline.storage.writers import layout
@@ -41,19 +40,14 @@ class Recording:
         self.path = path
         if path.is_file() and path.stat().st_size and not hdf5.is_hdf5(path):
             raise _foreign(path)
-        self._file = hdf5.open_hdf5(path, follow=True)
-        with hdf5.closed_on_error(self), hdf5.readable(path):
-            if layout.COMMITTED not in self._file:
-                raise _foreign(path)
-            self._data: h5py.Dataset = self._file[layout.DATA]
-            self._preview: h5py.Dataset = self._file[layout.PREVIEW]
-            self.shape = (int(self._data.shape[1]), int(self._data.shape[2]))
+        scan = scan_file.opened(path, follow=True)
+        if scan is None:
+            raise _foreign(path)
+        self._scan, self.shape, self.close = scan, scan.shape, scan.close
+        with hdf5.closed_on_error(scan), hdf5.readable(path):
+            self._preview: h5py.Dataset = scan.file[layout.PREVIEW]  # stays open, see `ScanFile.data`
             self.preview_bin = int(self._preview.attrs["bin"])
         self._dark_and_flat: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-
-    def close(self) -> None:
-        with suppress(RuntimeError, OSError, ValueError):
-            self._file.close()
 
     @property
     def has_references(self) -> bool:
@@ -61,31 +55,24 @@ class Recording:
         return self._dark_and_flat is not None
 
     def progress(self) -> ScanProgress:
-        values = committed, finished, status = [
-            self._file[name] for name in (layout.COMMITTED, layout.FINISHED, layout.STATUS)
-        ]
-        for value in values:
-            hdf5.look_again(value)
-        n, times = int(committed[()]), self._file[layout.TIME]
-        if n:
-            hdf5.look_again(times)
-        newest = _json_number(times[n - 1]) if n else None
-        return ScanProgress(n, datasets.text_of(status) if finished[()] else "running", newest)
+        n, scan = self._scan.committed(), self._scan
+        newest = _json_number(scan.values(layout.TIME, n - 1)) if n else None
+        return ScanProgress(n, datasets.text(scan.values(layout.STATUS)) if scan.finished else "running", newest)
 
     def facts(self) -> dict[str, Any]:
         """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
-        pixel = datasets.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS)
-        axis = datasets.dataset(self._file, layout.AXIS_COL)
+        scan = self._scan
+        axis = datasets.dataset(scan.file, layout.AXIS_COL)
         return {
-            "sample": datasets.text_at(self._file, "/entry/sample/name"),
-            "title": datasets.text_at(self._file, "/entry/title"),
+            "sample": datasets.text_at(scan.file, "/entry/sample/name"),
+            "title": datasets.text_at(scan.file, "/entry/title"),
             "shape": self.shape,
             "preview_bin": self.preview_bin,
-            "pixel_mm": pixel,
+            "pixel_mm": datasets.scalar(scan.file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS),
             "axis_col": None if axis is None else _json_number(axis[()]),
-            "monitored": datasets.text_at(self._file, "/entry/record/plan") not in ("", "{}"),
+            "monitored": datasets.text_at(scan.file, "/entry/record/plan") not in ("", "{}"),
             "checks": [
-                {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(self._file)
+                {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(scan.file)
             ],
         }
 
@@ -97,7 +84,7 @@ class Recording:
 
     def flags(self) -> list[dict[str, Any]]:
         """Each flag of each frame: frame, check, whether it is an alarm, score, region [row, row, col, col] or null."""
-        frame_flags = read_flags(self._file, self.progress().frames)
+        frame_flags = read_flags(self._scan.file, self.progress().frames)
         listed = []
         for frame in np.flatnonzero(frame_flags.flagged):
             bits = int(frame_flags.bits[frame])
@@ -133,8 +120,7 @@ class Recording:
         region = region.inside(self.shape)
         rows, cols = region.slices
         factor = region.binning()
-        hdf5.look_again(self._data)
-        pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
+        pixels = bin_mean(self._scan.data[frame, rows, cols], (factor, factor))
         if corrected and (references := self._references(frames)) is not None:
             dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in references)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,10 +134,10 @@ class Recording:
         Returns:
             [view, col / bin] of at most 1024 columns, the frames, and the binning.
         """
-        views = frames_in(self._file, self.progress().frames).views
+        views = frames_in(self._scan.file, self.progress().frames).views
         views = views[views >= first]
-        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
-        source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
+        packed = self._scan.data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
+        source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._scan.data, 1)
         at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
         hdf5.look_again(source)
         factor = max(1, -(-source.shape[2] // MOST))
@@ -172,15 +158,13 @@ class Recording:
         return [_json_number(self._preview[frame, rows, cols].mean()) for frame in frames]
 
     def _column(self, path: str, first: int, frames: int) -> list[Any]:
-        column = self._file[path]
-        hdf5.look_again(column)
-        values = column[first:frames]
+        values = self._scan.values(path, slice(first, frames))
         return [_json_number(value) for value in values] if values.dtype.kind == "f" else values.tolist()
 
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Means of the first darks and flats, at most eight each; None until there are some of both."""
         if self._dark_and_flat is None:
-            table = frames_in(self._file, frames)
+            table = frames_in(self._scan.file, frames)
             darks, flats = table.darks[:8], table.flats[:8]
             if darks.size == 0 or flats.size == 0:
                 return None
@@ -191,7 +175,7 @@ class Recording:
     def _mean(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
         total = np.zeros(self.shape, np.float32)
         for row in rows:
-            total += self._data[int(row)]
+            total += self._scan.data[int(row)]
         return total / np.float32(rows.size)
 
 

@@ -13,6 +13,7 @@ from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
 from beamline.projections.selection import SelectedScan, Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.combinations import SLABS_RESUMED
 from beamline.reconstruct.region import AroundSample, Region, box_around_sample, rows_around
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
@@ -154,6 +155,16 @@ class ReconOptions:
 
     def __post_init__(self) -> None:
         check_settings(self)
+
+    @property
+    def given(self) -> frozenset[str]:
+        """Names in `combinations.EXCLUDED` of what these options ask for."""
+        asked = {
+            "follow": self.follow, "budget": self.budget, "quality": self.quality, "reference": self.reference,
+            "volumes": self.method.volumes > 1, "uncertainty": self.uncertainty, "truth": self.truth,
+            "roi": self.region, "cluster": self.cluster, "memory": self.memory, SLABS_RESUMED: self.partial,
+        }  # fmt: skip
+        return frozenset(name for name, value in asked.items() if value not in (None, False))
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
         """Bytes on disk for the result, and for temporary files, of a volume of `volume` bytes."""

@@ -20,9 +20,10 @@ from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections
+from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections, require_usable
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import SelectedScan, check_axis
+from beamline.reconstruct.combinations import contradiction
 from beamline.reconstruct.memory import (
     ReconMemory,
     cluster,
@@ -224,11 +225,8 @@ def prepare_within(
     scan: SelectedScan, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
     """`prepare_projections`, and the plan: for a volume made in slabs, line integrals are stored on disk."""
-    try:
-        needs = recon_memory_of(scan, options)
-    except (ConfigError, DataError):
-        prepare_projections(scan, warn)  # faults of the views come first: this says them
-        raise
+    require_usable(scan)  # faults of the projections are told before those of options
+    needs = recon_memory_of(scan, options)
     plan, buffer = planned(scan, options, needs), None
     options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
@@ -283,7 +281,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
-    _refuse_several_volumes(options)
+    _refuse_contradictions(options)
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
@@ -300,20 +298,15 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     return truth
 
 
-def _refuse_several_volumes(options: ReconOptions) -> None:
-    """Raises ConfigError if options of one volume stand next to a method that makes several."""
-    if options.method.volumes > 1:
-        target = options.target
-        if target.written and target.output.suffix.lower() not in SUFFIXES:
-            raise ConfigError(
-                f"-o {target.output}: several volumes can only be written to HDF5. Use a name that ends in .h5."
-            )
-        of_one = ("region", "truth", "uncertainty", "cluster", "partial")
-        if wrong := [name for name in of_one if getattr(options, name)]:
-            raise ConfigError(
-                f"{' and '.join(wrong)}: works only with methods that make one volume, but {options.method.name} "
-                "makes several. Leave it out, or choose another method. Nothing was computed."
-            )
+def _refuse_contradictions(options: ReconOptions) -> None:
+    """Raises ConfigError for options that exclude each other, and for a file that cannot hold several volumes."""
+    if (found := contradiction(options.given)) is not None:
+        raise ConfigError(f"{found.name} cannot be combined with {found.other}: {found.why}. Nothing was computed.")
+    target = options.target
+    if options.method.volumes > 1 and target.written and target.output.suffix.lower() not in SUFFIXES:
+        raise ConfigError(
+            f"-o {target.output}: several volumes can only be written to HDF5. Use a name that ends in .h5."
+        )
 
 
 def _refuse_unfollowed(options: ReconOptions) -> None:

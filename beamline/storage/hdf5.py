@@ -9,11 +9,12 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that copies of scans use
@@ -195,6 +196,25 @@ def readable(path: Path) -> Iterator[None]:
         raise DataError(
             f"{path} is damaged or has an unexpected structure ({type(error).__name__}: {what}). Nothing was changed."
         ) from error
+
+
+class _OfPath(Protocol):
+    path: Path
+
+
+_S = TypeVar("_S", bound=_OfPath)
+_T = TypeVar("_T")
+
+
+def guarded(method: Callable[[_S], _T]) -> Callable[[_S], _T]:
+    """A method of an open file with this `path`, whose errors are converted as by `readable`."""
+
+    @wraps(method)
+    def read(self: _S) -> _T:
+        with readable(self.path):
+            return method(self)
+
+    return read
 
 
 _CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a TypeError by what a file holds

@@ -197,7 +197,7 @@ class CaChannel:
 
     def read(self, *suffixes: str) -> list[PvValue]:
         ca, names = self._asked(), [self.name + suffix for suffix in suffixes]
-        values = _waited(ca.caget(names, format=ca.FORMAT_CTRL, timeout=self._timeout, throw=False))
+        values = waited(ca.caget(names, format=ca.FORMAT_CTRL, timeout=self._timeout, throw=False))
         if silent := [value.name for value in values if not value.ok and value.errorcode in _CA_SILENCE]:
             self._errors.silent(", ".join(silent))
         for value in values:
@@ -207,7 +207,7 @@ class CaChannel:
 
     def write(self, suffix: str, value: float | str) -> None:
         ca, name = self._asked(), self.name + suffix
-        result = _waited(ca.caput(name, value, timeout=self._timeout, throw=False))
+        result = waited(ca.caput(name, value, timeout=self._timeout, throw=False))
         if not result.ok:
             if result.errorcode in _CA_SILENCE:
                 self._errors.silent(name)
@@ -237,7 +237,8 @@ def _loop() -> asyncio.AbstractEventLoop:
     return loop
 
 
-def _waited(asked: Any) -> Any:
+def waited(asked: Any) -> Any:
+    """The result of a coroutine of aioca. All of them run in one thread, because aioca's channels belong to it."""
     return asyncio.run_coroutine_threadsafe(asked, _loop()).result()
 
 

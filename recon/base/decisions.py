@@ -121,15 +121,34 @@ class Stop:
         return self.stopped and not 0 < planned <= done
 
 
+def always(step: int, residual: float) -> bool:
+    """Work that nobody ends."""
+    return True
+
+
 class GoesOn:
-    """Whether work goes on: asks the function `go_on` (step, residual) after each step, until its answer is False.
+    """Whether the iterations of a volume go on, and those of its test reconstructions.
+
+    Iterations call it with their number, from 1, and the weighted ||A x - p|| / ||p|| before their correction, so that
+    the volume afterwards is better. (For CGLS and ASD-POCS it is the residual of the volume afterwards.) It calls `ask`
+    with these two numbers until the answer is False.
+
+    Args:
+        ask: is told of each iteration; False ends them.
+        trials: asked after each iteration of the test reconstructions that choose a weight on some rows. If it ends
+            them, the iterations of the volume follow. None: nobody ends them.
 
     Attribute `going`: the last answer; True before the first one.
     """
 
-    def __init__(self, go_on: Callable[[int, float], bool]) -> None:
-        self._go_on, self.going = go_on, True
+    def __init__(self, ask: Callable[[int, float], bool] = always, trials: GoesOn | None = None) -> None:
+        self._ask, self.going = ask, True
+        self.trials: GoesOn = trials or (self if ask is always else GoesOn())
 
-    def __call__(self, step: int, residual: float) -> bool:
-        self.going = self.going and self._go_on(step, residual)
+    def __call__(self, step: int = 0, residual: float = 0.0) -> bool:
+        self.going = self.going and self._ask(step, residual)
         return self.going
+
+    def after(self, done: int, each: int = 1) -> GoesOn:
+        """The same, for iterations that follow `done` others and take the time of `each` of them."""
+        return GoesOn(lambda step, residual: self(done + each * step, residual), self.trials)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.decisions import Decisions, GoesOn
+from recon.base.decisions import Decisions
 from recon.base.empirical import FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, RunControl
@@ -23,7 +23,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
-from recon.voxels.iterative import TrialWatch, Watch, solve_views
+from recon.voxels.iterative import solve_views, watched
 from recon.voxels.methods import PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
 from recon.voxels.priors import NoiseBalance, pnp_dct
@@ -74,12 +74,11 @@ def level_of(beyond: F32) -> F32:
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Iterations of total variation from x [y, x, z], and PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
-    first, parts = GoesOn(problem.go_on), Subsets.of(problem, count, to_the_end=False)
-    x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
-    if not (first.going and strength):
+    parts = Subsets.of(problem, count, to_the_end=False)
+    x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
+    if not (problem.go_on.going and strength):
         return x
-    further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
-    return pnp_dct(further, x, strength, steps=PnpDct.iterations)
+    return pnp_dct(replace(problem, go_on=problem.go_on.after(sweeps)), x, strength, steps=PnpDct.iterations)
 
 
 @dataclass
@@ -100,9 +99,9 @@ class _Finish:
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         for method in pull_methods(iterations=PULLED_SWEEPS) if self.patches else ():
             if materials := method.materials(problem, weight, trial):
-                self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
-                x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                if not first.going:
+                self.planned = self.iterations + method.iterations
+                x = refine(problem, x, weight, strength, self.iterations)
+                if not problem.go_on.going:
                     return x
                 return method.pulled(problem, x, weight, materials, self.iterations, to_the_end=False)
         if self.patches:
@@ -165,15 +164,14 @@ def finish(
     n_views, count, made, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()
     method = _Finish(count, sweeps is None)
 
-    def on_sweep(number: int, residual: float) -> bool:
+    def on_sweep(number: int, residual: float) -> None:
         nonlocal made
         made = number
         control.report_progress(number, method.planned, begin, n_views, "sweeps on voxels")
-        return control.stop()
 
     refined = solve_views(
         method, projector, prepared, start=start, nonnegative=nonnegative,
-        watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
+        go_on=watched(control, n_views, PnpDct().trial_sweeps, on_sweep), decide=decide,
     )  # fmt: skip
     return Finished(refined, min(count, made))
 

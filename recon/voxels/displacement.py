@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter1d
 
+from recon.base.decisions import GoesOn
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.iterative import Watch, solve
+from recon.voxels.iterative import solve
 from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import Projector, seen_rays
 
@@ -34,6 +35,7 @@ NEAR = math.radians(5)  # radians from a projection of the longest part; farther
 TRIAL = 0.25  # pixels; step of the sample for numerical derivatives
 FARTHEST = 4.0  # largest step in pixels
 RELAXED = 1.5  # factor on a step, because the corrected projections are also in the volume, which makes steps too small
+_NO_TRIALS = GoesOn(trials=GoesOn(lambda *_: False))
 _STEPS = 4  # steps of the first registration
 _MEASURED = 0.99  # least weight of measured pixels in an interpolated one
 
@@ -238,7 +240,7 @@ class _Problem:
         data, geometry, weight = self.corrected(moves, views)
         # The weight follows the noise. Held-out projections would judge a sample that is still in two positions.
         method, projector = OsSirtTv(SWEEPS, still=0.0), Projector(geometry, self.grid)
-        return solve(method, projector, data, weight=weight, watch=Watch(on_trial=lambda: True))
+        return solve(method, projector, data, weight=weight, go_on=_NO_TRIALS)
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
         """Measured minus computed projections, without smooth differences, and the weights of the rays."""

@@ -132,7 +132,7 @@ def in_half_voxels(
     data = smoothed(problem.views, projector.resolution, None if problem.weight is None else problem.weight > 0)
     fine = replace(
         problem, projector=projector, data=data, measured=None if data is problem.views else problem.views,
-        go_on=lambda sweep, left: problem.go_on(first + before + COST * sweep, left), _norms=[],
+        go_on=problem.go_on.after(first + before, COST), _norms=[],
     )  # fmt: skip
     mu = weight.value if isinstance(weight, NoiseBalance) else weight
     made = make(fine, np.repeat(np.repeat(x, 2, axis=0), 2, axis=1), mu / 2)

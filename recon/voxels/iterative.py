@@ -9,6 +9,7 @@ to about one, because in other units sums of their squares could exceed the rang
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
@@ -20,7 +21,7 @@ import numpy as np
 from numba import get_num_threads, set_num_threads
 
 from recon.base.arrays import F32
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry, require_views
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
@@ -45,48 +46,32 @@ class Iterating(Protocol):
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
 
 
-def _silent(*_: object) -> bool:
-    return False
-
-
-@dataclass(frozen=True, eq=False)
-class Watch:
-    """Callbacks between iterations; the result True ends the iterations.
-
-    Attributes:
-        on_iteration: called with the number of each iteration, from 1, and the weighted ||A x - p|| / ||p|| before its
-            correction, so that the volume afterwards is better. For CGLS and ASD-POCS it is the residual of the volume
-            afterwards.
-        on_trial: called after each iteration of the test reconstructions that choose a method's weight on some rows. If
-            it ends them, the iterations of the volume follow.
-    """
-
-    on_iteration: Callable[[int, float], object] = _silent
-    on_trial: Callable[[], object] = _silent
-
-
-_UNWATCHED = Watch()
-
-
-class TrialWatch:
-    """Reports the iterations of test reconstructions, and asks whether to stop them: `Watch.on_trial`.
+def watched(
+    control: RunControl, n_views: int, usual_trials: int = 0, report: Callable[[int, float], object] = lambda *_: None
+) -> GoesOn:
+    """Whether iterations, and those of test reconstructions, go on by this control; `report` is told of the former.
 
     Args:
-        usual: usual number of iterations.
+        usual_trials: usual number of iterations of all test reconstructions, for the progress.
     """
+    begin, count = control.now(), itertools.count(1)
+    most = round(MOST_TRIALS * usual_trials)
 
-    def __init__(self, control: RunControl, n_views: int, usual: int) -> None:
-        self._control, self._n_views, self._begin = control, n_views, control.now()
-        self._usual, self._done = usual, 0
+    def trial(*_: object) -> bool:
+        if control.stop_of_trials():
+            return False
+        done = next(count)
+        of, words = (usual_trials, "as a rule") if done <= usual_trials else (max(done, most), "at most")
+        control.report_progress(done, of, begin, n_views, f"{SWEEPS_OF_TRIALS} {words}")
+        return True
 
-    def __call__(self) -> bool:
-        if self._control.stop_of_trials():
-            return True
-        self._done += 1
-        most = max(self._done, round(MOST_TRIALS * self._usual))
-        of, words = (self._usual, "as a rule") if self._done <= self._usual else (most, "at most")
-        self._control.report_progress(self._done, of, self._begin, self._n_views, f"{SWEEPS_OF_TRIALS} {words}")
-        return False
+    def iteration(number: int, residual: float) -> bool:
+        report(number, residual)
+        return not control.stop()
+
+    trials = GoesOn(trial)
+    trials.trials = trials
+    return GoesOn(iteration, trials)
 
 
 def solve(
@@ -97,7 +82,7 @@ def solve(
     weight: F32 | None = None,
     start: Volume | None = None,
     nonnegative: bool = True,
-    watch: Watch = _UNWATCHED,
+    go_on: GoesOn | None = None,
     decide: Decisions | None = None,
 ) -> Volume:
     """Reconstruct line integrals on the projector's grid.
@@ -118,7 +103,7 @@ def solve(
             zero.
     """
     views = Views(projections, projector.geometry, weight)
-    return solve_views(method, projector, views, start=start, nonnegative=nonnegative, watch=watch, decide=decide)
+    return solve_views(method, projector, views, start=start, nonnegative=nonnegative, go_on=go_on, decide=decide)
 
 
 def solve_views(
@@ -128,11 +113,11 @@ def solve_views(
     *,
     start: Volume | None = None,
     nonnegative: bool = True,
-    watch: Watch = _UNWATCHED,
+    go_on: GoesOn | None = None,
     decide: Decisions | None = None,
 ) -> Volume:
     """`solve` for projections in the projector's geometry, with their weights and the reach of the sample."""
-    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
+    problem, lines = scaled_problem(projector, views, start, nonnegative, go_on or GoesOn(), decide or Decisions())
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -155,7 +140,7 @@ def scaled_problem(
     views: Views,
     start: Volume | None,
     nonnegative: bool,
-    watch: Watch,
+    go_on: GoesOn,
     decide: Decisions,
 ) -> tuple[VoxelProblem, F32]:
     """The problem for these projections in units of about one, and its first volume [y, x, z]; see `solve_views`."""
@@ -169,8 +154,7 @@ def scaled_problem(
     inside = units.projector(projector)
     at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
     problem = VoxelProblem(
-        inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed),
-        lambda iteration, residual: not watch.on_iteration(iteration, residual), decide, lambda: not watch.on_trial(),
+        inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed), go_on, decide,
         measured=None if at_voxels is data else data, units=units, reach=views.reach,
     )  # fmt: skip
     return problem, lines
@@ -223,17 +207,16 @@ class VoxelMethod(Iterative):
         further = self.further_sweeps(problem.geometry, problem.grid)
         history: list[Progress] = []
 
-        def report(iteration: int, residual: float) -> bool:
+        def report(iteration: int, residual: float) -> None:
             seconds, planned = control.now() - begin, self.first_sweeps + self.iterations + further
             history.append(Progress(iteration, planned, seconds, residual, residual, 0, views))
             control.tell(history[-1])
-            return control.stop()
 
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
-        watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
+        go_on = watched(control, views, self.trial_sweeps, report)
         projector = Projector(problem.geometry, problem.grid, device=problem.device)
         volume = solve_views(
-            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide
+            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, go_on=go_on, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, **decide.settings, "seed": problem.seed}, tuple(history))

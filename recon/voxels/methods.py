@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 
 from recon.base.arrays import F32
 from recon.base.choices import Quality
-from recon.base.decisions import GoesOn, Prior
+from recon.base.decisions import Prior
 from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
@@ -90,9 +90,8 @@ class FistaTv(HalfVoxels):
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        first = GoesOn(problem.go_on)
-        x, weight = self.with_weight(replace(problem, go_on=first), x)
-        if not first.going or not self.halves(problem.projector.geometry, problem.projector.grid):
+        x, weight = self.with_weight(problem, x)
+        if not problem.go_on.going or not self.halves(problem.projector.geometry, problem.projector.grid):
             return x
         return in_half_voxels(problem, x, weight, self.in_halves)
 
@@ -276,14 +275,14 @@ class PnpDct(VoxelMethod):
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        first, sweeps = GoesOn(problem.go_on), 0 if x.any() else self.first_sweeps
+        sweeps = 0 if x.any() else self.first_sweeps
         trial = cache(partial(Trial.of, problem))
         weight: NoiseBalance | float
         if sweeps:
-            x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+            x, weight = FistaTv().with_weight(problem, x, trial)
         else:
             weight = choose_weight(problem, x, self.first_sweeps, trial)
-        if not first.going:
+        if not problem.go_on.going:
             return x
         for name in ENDED:  # of the first volume; patches follow it
             problem.decide.settings.pop(name, None)
@@ -292,8 +291,7 @@ class PnpDct(VoxelMethod):
             strength = choose_patches(problem, weight, trial, self.trial_steps).strength
         else:
             strength = problem.decide("threshold", lambda: share * density_unit(x))
-        further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
-        return pnp_dct(further, x, strength, steps=self.iterations)
+        return pnp_dct(replace(problem, go_on=problem.go_on.after(sweeps)), x, strength, steps=self.iterations)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from recon.base.arrays import F32, median_deviation
+from recon.base.decisions import GoesOn
 from recon.base.empirical import (
     FALL,
     HALF_OF_MANY,
@@ -193,7 +194,7 @@ def noise_of_volume(problem: VoxelProblem) -> float:
         np.divide(data, np.sqrt(problem.weight), out=data, where=problem.weight > 0)
         data[problem.weight == 0] = 0
     data = smoothed(data, problem.projector.resolution, None if problem.weight is None else problem.weight > 0)
-    alone = replace(problem, data=data, nonnegative=False, go_on=lambda *_: True)
+    alone = replace(problem, data=data, nonnegative=False, go_on=GoesOn())
     device = voxel_device(problem.projector.device)
     nz, ny, nx = problem.projector.grid.shape
     x, z = (device.zeros((ny, nx, nz)) for _ in range(2))

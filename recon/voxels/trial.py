@@ -189,7 +189,7 @@ class Trial:
         self, scan: VoxelProblem, slab: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns,
         settings: TrialSettings,
     ) -> None:  # fmt: skip
-        self._going = GoesOn(lambda sweep, residual: slab.trial_goes_on())
+        self._going = scan.go_on.trials
         self.scan, self.problem, self.start = scan, replace(slab, go_on=self._going), start
         self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
         early, geometry = settings.early, scan.projector.geometry
@@ -206,10 +206,10 @@ class Trial:
         Columns of air far from the sample are left out.
 
         None if there are fewer than 16 projections, `middle_of_cone` returns None for a cone, the held-out projections
-        have weight 0 in these rows, or `problem.trial_goes_on` ends the trial.
+        have weight 0 in these rows, or `problem.go_on.trials` ends the trial.
         """
         geometry, grid = problem.projector.geometry, problem.projector.grid
-        if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
+        if geometry.n_views < LEAST_VIEWS or not problem.go_on.trials():
             return None
         images = problem.data.swapaxes(1, 2)
         if not geometry.is_cone:
@@ -238,7 +238,7 @@ class Trial:
                 measured=None if problem.measured is None else cut(problem.measured),
                 weight=None if problem.weight is None else cut(problem.weight),
                 rng=np.random.default_rng(0),
-                go_on=lambda *_: True,
+                go_on=GoesOn(trials=problem.go_on.trials),
                 decide=Decisions(),
             )
 
@@ -386,7 +386,7 @@ class Trial:
     @property
     def control(self) -> RunControl:
         """The control for a run that is one of the trials."""
-        return RunControl(lambda: not self._going(0, 0.0), now=self.settings.now)
+        return RunControl(lambda: not self._going(), now=self.settings.now)
 
     def views_of(self, method: Method) -> ReconProblem:
         """The projections that are not held out, as methods get them: with all columns, in the units of the scan."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, some_values
-from recon.base.decisions import Decisions, Prior
+from recon.base.decisions import Decisions, GoesOn, Prior
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import ReconProblem
@@ -183,10 +183,9 @@ class VoxelProblem:
         weight: weight of each ray, [view, col, row], or None.
         nonnegative: True: voxels below zero are clipped.
         rng: random generator for the order of projections and subsets.
-        go_on: called with (iteration, relative residual) after each iteration; False ends the method.
+        go_on: called with (iteration, relative residual) after each iteration; False ends the method. `go_on.trials`
+            likewise ends test reconstructions on some rows.
         decide: stores decisions that follow from sums over the whole volume or all rays.
-        trial_goes_on: called after each sweep of a test reconstruction on some rows; False ends this test and the next
-            ones.
         measured: the measured projections if `data` were smoothed because the voxels are coarse; otherwise None.
         with_all_columns: if the problem has only some columns, a function that makes the problem with all columns,
             which determines the length of the steps.
@@ -199,9 +198,8 @@ class VoxelProblem:
     weight: F32 | None
     nonnegative: bool
     rng: np.random.Generator
-    go_on: Callable[[int, float], bool]
+    go_on: GoesOn
     decide: Decisions = field(default_factory=Decisions)
-    trial_goes_on: Callable[[], bool] = lambda: True
     measured: F32 | None = None
     with_all_columns: Callable[[], VoxelProblem] | None = None
     units: Units = _NO_UNITS

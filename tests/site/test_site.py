@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.storage.readers import open as readers
+from beamline.storage.readers import formats as readers
 from beamline.testing import ReaderConformance
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance

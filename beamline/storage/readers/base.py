@@ -75,6 +75,8 @@ class ScanSource(ABC):
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
         stated_ending: `ending` of a format in which it does not change.
+        angles_unit: the unit of a list of angles in the file that states none; "": such a list is an error.
+        side_files: True if a settings file of the scanner's maker may lie next to it.
     """
 
     path: Path
@@ -102,6 +104,8 @@ class ScanSource(ABC):
     row_period: float | None = None
     decisions: tuple[Mapping[str, Any], ...] = ()
     stated_ending: ScanEnding = ScanEnding()
+    angles_unit: str = ""
+    side_files: bool = False
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
@@ -239,16 +243,42 @@ class Opening:
 
 
 @dataclass(frozen=True)
+class NamedArrays:
+    """The paths of arrays in a file that the caller names as a scan; None for those that are not named.
+
+    Attributes:
+        data: of the projections; the order of the dimensions may follow, as in "/images:view,col,row".
+        angles: of the angles of the projections alone.
+        own_angles: as in `Opening`.
+    """
+
+    data: str
+    darks: str | None = None
+    flats: str | None = None
+    angles: str | None = None
+    own_angles: bool = True
+
+    @property
+    def alone(self) -> bool:
+        """True if neither darks nor flats are named."""
+        return not (self.darks or self.flats)
+
+
+@dataclass(frozen=True)
 class ScanFormat:
-    """A file format in the registry `storage.readers.open.FORMATS`.
+    """A file format in the registry `storage.readers.formats.FORMATS`.
 
     Attributes:
         name: for messages.
         recognises: whether a path holds this format. It is asked in the registry's order, and it may raise DataError
             (NotReadyError while following) for a file of its kind that cannot be read.
         open: the reader of a path that is recognised.
+        at: the scan to which these arrays of a file belong; None if they are no scan of this format.
+        references: the scan in an open HDF5 file with frames of a kind (dark or flat); None if it has none.
     """
 
     name: str
     recognises: Callable[[Path, Opening], bool]
     open: Callable[[Path, Opening], ScanSource]
+    at: Callable[[Path, NamedArrays], ScanSource | None] = lambda path, arrays: None
+    references: Callable[[Path, Any, FrameKind], ScanSource | None] = lambda path, file, kind: None

@@ -15,7 +15,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import open_array_file, zarr_root
 from beamline.storage.frame_table import FrameTable
-from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
+from beamline.storage.readers.base import NamedArrays, NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
@@ -50,7 +50,7 @@ PLACES = (
 )
 
 
-def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
+def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> ExchangeSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
     file = open_array_file(path, follow)
     with hdf5.closed_on_error(file):
@@ -99,6 +99,7 @@ class ExchangeSource(StacksSource):
 
     own_angles: bool = True
     grows: bool = False
+    angles_unit = "degrees"
 
     def refresh(self) -> int:
         if not self.grows:
@@ -301,8 +302,20 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 
+def _at(path: Path, arrays: NamedArrays) -> ExchangeSource | None:
+    own = arrays.alone and arrays.data.strip("/") == "exchange/data" and _recognises(path, Opening())
+    return open_exchange(path, own_angles=arrays.own_angles) if own else None
+
+
+def _references(path: Path, file: h5py.File, kind: FrameKind) -> ExchangeSource | None:
+    there = all(datasets.dataset(file, where) is not None for where in (dict(PLACES)[kind], "exchange/data"))
+    return open_exchange(path, own_angles=False) if there else None
+
+
 FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
     lambda path, opening: open_exchange(path, follow=opening.follow, own_angles=opening.own_angles),
+    _at,
+    _references,
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_substitute
-from beamline.storage import datasets, hdf5
-from beamline.storage.array_file import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_files import Angles, angles_at, assign, load_angles, parse_angles, select_rows
 from beamline.storage.readers.averaged import AveragedSource, stated_frames_per_view
-from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.dxchange import FORMAT as EXCHANGE
-from beamline.storage.readers.dxchange import open_exchange
+from beamline.storage.readers.base import NamedArrays, Opening, Quantity, ScanSource, Stated, read_known
+from beamline.storage.readers.formats import open_arrays, open_file
+from beamline.storage.readers.formats import scan_format as scan_format
 from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
-from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import with_order
 from beamline.storage.readers.reference_files import Images, load_images, overlaid, places_of_flats, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import datasets_text, open_stacks
-from beamline.storage.readers.tiff import FOREIGN, no_image
 from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
@@ -44,36 +36,14 @@ from beamline.storage.readers.transforms import (
     type_wrapped,
     with_kinds,
 )
-from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
-from recon.base.registry import Registry, in_folders
 from recon.base.views import spread
 
-__all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
+__all__ = ["NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
 _SIGNED = "i1", "i2", "i4"  # types that cameras' counts may not fit
 _LOOKED_AT = 3  # frames of a kind, for counts that wrapped
 _PIXELS = 2**27  # of a frame whose rows are all looked at
-REGISTRY = (  # modules in this folder, asked in this order; the first one before those in folders, the others after
-    "nxtomo",
-    "dxchange",
-    "stacks",
-)
-_OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
-_MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
-
-
-def _fitting(name: str, found: Any) -> ScanFormat:
-    if not isinstance(found, ScanFormat):
-        raise ValueError(f"it is a {type(found).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
-    return found
-
-
-FORMATS: tuple[ScanFormat, ...] = tuple(
-    Registry("reader", {name: import_module(module).FORMAT for name, module in _MODULES.items()}, _fitting).values()
-)
-"""Every format that is read, those of other packages last; adding one takes its file, and its line in REGISTRY
-or in FORMATS of a folder of formats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,16 +152,17 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
         def file(path: Path) -> ScanSource:
             if options.data_path is None:
-                return opened.enter_context(_open(path, opening))
+                return opened.enter_context(open_file(path, opening))
             data = options.data_path if options.order is None else f"{options.data_path}:{options.order}"
-            with hdf5.readable(path):
-                return opened.enter_context(_at_data_path(path, data, options))
+            of_views = options.angles_path if options.angle_rows is None else None
+            arrays = NamedArrays(data, options.darks_path, options.flats_path, of_views, own_angles)
+            return opened.enter_context(open_arrays(path, arrays))
 
         base = file(path)
         if options.then:
             base = in_parts([base, *map(file, options.then[:-1])], file(options.then[-1]), path)
         if options.earlier:
-            base = in_parts([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
+            base = in_parts([opened.enter_context(open_file(each, Opening())) for each in options.earlier], base)
         if kinds is not None:
             base = with_kinds(base, kinds)
         opened.pop_all()
@@ -264,8 +235,7 @@ def _angle_table(
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
         origin = f"{options.angles_path} in {options.path}"
-        default = "degrees" if base.format == "data_exchange" else ""
-        table = angles_at(Path(options.path), options.angles_path, options.angles_unit, default)
+        table = angles_at(Path(options.path), options.angles_path, options.angles_unit, base.angles_unit)
     if table is None and side is not None and side.angles is not None:
         table, origin = side.angles, str(side.path)
     if table is None and base.angle_text is not None:
@@ -276,22 +246,6 @@ def _angle_table(
             raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from; give --angles FILE.")
         table = select_rows(table, options.angle_rows)
     return table, origin
-
-
-def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
-    """The detector of an NXtomo whose frames these are, the scan of Data Exchange, or a scan of these stacks."""
-    own_angles = options.angles is None and options.angles_path is None
-    alone = not (options.darks_path or options.flats_path)
-    if alone and data.strip("/") == "exchange/data" and EXCHANGE.recognises(path, Opening()):
-        return open_exchange(path, own_angles=own_angles)
-    if alone and not holds_arrays(path):
-        with hdf5.open_hdf5(path) as file:
-            named = datasets.dataset(file, data)
-            keyed = named is not None and any(places.data == named for places in find(file))
-        if keyed:
-            return open_nxtomo(path, own_angles=own_angles, data=data)
-    of_views = options.angles_path if options.angle_rows is None else None
-    return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
@@ -316,48 +270,6 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             with suppress(DataError):  # what cannot be read is told where it is used
                 yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
-
-
-def _open(path: Path, opening: Opening) -> ScanSource:
-    if path.is_file() and not opening.follow:
-        refuse_substitute(path)
-    with hdf5.readable(path):
-        for kind in FORMATS:
-            if kind.recognises(path, opening):
-                return kind.open(path, opening)
-        if holds_arrays(path):
-            return open_stacks(path, None)
-    if path.suffix.lower() in FOREIGN:
-        raise DataError(no_image(path, [path.name]))
-    if not hdf5.is_hdf5(path):
-        raise DataError(
-            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr. A scan must be "
-            f"one of these, or a folder or .zip of images.{_WAYS.get(path.suffix.lower(), '')}"
-        )
-    known = ", ".join(kind.name for kind in FORMATS)
-    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        held, is_volume = datasets_text(file), datasets.text_at(file, "entry/definition") == "NXtomoproc"
-    if is_volume:
-        with opened_reconstruction(path) as record:
-            made_by = record.method or "another program"
-        raise DataError(
-            f"{path} is a volume made by {made_by}, not a scan. `beamline view {path}` shows it, and "
-            "`beamline export` writes it in another format."
-        )
-    raise DataError(
-        f"{path} contains no scan in a known format: {known}. {held} Name the datasets of the scan: "
-        "--data-path, --angles-path, --darks-path, --flats-path."
-    )
-
-
-_VOLUME = " It may be a volume: `beamline view` shows NIfTI volumes."
-_WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}
-
-
-def scan_format(path: Path) -> str | None:
-    """The name of the format of the scan in an HDF5 file; None if it is no scan."""
-    with hdf5.readable(path):
-        return next((kind.name for kind in FORMATS if kind.recognises(path, Opening())), None)
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:

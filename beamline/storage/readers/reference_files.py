@@ -20,10 +20,8 @@ from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.datasets import require_real
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import Quantity, ScanSource, Stated, frame_indices
-from beamline.storage.readers.dxchange import open_exchange
+from beamline.storage.readers.formats import references_in
 from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.nexus import find
-from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import as_frames
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from beamline.storage.readers.tiff import (
@@ -145,12 +143,10 @@ def _of_images(path: Path) -> NDArray[Any]:
 def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: tuple[int, int] | None) -> NDArray[Any]:
     if dataset:
         return _read(path, dataset_at(file, dataset))
-    for places in find(file):
-        if (places.kinds() == kind).any():
-            return _of_scan(open_nxtomo(path, own_angles=False, data=str(places.data.name)), kind)
+    if (scan := references_in(path, file, kind)) is not None:
+        with scan:  # as the reader of its format gives them, mirrored and turned as the file says
+            return _stack(scan.read(scan.table.of_kind(kind)), str(path))
     exchange = datasets.dataset(file, _EXCHANGE[kind])
-    if exchange is not None and datasets.dataset(file, "exchange/data") is not None:
-        return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
     if numbered := _numbered(file, kind, shape):
@@ -165,12 +161,6 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if candidates:
         raise DataError(f"{path} contains several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
     raise DataError(f"{path} contains no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
-
-
-def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
-    """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
-    with source:
-        return _stack(source.read(source.table.of_kind(kind)), str(source.path))
 
 
 def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -> dict[int, h5py.Dataset]:

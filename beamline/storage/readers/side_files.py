@@ -170,7 +170,7 @@ def side_of(source: ScanSource) -> SideFile | None:
     """The vendor's file in a folder of images, or next to it or to a TIFF, if exactly one has the same number of
     projections.
     """
-    if not source.format.startswith("tiff"):
+    if not source.side_files:
         return None
     views, found = source.table.views.size, []
     for path in _candidates(source.path):

@@ -22,7 +22,15 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import ArrayFile, NamedArray, open_array_file
 from beamline.storage.frame_table import FrameTable
-from beamline.storage.readers.base import WHOLE, Attributes, Opening, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import (
+    WHOLE,
+    Attributes,
+    NamedArrays,
+    Opening,
+    ScanFormat,
+    ScanSource,
+    frame_indices,
+)
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.orders import (
     Order,
@@ -309,4 +317,8 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return isinstance(data, h5py.Dataset) and datasets.attribute(data, "data_type") == "AcquisitionData"
 
 
-FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL))
+def _at(path: Path, arrays: NamedArrays) -> StacksSource:
+    return open_stacks(path, arrays.data, arrays.darks, arrays.flats, arrays.angles)
+
+
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL), _at)

@@ -22,7 +22,7 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import is_zarr
 from beamline.storage.foreign_zarr import open_zarr
 from beamline.storage.readers.base import Opening
-from beamline.storage.readers.open import FORMATS as SCANS
+from beamline.storage.readers.formats import FORMATS as SCANS
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of

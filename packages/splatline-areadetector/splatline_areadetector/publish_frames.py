@@ -9,7 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,20 +20,15 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import parts_of
 from beamline.scan.runs import newest
-from beamline.storage.hdf5 import look_again, open_hdf5, readable
+from beamline.storage.hdf5 import readable
+from beamline.storage.scan_file import ScanFile, opened
+from beamline.storage.writers.layout import ANGLE, COUNT_TIME, KIND, TIME
 from drivers.base.frame import FrameKind
 
 LOOK_EVERY = 0.5  # s between two checks for a new run
 _SPREAD = 0.7  # frames that came together are sent this fraction of the mean time between frames apart
 _WINDOW = 2.0  # s over which the mean is computed
 _LONGEST, _AT_FIRST = 0.25, 0.02  # s: longest time between two frames sent, and this time while the mean is not known
-
-# Paths of docs/file_layout.md.
-_DATA, _KIND = "/entry/instrument/detector/data", "/entry/frame_log/kind"
-_ANGLE, _TIME = "/entry/sample/rotation_angle", "/entry/frame_log/time"
-_EXPOSURE, _COMMITTED = "/entry/instrument/detector/count_time", "/entry/progress/frames_committed"
-_COLUMNS = (_DATA, _KIND, _ANGLE, _TIME, _EXPOSURE)
-
 
 LOCATIONS = {
     FrameKind.PROJECTION: "/exchange/data",
@@ -116,14 +111,12 @@ class RunFrames:
         self._runs, self._say, self._now = runs, say, now
         self.run: Path | None = None
         self.shape, self.dtype = (0, 0), np.dtype(np.uint16)
-        self._file: Any = None
-        self._columns: list[Any] = []  # stay open: HDF5 refreshes a dataset wrongly if it is open twice
-        self._counter: Any = None
+        self._file: ScanFile | None = None
         self._pace, self._looked = SendRate(), -math.inf
         self._next = self._committed = 0
         self._look()
         if self._file is not None:
-            self._next = max(0, self._n_committed() - 1)
+            self._next = max(0, self._file.committed() - 1)
 
     @property
     def waiting(self) -> int:
@@ -139,12 +132,12 @@ class RunFrames:
             return None
         try:
             with readable(self.run):
-                if (committed := self._n_committed()) > self._committed:
+                if (committed := self._file.committed()) > self._committed:
                     self._pace.came(committed - self._committed, now)
                     self._committed = committed
                 if not self.waiting or self._pace.wait(now):
                     return None
-                frame = self._read(self._next)
+                frame = _read(self._file, self._next)
         except DataError as error:
             self._say(f"Publishing of this run has ended: {error}")
             self.close()
@@ -157,8 +150,7 @@ class RunFrames:
         """Close the file. A second time does nothing."""
         file, self._file = self._file, None
         if file is not None:
-            with suppress(OSError, RuntimeError, ValueError):
-                file.close()
+            file.close()
         self._committed = self._next
 
     def _look(self) -> None:
@@ -168,24 +160,14 @@ class RunFrames:
             run = parts_of(newest(self._runs))[-1]
             if run == self.run:
                 return
-            file = open_hdf5(run / "scan.h5", follow=True)
-            with ExitStack() as failed:
-                failed.callback(file.close)
-                with readable(run):
-                    columns, counter = [file[path] for path in _COLUMNS], file[_COMMITTED]
-                failed.pop_all()
+            file = opened(run / "scan.h5", follow=True)
+            if file is None:
+                return
             self.close()
-            self._file, self.run, self._columns, self._counter = file, run, columns, counter
-            self.shape, self.dtype = columns[0].shape[1:], columns[0].dtype
+            self._file, self.run, self.shape, self.dtype = file, run, file.shape, file.dtype
             self._next = self._committed = 0
 
-    def _n_committed(self) -> int:
-        look_again(self._counter)
-        return int(self._counter[()])
 
-    def _read(self, row: int) -> PublishedFrame:
-        for column in self._columns:
-            if len(column) <= row:
-                look_again(column)
-        counts, kind, angle, at, exposure = (column[row] for column in self._columns)
-        return PublishedFrame(counts, row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
+def _read(file: ScanFile, row: int) -> PublishedFrame:
+    kind, angle, at, exposure = (file.values(path, row) for path in (KIND, ANGLE, TIME, COUNT_TIME))
+    return PublishedFrame(file.data[row], row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))

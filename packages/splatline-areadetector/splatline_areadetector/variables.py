@@ -6,17 +6,17 @@ once. So a value counts from the time stamp of its IOC.
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from typing import Any, Self
 
 from beamline.core.errors import ConfigError
 from drivers.base.errors import DeviceTimeout
+from drivers.epics.channel import waited
 from splatline_areadetector.receiver import Subscribed
 
 Value = float | str
@@ -182,14 +182,6 @@ def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
     return Subscribed({name: partial(take, add) for name, add in adders.items()}).close
 
 
-@cache
-def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of Channel Access in a separate thread; one for each process."""
-    loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
-    return loop
-
-
 def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
     import aioca
 
@@ -211,6 +203,6 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
         for each in subscriptions:
             each.close()
 
-    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
+    subscriptions = waited(start())
     # Wait for the closing. Otherwise aioca closes the rest at the end of the program in another thread, which crashes.
-    return lambda: asyncio.run_coroutine_threadsafe(end(), _loop()).result()
+    return lambda: waited(end())

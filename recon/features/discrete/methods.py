@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.decisions import GoesOn, MaterialPrior, Prior
+from recon.base.decisions import MaterialPrior, Prior
 from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
 from recon.base.setting import Count, NonNegative
@@ -127,15 +127,14 @@ class Discrete(HalfVoxels):
         smooth = FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels)
         if x.any():  # a pull would hide the noise that the refits for error bars must show
             return smooth.iterate(problem, x)
-        first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
-        watched = replace(problem, go_on=first)
-        x, weight = FistaTv(still=self.still).with_weight(watched, x, trial)
+        going, trial = problem.go_on, cache(partial(Trial.of, problem))
+        x, weight = FistaTv(still=self.still).with_weight(problem, x, trial)
         materials, halves = self.materials(problem, weight, trial), problem.projector
-        if not first.going:
+        if not going.going:
             return x
         if materials is not None:
-            x = self.pulled(watched, x, weight, materials, self.first_sweeps)
-        if not first.going or not self.halves(halves.geometry, halves.grid):
+            x = self.pulled(problem, x, weight, materials, self.first_sweeps)
+        if not going.going or not self.halves(halves.geometry, halves.grid):
             return x
         if materials is None:
             return in_half_voxels(problem, x, weight, smooth.in_halves)
@@ -176,7 +175,7 @@ class Discrete(HalfVoxels):
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
         `to_the_end` as in `Subsets.of`."""
         where, thin = in_field(problem), thin_parts(x, materials)
-        further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
+        further = replace(problem, go_on=problem.go_on.after(done))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)

@@ -96,7 +96,7 @@ class StateFit:
 
     def __post_init__(self) -> None:
         problem = self.problem
-        self.going = GoesOn(problem.go_on)
+        self.going = problem.go_on
         self._subsets = Subsets.of(problem, subsets_of(problem.projector.geometry, SUBSETS, True), True)
         self._prox = TwoVariations(self.x.shape, difference_weights(problem.projector.grid), problem.nonnegative)
         self._views = MotionViews.of(problem)
@@ -134,8 +134,8 @@ class StateFit:
             return self.going(self._done, left)
 
         self.x = ordered_fista(
-            replace(self.problem, go_on=go_on), self.x, self.weight, self._subsets, sweeps=most, tv_steps=self._prox,
-            still=still,
+            replace(self.problem, go_on=GoesOn(go_on)), self.x, self.weight, self._subsets, sweeps=most,
+            tv_steps=self._prox, still=still,
         )  # fmt: skip
 
     def follow(self, steps: Sequence[tuple[int, float]]) -> None:

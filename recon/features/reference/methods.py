@@ -19,7 +19,7 @@ from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import require_finite
 from recon.voxels.choice import TrialChoice
-from recon.voxels.iterative import Watch, solve_views
+from recon.voxels.iterative import solve_views, watched
 from recon.voxels.projector import Projector, volume_slices
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_power
@@ -94,17 +94,16 @@ class FromReference(Method):
         begin, history = control.now(), list[Progress]()
         planned = (1 + len(_ROUNDS)) * _FIRST + _SHARPER * _LAST
 
-        def report(iteration: int, residual: float) -> bool:
+        def report(iteration: int, residual: float) -> None:
             seconds = control.now() - begin
             history.append(Progress(iteration, planned, seconds, residual, residual, 0, problem.geometry.n_views))
             control.tell(history[-1])
-            return control.stop()
 
         state, decide = _State(self.reference, verdict), control.decide
         projector = Projector(problem.geometry, problem.grid)
         volume = solve_views(
-            state, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=Watch(report),
-            decide=decide,
+            state, projector, problem.views.masked(), nonnegative=not self.allow_negative,
+            go_on=watched(control, problem.geometry.n_views, report=report), decide=decide,
         )  # fmt: skip
         settings = {
             **decide.settings, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from beamline.cli.method_options import SLABS_RESUMED
 from beamline.cli.options import declared
 from beamline.cli.recon import recon
 from beamline.projections.selection import Selection
+from beamline.reconstruct.combinations import SLABS_RESUMED
 from beamline.reconstruct.options import ReconOptions
 from recon.methods import accepting, taking
 

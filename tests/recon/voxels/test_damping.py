@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from recon.base.decisions import GoesOn
 from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -87,7 +88,7 @@ def _problem(cone: bool, weighted: bool) -> tuple[VoxelProblem, F32]:
     data += rng.normal(0, 0.02 * data.max(), data.shape).astype(np.float32)
     weight = rng.uniform(0.6, 1, data.shape).astype(np.float32) if weighted else None
     start = np.full((*projector.grid.shape[1:], projector.grid.shape[0]), 0.1, np.float32)
-    return VoxelProblem(projector, data, weight, True, rng, lambda *_: True), start
+    return VoxelProblem(projector, data, weight, True, rng, GoesOn()), start
 
 
 @pytest.mark.parametrize(("cone", "weighted"), [(False, False), (True, False), (False, True)])
@@ -123,7 +124,7 @@ def test_the_settings_say_how_the_sweeps_ended(sweeps: int, still: float, stop_a
         done.append(sweep)
         return sweep < stop_at
 
-    made, mu = replace(problem, go_on=go_on), 0.02 * float(problem.data.max())
+    made, mu = replace(problem, go_on=GoesOn(go_on)), 0.02 * float(problem.data.max())
     subsets = Subsets.of(made, subsets_of(made.projector.geometry))
     ordered_fista(made, start, mu, subsets, sweeps=sweeps, tv_steps=3, still=still)
     settings = made.decide.settings
@@ -137,7 +138,7 @@ def test_the_settings_say_how_the_sweeps_ended(sweeps: int, still: float, stop_a
 def test_steps_that_are_not_damped_make_all_sweeps_and_say_nothing() -> None:
     problem, start = _problem(False, False)
     done: list[int] = []
-    made = replace(problem, go_on=lambda sweep, _: not done.append(sweep))
+    made = replace(problem, go_on=GoesOn(lambda sweep, _: not done.append(sweep)))
     ordered_fista(made, start, 0.1, Subsets.of(made, 1, to_the_end=False), sweeps=25, tv_steps=3, still=1.0)
     assert len(done) == 25 and not set(ENDED) & made.decide.settings.keys()
 
@@ -169,7 +170,7 @@ def test_hard_scans_end_no_further_from_the_minimum_than_the_early_end(name: str
     weight[:, 20] *= hard.get("column", 1)
     weight[7] *= hard.get("view", 1)
     data += (rng.normal(0, 0.02 * data.max(), data.shape) / np.sqrt(np.maximum(weight, 1e-3))).astype(np.float32)
-    problem = VoxelProblem(projector, data, weight if hard else None, True, rng, lambda *_: True)
+    problem = VoxelProblem(projector, data, weight if hard else None, True, rng, GoesOn())
     start = np.full((48, 48, 1), 0.1, np.float32)
     mu = 0 if not hard else 1e-3 * largest_eigenvalue(projector.plain, weight)
 

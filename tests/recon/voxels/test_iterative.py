@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsqr, svds
 
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid, Volume
 from recon.features.iterative.methods import AsdPocs, Cgls, Sart, Sirt
 from recon.reconstruction import reconstruct
 from recon.voxels.fbp import fbp
-from recon.voxels.iterative import Watch, solve
+from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
@@ -123,7 +123,7 @@ def test_sirt_has_the_truth_as_its_fixed_point_and_a_falling_residual() -> None:
     noisy = views + _noise(views, 0.05)
     curve: list[float] = []
     # In the norm that SIRT minimises (rays weighed by their lengths) without clipping; nearly so in the plain one.
-    solve(Sirt(40), projector, noisy, nonnegative=False, watch=Watch(lambda _, r: curve.append(r)))
+    solve(Sirt(40), projector, noisy, nonnegative=False, go_on=GoesOn(lambda _, r: not curve.append(r)))
     assert curve[0] == pytest.approx(1.0)
     assert (np.diff(curve) < 1e-6).all()
     assert curve[-1] < 0.15
@@ -140,7 +140,7 @@ def test_cgls_is_lsqr(steps: int, weighed: bool, rng: np.random.Generator) -> No
     expected = lsqr(matrix, root * views.ravel(), atol=0, btol=0, conlim=0, iter_lim=steps)[0]
     curve: list[float] = []
     found = solve(
-        Cgls(steps), projector, views, weight=weight, nonnegative=False, watch=Watch(lambda _, r: curve.append(r))
+        Cgls(steps), projector, views, weight=weight, nonnegative=False, go_on=GoesOn(lambda _, r: not curve.append(r))
     )
     np.testing.assert_allclose(found.data.ravel(), expected, atol=1e-4 * np.abs(expected).max())
     misfit = np.linalg.norm(matrix @ expected - root * views.ravel()) / np.linalg.norm(root * views.ravel())
@@ -265,9 +265,9 @@ def test_progress_stop_and_start(method: Any) -> None:
 
     def third(iteration: int, residual: float) -> bool:
         told.append((iteration, residual))
-        return len(told) == 3
+        return len(told) < 3
 
-    stopped = solve(replace(method, iterations=50), projector, views, watch=Watch(third))
+    stopped = solve(replace(method, iterations=50), projector, views, go_on=GoesOn(third))
     assert [k for k, _ in told] == [1, 2, 3]
     assert all(0 < r <= 1.0 + 1e-6 for _, r in told)
     np.testing.assert_array_equal(stopped.data, three.data)

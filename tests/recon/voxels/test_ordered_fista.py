@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.base.decisions import GoesOn
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.ordered_fista import Subsets, ordered_fista
@@ -20,7 +21,7 @@ def test_equal_rows_stay_equal_slices() -> None:
     views = Geometry.parallel(VIEWS.angles[::2], (9, 48), pixel_pitch=1.0)
     projector = Projector(views, Grid.matching(views))
     data = projector.forward_lines(np.repeat(DISC[:, :, :1], 9, axis=2))
-    problem = VoxelProblem(projector, data, None, True, np.random.default_rng(1), lambda *_: True)
+    problem = VoxelProblem(projector, data, None, True, np.random.default_rng(1), GoesOn())
     start = np.full((48, 48, 9), 0.1, np.float32)
     volume = ordered_fista(problem, start, 500.0, Subsets.of(problem, 2), sweeps=30, tv_steps=3)
     assert np.ptp(volume, axis=2).max() < 1e-3
@@ -32,7 +33,7 @@ def test_the_step_is_safe_for_the_subset_that_weighs_most() -> None:
     projector = Projector(views, Grid.matching(views))
     data = projector.forward_lines(np.ones((9, 9, 1), np.float32))
     for weight in (None, np.random.default_rng(0).uniform(0.1, 3, data.shape).astype(np.float32)):
-        made = Subsets.of(VoxelProblem(projector, data, weight, True, np.random.default_rng(1), lambda *_: True), 2)
+        made = Subsets.of(VoxelProblem(projector, data, weight, True, np.random.default_rng(1), GoesOn()), 2)
         units = np.eye(81, dtype=np.float32).reshape(81, 9, 9, 1)
         for some, part in zip(made.views, made.projectors, strict=True):
             a = np.stack([part.forward_lines(unit).ravel() for unit in units], 1).astype(np.float64)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import recon
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, RunControl
 from recon.base.slabs import part_of, slabs_of
@@ -30,7 +30,7 @@ def problem_of(geometry: Geometry, truth: F32, weight: F32 | None = None, nonneg
     projector = Projector(geometry, Grid.matching(geometry))
     data = projection_lines(projector.forward(truth))
     rays = None if weight is None else projection_lines(weight)
-    return VoxelProblem(projector, data, rays, nonnegative, np.random.default_rng(0), lambda *_: True)
+    return VoxelProblem(projector, data, rays, nonnegative, np.random.default_rng(0), GoesOn())
 
 
 BEAMS = {

@@ -76,6 +76,7 @@ class TiffSeriesSource(ScanSource):
     """A folder or .zip with one image per file; see ScanSource. Frames: darks, flats, then the series."""
 
     format = "tiff_series"
+    side_files = True
 
     def __init__(self, path: Path, *, one_series: bool = False, listed: list[str] | None = None) -> None:
         """Open.

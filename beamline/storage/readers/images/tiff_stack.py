@@ -38,6 +38,7 @@ class TiffStackSource(ScanSource):
     """One TIFF with one page per frame, read page by page; see ScanSource. The caller supplies the angles."""
 
     format = "tiff_stack"
+    side_files = True
 
     def __init__(self, path: Path) -> None:
         self.path = path

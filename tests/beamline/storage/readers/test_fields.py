@@ -61,22 +61,57 @@ HARMLESS: dict[str, Any] = {  # of those, values that change nothing
 }
 
 
-@pytest.mark.parametrize("field", [field for field in (*NXTOMO, *EXCHANGE) if not field.used], ids=lambda f: f.where)
-def test_what_is_not_used_is_named(tmp_path: Path, field: Entry) -> None:
-    def said(value: Any, units: str | None) -> str:
-        change = (field.where, value, units)
-        path = exchange(tmp_path / "s.h5", change) if field in EXCHANGE else nxtomo(tmp_path / "s.nx", *CONE, change)
-        (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
-        assert f"The file states {field.where}, " in hit.message and field.use in hit.message
-        return hit.severity
+UNUSED = [field for field in (*NXTOMO, *EXCHANGE) if not field.used]
+Hits = dict[str, list[tuple[str, str]]]
 
-    assert said(HARMLESS.get(field.where, 0.0), "um") == "info"
-    (path,) = tmp_path.iterdir()
-    assert describe(path)["not_used"][field.where].endswith(f"(not used: {field.use})")
+
+def hits_of(path: Path) -> Hits:
+    """Severity and message of each finding on a field that is not used, by the field."""
+    hits = Hits()
+    for hit in validate(path):
+        if hit.rule == "not-used":
+            hits.setdefault(hit.message.split("The file states ")[1].split(",")[0], []).append(
+                (hit.severity, hit.message)
+            )
+    return hits
+
+
+@pytest.fixture(scope="module")
+def harmless(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hits, dict[str, str]]:
+    """Findings on two files, one of each format, that have all fields that are not used, with values that change
+    nothing; and what `info` says of these fields."""
+    folder = tmp_path_factory.mktemp("harmless")
+    changes = [(field.where, HARMLESS.get(field.where, 0.0), "um") for field in UNUSED]
+    paths = [
+        nxtomo(folder / "s.nx", *CONE, *(each for each in changes if each[0] in {field.where for field in NXTOMO})),
+        exchange(folder / "s.h5", *(each for each in changes if each[0] in {field.where for field in EXCHANGE})),
+    ]
+    named: dict[str, str] = {}
+    for path in paths:
+        named |= describe(path)["not_used"]
+    return hits_of(paths[0]) | hits_of(paths[1]), named
+
+
+@pytest.fixture(scope="module")
+def mattering(tmp_path_factory: pytest.TempPathFactory) -> Hits:
+    """Findings on two files that have all fields that may change the volume."""
+    folder = tmp_path_factory.mktemp("mattering")
+    nexus = {field.where for field in NXTOMO}
+    changes = [(where, *each) for where, each in MATTERS.items()]
+    one = nxtomo(folder / "s.nx", *CONE, *(each for each in changes if each[0] in nexus))
+    return hits_of(one) | hits_of(exchange(folder / "s.h5", *(each for each in changes if each[0] not in nexus)))
+
+
+@pytest.mark.parametrize("field", UNUSED, ids=lambda f: f.where)
+def test_what_is_not_used_is_named(harmless: tuple[Hits, dict[str, str]], mattering: Hits, field: Entry) -> None:
+    hits, named = harmless
+    ((severity, message),) = hits[field.where]
+    assert severity == "info" and field.use in message
+    assert named[field.where].endswith(f"(not used: {field.use})")
     assert (field.matters is not None) == (field.where in MATTERS)
     if field.matters is not None:
-        value, units = MATTERS[field.where]
-        assert said(value, units) == "warning"
+        ((severity, message),) = mattering[field.where]
+        assert severity == "warning" and field.use in message
 
 
 PLACES = ("detector", "sample")
@@ -218,13 +253,23 @@ def test_what_is_used_has_its_value(tmp_path: Path, where: str) -> None:
         assert not [field for field in source.not_used if field.doubt]
 
 
-@pytest.mark.parametrize("field", [field for field in NXTOMO if field.units is not None], ids=lambda f: f.where)
-def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Entry) -> None:
-    value = np.full(7, 2.0) if "time" in field.where else 2.0
-    for units, said in ((None, "it has no attribute `units`"), ("furlong", "its units 'furlong' are")):
-        path = nxtomo(tmp_path / "s.nx", (field.where, value, units))
-        (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
-        assert hit.severity == "warning" and said in hit.message
+MEASURED = [field for field in NXTOMO if field.units is not None]
+
+
+@pytest.fixture(scope="module", params=[(None, "it has no attribute `units`"), ("furlong", "its units 'furlong' are")])
+def without_units(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Hits, str]:
+    """Findings on a file whose numbers all have no known unit, and what they must say."""
+    units, said = request.param
+    values = {field.where: np.full(7, 2.0) if "time" in field.where else 2.0 for field in MEASURED}
+    changes = [(where, value, units) for where, value in values.items()]
+    return hits_of(nxtomo(tmp_path_factory.mktemp("units") / "s.nx", *changes)), said
+
+
+@pytest.mark.parametrize("field", MEASURED, ids=lambda f: f.where)
+def test_a_number_without_a_known_unit_is_named(without_units: tuple[Hits, str], field: Entry) -> None:
+    hits, said = without_units
+    ((severity, message),) = hits[field.where]
+    assert severity == "warning" and said in message
 
 
 @pytest.mark.parametrize(

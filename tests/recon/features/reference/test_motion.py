@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.features.reference.motion import (
@@ -20,7 +20,7 @@ from recon.features.reference.motion import (
     roughly_moved,
 )
 from recon.features.reference.particles import particles_of
-from recon.voxels.iterative import Watch, scaled_problem
+from recon.voxels.iterative import scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 from tests.recon.features.reference.scene import Discs, N, packed, scanned
@@ -67,7 +67,7 @@ def _state(scene: Discs) -> tuple[VoxelProblem, Moved]:
     """The problem of 24 views of the scene, and the scene at rest as its reference."""
     data, geometry = scanned(scene, 24, 1e5)
     projector = Projector(geometry, Grid.matching(geometry))
-    problem, _ = scaled_problem(projector, Views(data, geometry), None, True, Watch(), Decisions(0))
+    problem, _ = scaled_problem(projector, Views(data, geometry), None, True, GoesOn(), Decisions(0))
     rest = replace(scene, turn=0.0, shift=(0.0, 0.0))
     volume = times_power(np.ascontiguousarray(rest.volume.transpose(1, 2, 0)), -problem.units.density)
     particles = particles_of(volume)

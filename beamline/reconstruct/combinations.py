@@ -1,0 +1,69 @@
+"""Which options of a reconstruction exclude each other, and why. The command line, a recipe, Python and the plan of a
+reconstruction all ask this table.
+
+The module imports nothing that the help of a command does not need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+SLABS_RESUMED = "resume of slabs"
+"""Name for `--resume` with a partial volume, because other rules apply to it than to a checkpoint."""
+
+_FINISHED = {"follow": "it needs a finished scan"}
+_PLANNED = {"quality": "--quality already sets it"}
+_BY_SECONDS = {"follow": "it needs a finished scan; use --seconds"}
+_WITH_SLABS = {"follow": "a running scan cannot be reconstructed in slabs, because everything must stay in memory"}
+
+EXCLUDED: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "steps": {"seconds": "give one of them", **_PLANNED},
+        "gaussians": _PLANNED,
+        "finish": {**_PLANNED, **_FINISHED},
+        "seconds": _PLANNED,
+        "budget": {"quality": "give one of them", **_BY_SECONDS},
+        "quality": _BY_SECONDS,
+        **dict.fromkeys(("start", "device", "early-stop", "checkpoint", "resume", "allow-negative"), _FINISHED),
+        "reference": {
+            **_FINISHED,
+            "volumes": "a reference helps to reconstruct a single volume",
+            "uncertainty": "error bars are not calibrated for it",
+            "roi": "the motion of the sample is estimated in all of the field",
+        },
+        "volumes": {  # in time, or of materials
+            **_FINISHED,
+            "roi": "a box can be cut only from a single volume",
+            "truth": "a ground truth can be compared only with a single volume",
+            "uncertainty": "error bars are computed only for a single volume",
+            **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes cannot be reconstructed in slabs"),
+        },
+        "uncertainty": dict.fromkeys(
+            ("follow", "budget", "seconds"), "error bars need the complete scan, and time for two further fits"
+        ),
+        "follow": {SLABS_RESUMED: "slabs can be resumed only for a finished scan"},
+        **dict.fromkeys(("memory", "cluster"), _WITH_SLABS),
+        "roi": {**_FINISHED, "truth": "a ground truth can be compared only with the whole volume"},
+        "dry-run": {
+            "follow": "the time of a running scan is not known",
+            "budget": "it prints the time of every method",
+        },
+    }
+)
+"""For each option the options that cannot be combined with it, each with the reason."""
+
+
+class Contradiction(NamedTuple):
+    """Two options that exclude each other."""
+
+    name: str
+    other: str
+    why: str
+
+
+def contradiction(given: Collection[str]) -> Contradiction | None:
+    """The first two of the given options that exclude each other, in the order of the table; None: there are none."""
+    pairs = (Contradiction(name, *each) for name, others in EXCLUDED.items() for each in others.items())
+    return next((pair for pair in pairs if pair.name in given and pair.other in given), None)
