@@ -14,6 +14,7 @@ from beamline.core.quantities import VoxelKind
 from beamline.core.recon_events import VolumeDone
 from beamline.core.text import safe_name
 from beamline.projections.selection import Selection
+from beamline.projections.views import select, stated_geometry
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recon_record import ReconRecord
@@ -22,6 +23,7 @@ from drivers.base.clock import Clock
 from recon.auto import Auto
 from recon.base.volume import Volume
 from recon.methods import with_settings
+from recon.voxels.held_out import LEAST_VIEWS
 
 
 def with_reference(
@@ -33,7 +35,8 @@ def with_reference(
 ) -> ReconOptions:
     """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
 
-    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again.
+    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again. If the state has
+    fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
 
     Raises:
         DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has
@@ -47,6 +50,8 @@ def with_reference(
                 f"The reference {path.name} is a scan, whose volume would be in {made}, which is also the output. "
                 "Name another output. Nothing was computed."
             )
+        if _too_few(options):
+            return options  # the method says so, and does not look at a reference
         if not made.exists():
             said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
             sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
@@ -70,6 +75,14 @@ def with_reference(
     except ValueError as error:
         raise DataError(f"{path} is no reference: {error}. The state was not reconstructed.") from None
     return replace(options, method=method)
+
+
+def _too_few(options: ReconOptions) -> bool:
+    """Whether a finished scan has too few projections to test whether a reference helps."""
+    if options.follow is not None:
+        return False
+    with options.source.open() as source:
+        return stated_geometry(select(source, options.selection)).n_views < LEAST_VIEWS
 
 
 def _of_this_scan(made: Path, scan: Path) -> Path:

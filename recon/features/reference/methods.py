@@ -82,11 +82,11 @@ class FromReference(Method):
         return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
     def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
-        if self.reference is None:
-            return ReferenceVerdict(False, "none was given")
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
             return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
+        if self.reference is None:
+            return ReferenceVerdict(False, "none was given")
         return asked(trial, choice, self.reference)
 
     def _from_reference(self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl) -> Reconstruction:

@@ -92,6 +92,7 @@ def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
         (("--reference", "none.h5"), "none.h5 does not exist"),
         (("--reference", "good_volume.h5", "-m", "fbp"), "--reference works only with from-reference"),
         (("--reference", "good_volume.h5", "--follow"), "it needs a finished scan"),
+        (("-m", "from-reference"), "--method from-reference needs --reference GOOD"),
         (("--reference", "good_volume.h5", "--uncertainty"), "error bars are not calibrated for it"),
     ],
 )
@@ -110,6 +111,14 @@ def test_a_reference_with_a_voxel_that_is_not_finite_is_refused(folder: Path) ->
     done = beamline("recon", str(folder / "state.h5"), "--reference", str(spoilt), *QUICK, "-o", str(folder / "y.h5"))
     assert done.exit_code != 0 and "1 of 16384 voxels of the reference are not finite" in done.output
     assert not (folder / "y.h5").exists()
+
+
+def test_a_scan_is_not_reconstructed_in_vain_for_too_few_projections(folder: Path, tmp_path: Path) -> None:
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(folder / "good.h5"), *QUICK, "--views",
+                    "every:2", "--no-report", "-o", str(tmp_path / "few.h5"))  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "The reference was not used: whether it helps cannot be tested" in " ".join(done.output.split())
+    assert not (tmp_path / "good_reference.h5").exists()
 
 
 def test_an_output_with_the_name_of_the_volume_of_the_reference_is_refused_at_once(folder: Path) -> None:
