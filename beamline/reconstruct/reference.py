@@ -35,8 +35,8 @@ def with_reference(
 ) -> ReconOptions:
     """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
 
-    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again. If the state has
-    fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
+    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again. If the state
+    has fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
 
     Raises:
         DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has

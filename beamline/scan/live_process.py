@@ -69,12 +69,14 @@ class Commands:
     """The commands that reconstruct a scan: while it runs, or when it is complete; neither: no reconstruction.
 
     Attributes:
+        live: while the scan runs; it makes the volume, unless it only `draws` pictures and ends with the scan.
         remark: a remark for the operator; "" if there is none.
     """
 
     live: LiveCommand | None = None
     afterwards: LiveCommand | None = None
     remark: str = ""
+    draws: bool = False
 
 
 def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
@@ -178,7 +180,7 @@ class LiveReconstruction:
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
         self._changing = threading.Lock()  # protects the process and the wish for another one
         with self._changing:
-            self._start("x")
+            self._start("a" if self._log.exists() else "x")
 
     def _start(self, mode: Literal["a", "x"]) -> None:
         try:
