@@ -48,7 +48,8 @@ def _command(verb: str, help_text: str) -> click.Command:
 def _send(run: Path | None, word: str) -> None:
     """Send a command, or the decision what to measure next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # imported here because help does not need it
-    from beamline.scan.control import Verb, is_series_folder, tell
+    from beamline.scan.control import Verb, tell
+    from beamline.storage.run_record import is_series_folder
 
     runs = Path(StorageSection.model_fields["folder"].default)
     if run is not None and not run.is_dir():
@@ -246,7 +247,7 @@ def recover(file: Path, as_json: bool) -> None:
 
 def _runs_of(path: Path) -> list[Path]:
     """The runs of a series that have a scan file; any other path itself."""
-    from beamline.scan.control import is_series_folder
+    from beamline.storage.run_record import is_series_folder
 
     runs = sorted(scan.parent for scan in path.glob(f"*/{SCAN}")) if is_series_folder(path) else []
     return runs or [path]

@@ -232,7 +232,6 @@ _WITH_REFERENCE = option(
     "--reference",
     argument="reference",
     excludes={
-        **_FINISHED,
         "volumes": "a reference helps to reconstruct a single volume",
         "uncertainty": "error bars are not calibrated for it",
         "roi": "the motion of the sample is estimated in all of the field",

@@ -76,6 +76,14 @@ class ScanRequest:
         help="With several scans: wait for Enter before each scan except the first, so that you can change the sample.",
     )
     as_json: bool = set_by(json_option)
+    reference: Path | None = set_by(
+        "--reference",
+        metavar="GOOD",
+        type=click.Path(path_type=Path),
+        help="Volume of the same sample from an earlier, careful scan, or that scan itself. During the scan the live "
+        "picture shows the moved reference and what changed, and afterwards the volume is made with it, as by "
+        "`beamline recon --reference`. The same as recon.reference in CONFIG.",
+    )
     output: Path | None = set_by(
         "-o",
         "--output",
@@ -88,6 +96,7 @@ class ScanRequest:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
             "output": "the run already has its folder",
+            "reference": "the run keeps the reference of its configuration",
             "rehearse": "a rehearsal always starts a new run, and --resume uses the devices stored in RUN",
             "documents": "documents can describe only complete scans",
         },
@@ -99,6 +108,14 @@ class ScanRequest:
     def file(self) -> Path | None:
         """The configuration of a single scan."""
         return self.files[0] if self.files else None
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The values that replace those of the configuration."""
+        from beamline.config.load import override_of
+
+        given = self.reference
+        return self.overrides if given is None else (*self.overrides, override_of("recon.reference", given.resolve()))
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
@@ -145,7 +162,7 @@ def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> N
 
     file, run = request.file, request.run
     config = (
-        None if file is None else load(file, request.overrides, rehearse=request.rehearse, no_live=request.unless_live)
+        None if file is None else load(file, request.settings, rehearse=request.rehearse, no_live=request.unless_live)
     )
     of_series = _config_of_series(config, run, request.documents)
     if of_series is not None and not request.dry:

@@ -309,6 +309,8 @@ def _locate(data: Any, folder: Path) -> None:
     """Make the file names in plain configuration values independent of the working directory, in place."""
     if (scan := _group(data, "scan", "angles", "path")) is not None:
         scan["path"] = str((folder / scan["path"]).resolve())
+    if (of_recon := _group(data, "recon", "reference")) is not None:
+        of_recon["reference"] = str((folder / of_recon["reference"]).resolve())
     if (simulation := _group(data, "simulation", "scene")) is not None:
         scene_file, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
         if scene_file.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
@@ -346,6 +348,12 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
         yield (
             ("scan", "angles", "path"),
             f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
+        )
+    if config.recon.reference is not None and not Path(config.recon.reference).exists():
+        yield (
+            ("recon", "reference"),
+            f"recon.reference: there is no file {config.recon.reference}; expected a volume of the same sample, or its "
+            "scan",
         )
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():

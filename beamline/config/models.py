@@ -17,7 +17,7 @@ from beamline.plan.plan import Mode, Place
 from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
 from recon.base.setting import Setting, setting
-from recon.methods import DEFAULT, names_of_one_volume, streams
+from recon.methods import DEFAULT, WITH_REFERENCE, names_of_one_volume, streams
 
 if TYPE_CHECKING:
     MethodName = str
@@ -277,8 +277,19 @@ class ReconSection(Section):
         "Time limit after the last projection. null: no time limit; the fit takes as many steps as for a "
         "finished scan, and needs more time on a busy computer.",
     )
+    reference: str | None = setting(
+        None,
+        "File with an earlier, careful volume of the same sample, or with its scan; relative to the configuration "
+        "file. The volume is then made from it after the scan, whatever `method` says. null: there is none.",
+        min_length=1,
+    )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
+
+    @property
+    def chosen_method(self) -> str:
+        """The method of the volume: `method`, or the one that uses the reference if there is one."""
+        return self.method if self.reference is None or WITH_REFERENCE is None else WITH_REFERENCE
 
 
 class Speed(Section):
@@ -382,6 +393,7 @@ class Config(Section):
             "one scan at a time; set scan.energies to null": scan.energies is None,
             "one scan at a time; set scan.states to null": scan.states is None,
             "a live volume; set recon.live to true": recon.live,
+            "a volume that grows during the scan; set recon.reference to null": recon.reference is None,
             "a volume that grows during the scan; set recon.method to r2": streams(recon.method),
             "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan set "
             "scan.pass_views (for example 60)": 0 < scan.pass_views < getattr(angles, "views", math.inf)

@@ -18,6 +18,7 @@ from beamline.projections.views import select, stated_geometry
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.run_record import is_series_folder
 from beamline.storage.volumes.files import opened_volume, volume_format
 from drivers.base.clock import Clock
 from recon.auto import Auto
@@ -35,7 +36,8 @@ def with_reference(
 ) -> ReconOptions:
     """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
 
-    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again. If the state
+    That volume is in `<name of the scan>_reference.h5` beside the output, or in the folder of the series that the run
+    of the output belongs to, and later calls use it again. If the state
     has fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
 
     Raises:
@@ -44,7 +46,9 @@ def with_reference(
         ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
     if volume_format(path) is None:
-        made = options.target.output.with_name(f"{safe_name(path.stem)}_reference.h5")
+        folder = options.target.output.parent
+        folder = folder.parent if is_series_folder(folder.parent) else folder  # one for all states of a series
+        made = folder / f"{safe_name(path.stem)}_reference.h5"
         if made == options.target.output:
             raise DataError(
                 f"The reference {path.name} is a scan, whose volume would be in {made}, which is also the output. "

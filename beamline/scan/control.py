@@ -18,10 +18,10 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.files import CONFIG, CONTROL, EVENTS, is_below, parts_of
+from beamline.core.files import CONTROL, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.plan.passes import Choice
-from beamline.storage.run_record import DIED, alive, read_record
+from beamline.storage.run_record import DIED, alive, is_series_folder, read_record
 
 
 class State(StrEnum):
@@ -157,11 +157,6 @@ def running(runs: Path) -> list[Path]:
 def series_in(folder: Path) -> list[Path]:
     """The folders of series of scans in a folder."""
     return [path for path in folder.glob("*/") if is_series_folder(path)]
-
-
-def is_series_folder(folder: Path) -> bool:
-    """True if the folder has a configuration, but is not the folder of a run."""
-    return (folder / CONFIG).is_file() and not is_below(folder, EVENTS) and read_record(folder) is None
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,9 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
         earlier: files of the same scan, whose projections come first.
     """
     plan = plan or LivePlan()
-    options = {**_common(config), "--seconds": config.recon.seconds}
+    options = _common(config)
+    if config.recon.reference is None:
+        options["--seconds"] = config.recon.seconds
     if plan.binning > 1:
         options["--bin"] = plan.binning
     if plan.every > 1:
@@ -81,25 +83,33 @@ class Commands:
 
 def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     """The commands for the configuration of a scan, or of a resumed run."""
-    method = config.recon.method
+    method, draws = config.recon.chosen_method, config.recon.reference is not None
     if not config.recon.live:
         return Commands()
+    if draws and (series is None or series.end_references is None):
+        how = Commands(_followed(config, series), finished_command(config), draws=True)
+        return replace(how, remark="Pictures are drawn during the scan; the volume is made after it.")
     if not streams(method):
         remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
         remark = "No live volume is made, because only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
+    return Commands(live=_followed(config, series))
+
+
+def _followed(config: Config, series: ResumableRun | None) -> LiveCommand:
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
-    return Commands(live=follow_command(config, plan, series.parts if series else ()))
+    return follow_command(config, plan, series.parts if series else ())
 
 
 def _common(config: Config) -> dict[str, object]:
     recon, axis = config.recon, config.recon.axis
     if axis == "auto" and config.optics.axis_col is not None:
         axis = config.optics.axis_col
-    return {"--method": recon.method, "--axis": axis, "--seed": recon.seed}
+    of_reference = {} if recon.reference is None else {"--reference": recon.reference}
+    return {"--method": recon.chosen_method, "--axis": axis, "--seed": recon.seed, **of_reference}
 
 
 def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:

@@ -285,7 +285,7 @@ def _worked(
     free: int,
 ) -> Timeline:
     """The timeline, with a remark on the live volume."""
-    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.method
+    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.chosen_method
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or not streams(method):
         return worked

@@ -135,7 +135,7 @@ def take_all(request: ScanRequest) -> None:
     """Plan the scans of a queue, then run them, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
         plan = plan_queue(
-            request.files, request.overrides, place=request.output, rehearse=request.rehearse,
+            request.files, request.settings, place=request.output, rehearse=request.rehearse,
             no_live=request.unless_live,
         )  # fmt: skip
         for scan in plan.scans:

@@ -15,15 +15,18 @@ from beamline.cli.recon import recon as command
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Sink
 from beamline.projections.selection import Selection
+from beamline.reconstruct import live_reference
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.reference import with_reference
+from beamline.report.live_picture import PictureRow, reference_row
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
+from recon.base.method import Preview
 from recon.features.reference.methods import FromReference
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
-from tests.recon.features.reference.scene import Discs, N, packed, scanned
+from tests.recon.features.reference.scene import LEVEL, Discs, N, packed, scanned
 
 QUICK = "--axis", str((N - 1) / 2), "--quality", "preview"
 AFTER = replace(packed(), turn=np.radians(0.8), shift=(1.5, -1.0), slit=4)
@@ -86,12 +89,35 @@ def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
     assert not (folder / "x.h5").exists()
 
 
+def test_the_picture_of_a_followed_scan_shows_the_moved_reference_and_the_slit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = list[Preview]()
+
+    def row(shown: Preview, n_views: int, unit: str) -> PictureRow:
+        assert n_views == 24
+        drawn.append(shown)
+        return reference_row(shown, n_views, unit)
+
+    monkeypatch.setattr(live_reference, "reference_row", row)
+    out = tmp_path / "out.h5"
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(folder / "good_volume.h5"), *QUICK[:2], "--follow",
+                    "-o", str(out))  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert out.exists() and out.with_name("out.live.png").exists()
+    (shown,) = drawn
+    gap = (replace(AFTER, slit=-1).volume - AFTER.volume)[0]
+    change = (shown.volume.data - shown.moved.data)[len(shown.moved.data) // 2]
+    slit = -float((change * gap).sum() / np.square(gap).sum()) * LEVEL / np.percentile(shown.moved.data, 99)
+    assert slit > 0.4, "the slit is in FBP of the rest"
+    assert abs(change[gap == 0]).mean() < 0.1 * abs(change[gap > 0.5 * gap.max()]).mean()
+
+
 @pytest.mark.parametrize(
     ("options", "error"),
     [
         (("--reference", "none.h5"), "none.h5 does not exist"),
         (("--reference", "good_volume.h5", "-m", "fbp"), "--reference works only with from-reference"),
-        (("--reference", "good_volume.h5", "--follow"), "it needs a finished scan"),
         (("-m", "from-reference"), "--method from-reference needs --reference GOOD"),
         (("--reference", "good_volume.h5", "--uncertainty"), "error bars are not calibrated for it"),
     ],
