@@ -45,16 +45,18 @@ class ReferencePictures:
         self._search, stated = AxisSearch(), options.selection.axis_col
         self._axis = source.axis_col if stated is None else stated
 
-    def draw(self, pause: float) -> None:
+    def draw(self, pause: float | None) -> None:
         """Draw the projections so far, if there are new ones, and `pause` s and the time of the last drawing have
-        passed."""
+        passed. None: the scan has ended, draw now."""
         views = self._views.chosen(self._views.usable().frames)
         if views.size < FEWEST or not self._slices.due(views, pause):
             return
         with suppress(DataError):  # for example, flats are still to come; the scan and the reconstruction continue
             plan = survey(self._views.scan.renewed())
             if self._axis is None or self._search.estimate is not None:
-                self._search, self._axis = self._search.look(self._views, plan, views, self._axis, False, self._warn)
+                self._search, self._axis = self._search.look(
+                    self._views, plan, views, self._axis, pause is None, self._warn
+                )
             lines = apply(plan, spread(views, _MOST_VIEWS))
             self._slices.draw([lines], self._axis, pause, views.size)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.recon_events import ReconStarted
+from beamline.core.recon_events import ALL_SHOWN, ReconStarted
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
@@ -122,9 +122,12 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
             drawn = ReferencePictures(options, source, channels.sink, channels.clock, channels.warn)
         for n_frames in growing(source, channels.clock, timing.patience, timing.poll):
             if drawn is not None and n_frames:
-                drawn.draw(timing.picture)
+                drawn.draw(None if source.finished else timing.picture)
             if should_stop():
                 raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")
+        if drawn is not None:
+            said = "The picture shows all projections of the scan"
+            channels.sink(StateEntered(ALL_SHOWN, said, time=channels.clock.now()))
     return replace(options, follow=None)
 
 

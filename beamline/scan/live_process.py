@@ -21,7 +21,7 @@ from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
-from beamline.core.recon_events import LawMeasured, ReconDone
+from beamline.core.recon_events import ALL_SHOWN, LawMeasured, ReconDone
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import describe
 from beamline.scan.live_plan import LivePlan, live_plan
@@ -36,6 +36,7 @@ _SILENCE = 300.0  # real s without output after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
 _AGAIN = 2  # how often it is started again
+_SHOWN_WITHIN = 10.0  # real s after the scan
 _POLL = 0.1  # real s between two checks of its readiness
 _SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
@@ -185,7 +186,7 @@ class LiveReconstruction:
         self._silence, self.ended = silence, False
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
-        self._ready = threading.Event()
+        self._ready, self._shown = threading.Event(), threading.Event()
         self._process: ChildProcess | None = None
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
         self._changing = threading.Lock()  # protects the process and the wish for another one
@@ -248,6 +249,13 @@ class LiveReconstruction:
             self._sink(Warned(message, source="recon"))
         return self._done
 
+    def wait_shown(self, stop: Callable[[], bool]) -> None:
+        """Wait until its picture shows all projections or it has ended, at most 10 s; `stop` ends the wait."""
+        deadline = time.monotonic() + _SHOWN_WITHIN
+        while self._process is not None and self._process.running and not stop() and time.monotonic() < deadline:
+            if self._shown.wait(_POLL):
+                return
+
     def close(self) -> None:
         """Terminate it if it is still running."""
         with self._changing:
@@ -291,6 +299,8 @@ class LiveReconstruction:
         match event:
             case StateEntered(state="ready"):
                 self._ready.set()
+            case StateEntered(state=state) if state == ALL_SHOWN:
+                self._shown.set()
             case LawMeasured():
                 self._on_law(event)
             case Done():

@@ -209,7 +209,9 @@ class Measurement:
             sample=self.config.sample.name,
         )
         self.sink(ScanDone(result))
-        if follower is not None and not draws:
+        if follower is not None and draws:
+            follower.wait_shown(lambda: self.stop.aborting or not closed)
+        elif follower is not None:
             useless = not closed or isinstance(ended.error, ReferencesError)
             aborting = abort_watch(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))
             recon = follower.finish(live_should_end(self.stop, useless), aborting)
