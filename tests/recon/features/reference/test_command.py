@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +16,8 @@ import pytest
 from beamline.cli.recon import recon as command
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Sink
+from beamline.page.tiles import TileRegion
+from beamline.page.volume import moved_reference
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_reference
 from beamline.reconstruct.options import OutputPaths, ReconOptions
@@ -70,7 +74,21 @@ def test_the_result_says_that_the_reference_was_used_and_shows_the_change(folder
         assert missing > 0.3, "the slit is in the change"
         shifts = [data[f"displacement_{axis}"] for axis in "zyx"]
         assert all(each.shape == record.grid.shape and each.attrs["units"] == record.length_unit for each in shifts)
-    assert "Change since the reference" in out.with_suffix(".html").read_text()
+    page = out.with_suffix(".html").read_text()
+    assert "Change since the reference" in page and "divided by its standard error" in page
+    median = float(re.findall(r"displaced by ([0-9.]+) voxels", page)[0])
+    assert abs(median - np.hypot(*AFTER.shift)) < 0.5
+
+
+def test_the_viewer_shows_the_moved_reference_above_the_state(folder: Path) -> None:
+    with ExitStack() as opened:
+        before = moved_reference(folder / "out.h5", opened)
+        assert before is not None and before.facts()["name"] == "out.h5::moved reference"
+        with h5py.File(folder / "out.h5") as file, closing(before):
+            expected = file["entry/data/data"][1] - file["entry/data/change"][1]
+            tile = before.cut(0, 1, TileRegion(0, N, 0, N))
+            np.testing.assert_allclose(tile.values, expected)
+        assert moved_reference(folder / "good_volume.h5", opened) is None
 
 
 def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
