@@ -62,7 +62,7 @@ FOR_PACKAGES = {
     "beamline.plan.plan": ("Block", "FieldPlan", "Mode", "Place", "ScanPlan", "Timeline"),
     "beamline.report.figures": ("WIDTH", "draw_slice", "finish", "new_figure", "planes", "png"),
     "beamline.report.html": ("Picture", "render"),
-    "beamline.scan.energies": ("scans_of",),
+    "beamline.scan.series": ("scans_of",),
     "beamline.scenes.scene_file": ("open_scene",),
     "beamline.scan.control": ("State", "Verb", "ask"),
     "beamline.scan.ledger": ("EXTRA", "LedgerError"),

@@ -170,7 +170,7 @@ class Instrument:
                 run_scan(
                     config, None if output is None else Path(output),
                     [remember, say, *([on_event] if on_event else [])], stop,
-                    live=how.live, afterwards=how.afterwards, instrument=self._devices,
+                    live=how, instrument=self._devices,
                 )  # fmt: skip
         finally:
             self.last = _result(ends)

@@ -49,11 +49,12 @@ def _send(run: Path | None, word: str) -> None:
     """Send a command, or the decision what to measure next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # imported here because help does not need it
     from beamline.scan.control import Verb, tell
+    from beamline.storage.run_record import is_series_folder
 
     runs = Path(StorageSection.model_fields["folder"].default)
     if run is not None and not run.is_dir():
         raise ConfigError(f"the folder {run} does not exist; {_running_in(runs)}. Nothing was changed.")
-    run = run or _only(runs)
+    run = _only(runs if run is None else run) if run is None or is_series_folder(run) else run
     log = parts_of(run)[-1] / EVENTS
     before = log.stat().st_size if log.is_file() else 0
     state = tell(run, Choice(word) if word in CHOICES else Verb(word))
@@ -225,6 +226,7 @@ def recover(file: Path, as_json: bool) -> None:
     \b
     beamline recover RUN            repair all files in the folder of a run
     beamline recover RUN/scan.h5    repair one file
+    beamline recover SERIES         repair all runs of a series of energies or states
 
     The command keeps all complete frames, and drops a frame that was being written. The repaired file has the group
     /exchange and the status `failed`. The command does not change an intact file. To repair a file, it copies the
@@ -238,8 +240,17 @@ def recover(file: Path, as_json: bool) -> None:
 
     with terminated_like_interrupted(), json_events(as_json) as sink:
         run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
-        recovered, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
-        recovered_files(recovered, left_out, sink, as_json)
+        for each in _runs_of(run):
+            recovered, left_out = recover_run(each, say) if each.is_dir() else ([recover_scan(each, say)], [])
+            recovered_files(recovered, left_out, sink, as_json)
+
+
+def _runs_of(path: Path) -> list[Path]:
+    """The runs of a series that have a scan file; any other path itself."""
+    from beamline.storage.run_record import is_series_folder
+
+    runs = sorted(scan.parent for scan in path.glob(f"*/{SCAN}")) if is_series_folder(path) else []
+    return runs or [path]
 
 
 def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:

@@ -137,6 +137,10 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     method = values["method"]
     if "reference" in asked and method in (None, AUTO):
         method = WITH_REFERENCE
+    if method is not None and method == WITH_REFERENCE and "reference" not in asked:
+        raise click.UsageError(
+            f"--method {method} needs --reference GOOD: an earlier volume of the same sample, or its scan."
+        )
     stated = method is not None
     if method is None:
         of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.argument}

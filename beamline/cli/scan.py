@@ -28,8 +28,8 @@ from recon.base.registry import in_folders
 if TYPE_CHECKING:
     from beamline.config.load import Config
     from beamline.core.run_result import RunResult
-    from beamline.scan.energies import SeriesRun
     from beamline.scan.resume import ResumableRun
+    from beamline.scan.series import SeriesRun
     from drivers.in_beam import Ask
 
 
@@ -76,6 +76,14 @@ class ScanRequest:
         help="With several scans: wait for Enter before each scan except the first, so that you can change the sample.",
     )
     as_json: bool = set_by(json_option)
+    reference: Path | None = set_by(
+        "--reference",
+        metavar="GOOD",
+        type=click.Path(path_type=Path),
+        help="Volume of the same sample from an earlier, careful scan, or that scan itself. During the scan the live "
+        "picture shows the moved reference and what changed, and afterwards the volume is made with it, as by "
+        "`beamline recon --reference`. The same as recon.reference in CONFIG.",
+    )
     output: Path | None = set_by(
         "-o",
         "--output",
@@ -88,6 +96,7 @@ class ScanRequest:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
             "output": "the run already has its folder",
+            "reference": "the run keeps the reference of its configuration",
             "rehearse": "a rehearsal always starts a new run, and --resume uses the devices stored in RUN",
             "documents": "documents can describe only complete scans",
         },
@@ -99,6 +108,14 @@ class ScanRequest:
     def file(self) -> Path | None:
         """The configuration of a single scan."""
         return self.files[0] if self.files else None
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The values that replace those of the configuration."""
+        from beamline.config.load import override_of
+
+        given = self.reference
+        return self.overrides if given is None else (*self.overrides, override_of("recon.reference", given.resolve()))
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
@@ -124,8 +141,8 @@ def scan(request: ScanRequest) -> None:
     Several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), run one after the other. If one scan
     fails, the next one starts anyway; Ctrl-C ends all of them.
 
-    If CONFIG has `scan.energies`, the command takes a scan at each energy, and puts all of them in one folder. --resume
-    can continue such a series, too.
+    If CONFIG has `scan.energies` or `scan.states`, the command takes a scan at each energy or of each state, and puts
+    all of them in one folder. --resume can continue such a series, too.
 
     Exit codes are listed in `beamline --help`. 6: darks or flats cannot be used. 7: the scan is complete, but frames
     have an alarm of the monitor, or darks or flats have a fault.
@@ -139,20 +156,20 @@ def scan(request: ScanRequest) -> None:
 
 
 def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:
-    """Run a scan, or one at each energy; or continue a run, whose parts may only need to be joined."""
+    """Run a scan, or each scan of a series; or continue a run, whose parts may only need to be joined."""
     from beamline.config.load import load
     from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
     file, run = request.file, request.run
     config = (
-        None if file is None else load(file, request.overrides, rehearse=request.rehearse, no_live=request.unless_live)
+        None if file is None else load(file, request.settings, rehearse=request.rehearse, no_live=request.unless_live)
     )
-    frames_by_energy = _config_of_energies(config, run, request.documents)
-    if frames_by_energy is not None and not request.dry:
-        _show_energies(take_energies(frames_by_energy, request, [json_sink], StopRequest()), request, json_sink)
+    of_series = _config_of_series(config, run, request.documents)
+    if of_series is not None and not request.dry:
+        _show_series(of_series, take_series(of_series, request, [json_sink], StopRequest()), request, json_sink)
         return
-    if frames_by_energy is not None:
-        run, config = None, frames_by_energy
+    if of_series is not None:
+        run, config = None, of_series
     try:
         series = None if run is None else held.enter_context(open_for_resume(run, config))
     except NotJoined:
@@ -277,15 +294,15 @@ def run_one(
         if request.documents is not None:
             sinks.append(import_module("beamline.bluesky.documents").sink(config, request.documents, held))
         place = series or request.output
-        return run_scan(config, place, sinks, stop, live=how.live, afterwards=how.afterwards, ask=ask)
+        return run_scan(config, place, sinks, stop, live=how, ask=ask)
 
 
-def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
-    """The configuration of a series of energies, given or stored in its folder `run`; None if it is a single scan."""
+def _config_of_series(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
+    """The configuration of a series, given or stored in its folder `run`; None if it is a single scan."""
     from beamline.config.load import load
     from beamline.core.files import CONFIG
-    from beamline.scan.energies import is_series
     from beamline.scan.resume import require_same_config
+    from beamline.scan.series import is_series
 
     if run is not None and not is_series(run):
         return None
@@ -293,33 +310,36 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
         if config is not None:
             require_same_config(run, (run / CONFIG).read_text("utf-8"), config, CONFIG)
         return load(run / CONFIG, environment={})
-    if config is None or config.scan.energies is None:
+    if config is None or not config.series:
         return None
     if documents is not None:
+        several = "scan.energies" if config.scan.states is None else "scan.states"
         raise click.UsageError(
-            "--documents works only with a single scan: leave it out, because the configuration has scan.energies."
+            f"--documents works only with a single scan: leave it out, because the configuration has {several}."
         )
     return config
 
 
-def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
-    """Scan at each energy, or continue the series, with output to the terminal and the page."""
-    from beamline.scan.energies import run_energies
+def take_series(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
+    """Take the scans of a series, or continue it, with output to the terminal and the page."""
     from beamline.scan.live_process import Commands, commands_of
+    from beamline.scan.series import run_series
 
     with _shown(request, others, stop) as (sinks, ask):
-        return run_energies(
+        return run_series(
             config, request.output, sinks, stop,
             lambda one, rest: Commands() if request.no_live else commands_of(one, rest), series=request.run, ask=ask,
         )  # fmt: skip
 
 
-def _show_energies(done: SeriesRun, request: ScanRequest, json_sink: Sink) -> None:
-    data = {"folder": done.folder, "scans": [{"energy_kev": energy, "path": path} for energy, path in done.scans]}
+def _show_series(config: Config, done: SeriesRun, request: ScanRequest, json_sink: Sink) -> None:
+    name, unit = ("energy_kev", "{:.7g} keV") if config.scan.states is None else ("state", "state {}")
+    data = {"folder": done.folder, "scans": [{name: value, "path": path} for value, path in done.scans]}
     json_sink(Done(data, time=SystemClock().now()))
     if not request.as_json:
-        click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
-        click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
+        click.echo("\n".join(f"{unit.format(value):<14}{path}" for value, path in done.scans))
+        if config.scan.states is None:
+            click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
     if faults := [fault for result in done.results for fault in faults_of(result)]:
         raise AlarmError(f"The scans are complete, but {' '.join(faults)} Details are in {done.folder}.")
 

@@ -38,7 +38,7 @@ from beamline.core.installed import config_folder as config_folder
 from beamline.core.installed import version
 from beamline.core.quantities import doubt, is_impossible
 from beamline.plan import plan as plans
-from beamline.plan.plan import FieldPlan, Mode, ScanPlan
+from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 from recon.base.findings import declared_at
 
@@ -161,25 +161,26 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
     return _validated(override(read(resolved_yaml(config), name), overrides, {}, takes_text), name)
 
 
-def at_energies(config: Config) -> tuple[Config, ...]:
-    """The configuration of a scan at each of `scan.energies`; a configuration without them itself.
+def each_scan(config: Config) -> tuple[Config, ...]:
+    """The configuration of each scan of a series (`scan.energies`, `scan.states`); that of a single scan itself.
 
     The n-th of N scans begins n / N of an angular step later, or has another random seed, so that all scans together
     contain more angles.
     """
-    scan, energies = config.scan, config.scan.energies
-    if energies is None:
-        return (config,)
+    scan, series = config.scan, config.series
+    key = "scan.energy" if scan.states is None else "scan.state"
     configs = []
-    for n, energy in enumerate(energies):
-        words = ["scan.energies=null", override_of("scan.energy", energy)]
+    for n, value in enumerate(series):
+        words = ["scan.energies=null", override_of(key, value)]
         if isinstance(scan.angles, RandomAngles):
             words.append(override_of("scan.angles.seed", scan.angles.seed + n))
         elif isinstance(scan.angles, FixedAngles | InterlacedAngles | GoldenAngles):
             step = scan.angles.span_deg / scan.angles.views
-            words.append(override_of("scan.angles.start_deg", scan.angles.start_deg + n / len(energies) * step))
+            words.append(override_of("scan.angles.start_deg", scan.angles.start_deg + n / len(series) * step))
+        if n and scan.states is not None and scan.states.references == "first":  # copies come before the projections
+            words += [f"scan.{name}.at=start" for name in ("darks", "flats") if getattr(scan, name).at != Place.NONE]
         configs.append(changed(config, words))
-    return tuple(configs)
+    return tuple(configs) or (config,)
 
 
 def override_of(key: str, value: object) -> str:
@@ -308,6 +309,8 @@ def _locate(data: Any, folder: Path) -> None:
     """Make the file names in plain configuration values independent of the working directory, in place."""
     if (scan := _group(data, "scan", "angles", "path")) is not None:
         scan["path"] = str((folder / scan["path"]).resolve())
+    if (of_recon := _group(data, "recon", "reference")) is not None:
+        of_recon["reference"] = str((folder / of_recon["reference"]).resolve())
     if (simulation := _group(data, "simulation", "scene")) is not None:
         scene_file, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
         if scene_file.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
@@ -345,6 +348,12 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
         yield (
             ("scan", "angles", "path"),
             f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
+        )
+    if config.recon.reference is not None and not Path(config.recon.reference).exists():
+        yield (
+            ("recon", "reference"),
+            f"recon.reference: there is no file {config.recon.reference}; expected a volume of the same sample, or its "
+            "scan",
         )
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -16,7 +17,7 @@ from beamline.plan.plan import Mode, Place
 from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
 from recon.base.setting import Setting, setting
-from recon.methods import DEFAULT, names_of_one_volume, streams
+from recon.methods import DEFAULT, WITH_REFERENCE, names_of_one_volume, streams
 
 if TYPE_CHECKING:
     MethodName = str
@@ -133,6 +134,22 @@ class TargetSection(Section):
     )
 
 
+class StatesSection(Section):
+    """A series of states of a sample that changes: one scan of each state."""
+
+    count: int = setting(doc="Number of states.", ge=2, le=1000)
+    every_s: Seconds | None = setting(
+        None,
+        "Time from the begin of one state to the begin of the next; a state that takes longer delays the next one. "
+        "null: each state after the first waits for `beamline resume`, from a terminal or a script.",
+    )
+    references: Literal["first", "each"] = setting(
+        "first",
+        "Darks and flats of the states after the first. first: those of the first state are copied into their files. "
+        "each: each state takes its own.",
+    )
+
+
 class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: AnglesSection
@@ -170,6 +187,14 @@ class ScanSection(Section):
         "angular step later than the scan before.",
         min_length=2,
         max_length=1000,
+    )
+    states: StatesSection | None = setting(
+        None,
+        "A series of states of a sample that changes: one scan of each, in one folder. Each scan begins a fraction of "
+        "an angular step later than the scan before. null: one scan.",
+    )
+    state: int | None = setting(
+        None, "Number of this scan in such a series, from 1; the series sets it.", ge=1, le=1000
     )
     offset_views: int = setting(
         0,
@@ -252,8 +277,19 @@ class ReconSection(Section):
         "Time limit after the last projection. null: no time limit; the fit takes as many steps as for a "
         "finished scan, and needs more time on a busy computer.",
     )
+    reference: str | None = setting(
+        None,
+        "File with an earlier, careful volume of the same sample, or with its scan; relative to the configuration "
+        "file. The volume is then made from it after the scan, whatever `method` says. null: there is none.",
+        min_length=1,
+    )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
+
+    @property
+    def chosen_method(self) -> str:
+        """The method of the volume: `method`, or the one that uses the reference if there is one."""
+        return self.method if self.reference is None or WITH_REFERENCE is None else WITH_REFERENCE
 
 
 class Speed(Section):
@@ -331,6 +367,17 @@ class Config(Section):
         one, several = self.scan.energy, self.scan.energies
         if one is not None and several is not None:
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
+        if several is not None and self.scan.states is not None:
+            raise ValueError("scan.energies and scan.states exclude each other; give one of them")
+        if self.scan.state is not None and self.scan.state > (self.scan.states.count if self.scan.states else 0):
+            raise ValueError(
+                f"scan.state {self.scan.state} needs scan.states with a count of at least this number; leave out "
+                "scan.state, because the series sets it"
+            )
+        if self.scan.states is not None and self.scan.states.references == "first" and self.scan.darks.at is Place.END:
+            raise ValueError(
+                "scan.states.references first needs darks before the projections; set scan.darks.at to start or both"
+            )
         texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(
@@ -344,7 +391,9 @@ class Config(Section):
         interlaced = isinstance(angles, InterlacedAngles) and angles.passes > 1
         needs = {
             "one scan at a time; set scan.energies to null": scan.energies is None,
+            "one scan at a time; set scan.states to null": scan.states is None,
             "a live volume; set recon.live to true": recon.live,
+            "a volume that grows during the scan; set recon.reference to null": recon.reference is None,
             "a volume that grows during the scan; set recon.method to r2": streams(recon.method),
             "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan set "
             "scan.pass_views (for example 60)": 0 < scan.pass_views < getattr(angles, "views", math.inf)
@@ -370,6 +419,19 @@ class Config(Section):
                 f"{name}: {beyond[0]:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
             )
         return self
+
+    @property
+    def series(self) -> Sequence[float]:
+        """The energies (keV), or the numbers of the states, of a series of scans; empty: a single scan."""
+        if self.scan.states is not None and self.scan.state is None:
+            return range(1, self.scan.states.count + 1)
+        return self.scan.energies or ()
+
+    @property
+    def copies_references(self) -> bool:
+        """Whether the scan copies its darks and flats from the first state of its series."""
+        states = self.scan.states
+        return states is not None and states.references == "first" and (self.scan.state or 1) > 1
 
     @property
     def simulated(self) -> bool:

@@ -8,6 +8,9 @@ from typing import Any
 
 from beamline.core.events import Event, Listed, spread
 
+ALL_SHOWN = "shown"
+"""State of a live reconstruction whose picture shows all projections of its scan."""
+
 
 class SnapshotWritten(Event, event="snapshot"):
     """The live volume was written to a file.

@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -20,7 +21,7 @@ from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import ZarrScale
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume, times_of
-from beamline.storage.writers.recon_file import opened_reconstruction
+from beamline.storage.writers.recon_file import CHANGE, opened_reconstruction
 from recon.base.arrays import some_values
 from recon.base.greys import apart, grey_windows
 
@@ -307,3 +308,31 @@ class ShownVolume:
             return np.asarray(values, np.float32)
         low, step = self._grey
         return np.float32(low) + np.float32(step) * np.asarray(values, np.float32)
+
+
+def moved_reference(path: Path, opened: ExitStack) -> ShownVolume | None:
+    """The moved reference of a state: its volume minus its change; None: the file has no change. `opened` keeps
+    the file open."""
+    if not hdf5.is_hdf5(path):
+        return None
+    with hdf5.open_hdf5(path) as file:
+        if not isinstance(file.get(_CHANGE), h5py.Dataset):
+            return None
+    record, file = opened.enter_context(opened_volume(path)), opened.enter_context(hdf5.open_hdf5(path))
+    data: Any = _Before(record.volume.data, file[_CHANGE])
+    shown = replace(record, volume=replace(record.volume, data=data))
+    return ShownVolume(path, dataset="moved reference", record=shown)
+
+
+_CHANGE = f"entry/data/{CHANGE}"
+
+
+class _Before:
+    """The voxels of a volume minus their change, slice by slice."""
+
+    def __init__(self, volume: Any, change: h5py.Dataset) -> None:
+        self._volume, self._change = volume, change
+        self.shape, self.dtype, self.ndim = volume.shape, volume.dtype, 3
+
+    def __getitem__(self, key: slice) -> F32:
+        return np.asarray(self._volume[key] - self._change[key], np.float32)

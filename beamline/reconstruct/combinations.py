@@ -28,7 +28,6 @@ EXCLUDED: Mapping[str, Mapping[str, str]] = MappingProxyType(
         "quality": _BY_SECONDS,
         **dict.fromkeys(("start", "device", "early-stop", "checkpoint", "resume", "allow-negative"), _FINISHED),
         "reference": {
-            **_FINISHED,
             "volumes": "a reference helps to reconstruct a single volume",
             "uncertainty": "error bars are not calibrated for it",
             "roi": "the motion of the sample is estimated in all of the field",

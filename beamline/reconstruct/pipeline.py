@@ -13,7 +13,7 @@ from pathlib import Path
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.recon_events import ReconStarted
+from beamline.core.recon_events import ALL_SHOWN, ReconStarted
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
@@ -31,6 +31,7 @@ from beamline.reconstruct.job import (
     with_error_bars,
 )
 from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.live_reference import ReferencePictures
 from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
 from beamline.reconstruct.record import partly_seen_warning, write_result
@@ -102,6 +103,8 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
     """Wait for the end of a scan whose method needs all projections; returns the options for the finished scan.
 
+    With a reference, pictures of the projections so far are drawn meanwhile.
+
     Raises:
         DataError: the scan died.
         KeyboardInterrupt: stopped before the end of the scan; nothing was written.
@@ -114,9 +117,17 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
                 time=channels.clock.now(),
             )
         )
-        for _ in growing(source, channels.clock, timing.patience, timing.poll):
+        drawn = None
+        if options.reference is not None:
+            drawn = ReferencePictures(options, source, channels.sink, channels.clock, channels.warn)
+        for n_frames in growing(source, channels.clock, timing.patience, timing.poll):
+            if drawn is not None and n_frames:
+                drawn.draw(None if source.finished else timing.picture)
             if should_stop():
                 raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")
+        if drawn is not None:
+            said = "The picture shows all projections of the scan"
+            channels.sink(StateEntered(ALL_SHOWN, said, time=channels.clock.now()))
     return replace(options, follow=None)
 
 
@@ -298,6 +309,10 @@ def reconstruct_file(
     truth_given = refuse_before_reading(options)
     if options.reference is not None:
         first = partial(reconstruct_file, clock=clock, stop_scope=stop_scope)
+        if options.follow is not None:  # a scan waits for this
+            shown = f"Pictures of the scan will be in {options.target.live_picture}, from the eighth projection on"
+            picture = {"picture": options.target.live_picture}
+            sink(StateEntered("ready", shown, picture, time=clock.now()))
         options = with_reference(options, options.reference, first, sink, clock)
     if options.follow is not None and not options.streams:
         options = _when_it_has_ended(options, channels, options.follow)

@@ -14,14 +14,17 @@ from beamline.core.quantities import VoxelKind
 from beamline.core.recon_events import VolumeDone
 from beamline.core.text import safe_name
 from beamline.projections.selection import Selection
+from beamline.projections.views import select, stated_geometry
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.run_record import is_series_folder
 from beamline.storage.volumes.files import opened_volume, volume_format
 from drivers.base.clock import Clock
 from recon.auto import Auto
 from recon.base.volume import Volume
 from recon.methods import with_settings
+from recon.voxels.held_out import LEAST_VIEWS
 
 
 def with_reference(
@@ -33,7 +36,9 @@ def with_reference(
 ) -> ReconOptions:
     """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
 
-    That volume is in `<name of the scan>_reference.h5` beside the output, and later calls use it again.
+    That volume is in `<name of the scan>_reference.h5` beside the output, or in the folder of the series that the run
+    of the output belongs to, and later calls use it again. If the state
+    has fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
 
     Raises:
         DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has
@@ -41,12 +46,16 @@ def with_reference(
         ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
     if volume_format(path) is None:
-        made = options.target.output.with_name(f"{safe_name(path.stem)}_reference.h5")
+        folder = options.target.output.parent
+        folder = folder.parent if is_series_folder(folder.parent) else folder  # one for all states of a series
+        made = folder / f"{safe_name(path.stem)}_reference.h5"
         if made == options.target.output:
             raise DataError(
                 f"The reference {path.name} is a scan, whose volume would be in {made}, which is also the output. "
                 "Name another output. Nothing was computed."
             )
+        if _too_few(options):
+            return options  # the method says so, and does not look at a reference
         if not made.exists():
             said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
             sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
@@ -70,6 +79,14 @@ def with_reference(
     except ValueError as error:
         raise DataError(f"{path} is no reference: {error}. The state was not reconstructed.") from None
     return replace(options, method=method)
+
+
+def _too_few(options: ReconOptions) -> bool:
+    """Whether a finished scan has too few projections to test whether a reference helps."""
+    if options.follow is not None:
+        return False
+    with options.source.open() as source:
+        return stated_geometry(select(source, options.selection)).n_views < LEAST_VIEWS
 
 
 def _of_this_scan(made: Path, scan: Path) -> Path:

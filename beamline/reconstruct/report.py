@@ -23,12 +23,15 @@ from beamline.report.metrics import METRICS, formatted
 from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Volume, VolumeSeries
 from recon.methods import BASELINE
 from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, StrayMass, Unexplained
+from recon.voxels.matter_checks import unexplained as unexplained_by
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
+_MATERIAL = 0.3  # share of the 99th percentile from which a voxel is material
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
 _NO_REFERENCE = (
     "Neither volume is the ground truth: if only one of them shows a feature, look for it in the projections."
@@ -236,6 +239,18 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
         )
 
 
+def _displaced(result: Reconstruction, moved: Volume) -> str:
+    """A sentence on the displacement of the material."""
+    if result.displacement is None:
+        return ""
+    material = moved.data > _MATERIAL * np.percentile(moved.data, 99)
+    if not material.any():
+        return ""
+    voxels = np.sqrt(np.square(result.displacement[:, material]).sum(0)) / result.volume.grid.voxel_size
+    middle, most = np.percentile(voxels, (50, 99))
+    return f" The material of the reference was displaced by {middle:.1f} voxels (median), at most {most:.1f}."
+
+
 def _doubts(
     result: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None
 ) -> Iterator[Picture]:
@@ -244,12 +259,17 @@ def _doubts(
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
+        moved = Volume(result.volume.data - result.change.data, result.volume.grid)
+        views = Views(prepared.projections.data, prepared.geometry, prepared.ray_weights())
+        left = unexplained_by(moved, views, np.random.default_rng(0))
         yield Picture(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
             "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
-            "motion.",
-            pictures.change(result.volume, result.change, unit, kind),
+            "motion. Last: what the moved reference leaves of the projections, after FBP and a blur of a voxel, divided "
+            "by its standard error. Beyond 4 and -4 the projections themselves show a change."
+            + _displaced(result, moved),
+            pictures.change(result.volume, result.change, left, unit, kind),
         )
     if result.deviation is not None:
         yield Picture(

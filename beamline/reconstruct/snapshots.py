@@ -23,6 +23,8 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
 from recon.base.views import spread
 from recon.base.volume import Volume
 from recon.prep.projections import Projections
@@ -48,7 +50,7 @@ class Snapshots:
         self._grown: tuple[PictureRow, ...] = ()
         self._at: Sequence[float] | None = None  # z, y and x of the FBP slices
         self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
-        self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
+        self.unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
         """Write the current volume and its picture, replacing the last ones."""
@@ -56,7 +58,7 @@ class Snapshots:
         (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
             volume=shown.volume,
-            length_unit=self._unit,
+            length_unit=self.unit,
             raw_file=str(self._source.path.resolve()),
             title=f"Snapshot from {fit.n_views} projections",
             sample=self._sample,
@@ -83,11 +85,19 @@ class Snapshots:
         written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
         self._sink(SnapshotWritten(*written, method, errors or None, time=now))
 
-    def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str, unseen: Wedge | None) -> None:
-        """Write the picture: these FBP slices, and below them the last drawn slices of the volume if there are any."""
+    def write_slices(
+        self,
+        slices: OrthogonalSlices,
+        n_views: int,
+        heading: str,
+        unseen: Wedge | None,
+        below: PictureRow | None = None,
+    ) -> None:
+        """Write the picture: these FBP slices, and below them another row, or the last drawn slices of the volume if
+        there are any."""
         self._at, self._unseen = slices.at, unseen
-        panels = slice_panels(slices.images, slices.at, slices.pixel, self._unit, unseen)
-        self._slices = (PictureRow(heading, panels),)
+        panels = slice_panels(slices.images, slices.at, slices.pixel, self.unit, unseen)
+        self._slices = (PictureRow(heading, panels), *([] if below is None else [below]))
         try:
             self._write_picture()
         except DataError as error:
@@ -111,7 +121,7 @@ class Snapshots:
             f"{fit.n_views} projections so far, {shown}; {fit.progress().n_gaussians} Gaussians, "
             f"{self._clock.now() - self._begin:.0f} s after the start"
         )
-        return volume_rows(volume, *fit.newest_view(), heading, self._unit, (self._at, self._unseen))
+        return volume_rows(volume, *fit.newest_view(), heading, self.unit, (self._at, self._unseen))
 
     def _write_picture(self) -> None:
         write_whole(self.picture_path, live_picture((*self._slices, *self._grown)), replace=True)
@@ -126,14 +136,21 @@ def _why(errors: Mapping[str, float]) -> str:
     return f"because it matches the held-out projections better (errors: {each})"
 
 
-_FEWEST, _BEFORE_AXIS = 8, 32  # projections needed for the first slices; projections used before the axis is known
+FEWEST, _BEFORE_AXIS = 8, 32  # projections needed for the first slices; projections used before the axis is known
 
 
 class LiveSlices:
-    """Draws slices when there are new projections and enough time has passed; uses at most half of the time."""
+    """Draws slices when there are new projections and enough time has passed; uses at most half of the time.
 
-    def __init__(self, views: FollowedViews, snapshots: Snapshots, clock: Clock) -> None:
-        self._views, self._snapshots, self._clock = views, snapshots, clock
+    Args:
+        below: gives a further row of the picture from the projections; None: there is none.
+    """
+
+    def __init__(
+        self, views: FollowedViews, snapshots: Snapshots, clock: Clock,
+        below: Callable[[Sequence[F32], Geometry], PictureRow | None] = lambda views, geometry: None,
+    ) -> None:  # fmt: skip
+        self._views, self._snapshots, self._clock, self._below = views, snapshots, clock, below
         self._newest, self._next = -1, -math.inf  # the last view drawn; the time from which they are drawn again
 
     def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
@@ -146,13 +163,14 @@ class LiveSlices:
             of: number of projections so far; 0 if `parts` has all of them.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
-        if n < _FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
+        if n < FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
             return
         ids = np.concatenate([part.view_ids for part in parts])
         col = (self._views.source.shape[1] - 1) / 2 if axis_col is None else axis_col
         geometry, _ = self._views.geometry(col, ids)
         with suppress(ValueError):
-            slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
+            data = [view for part in parts for view in part.data]
+            slices = orthogonal_slices(data, geometry)
             count = f"{n} of {of}" if of > n else str(n)
             place = (
                 "the detector middle, because the axis is not known yet: expect crescents (set optics.axis_col or "
@@ -162,17 +180,22 @@ class LiveSlices:
             )
             unseen = max(unseen_wedges(geometry), key=lambda wedge: wedge.size, default=None)
             heading = f"FBP of the first {count} projections{_coverage(unseen, geometry.angles)}, axis at {place}"
-            self._snapshots.write_slices(slices, n, heading, unseen)
+            row = self._below(data, geometry)
+            self._snapshots.write_slices(slices, n, heading, unseen, *([] if row is None else [row]))
         end = self._clock.now()
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
+
+    def due(self, views: NDArray[np.int64], pause: float | None) -> bool:
+        """Whether `draw` would draw these projections (rows of the file) now; `pause` as there."""
+        early = pause is not None and self._clock.now() < self._next
+        return views.size >= FEWEST and not early and int(views[-1]) != self._newest
 
     def draw_about_middle(self, lines_of: Callable[[NDArray[np.int64]], Projections], pause: float | None) -> None:
         """Draw slices before the axis is known, from some projections (rows of the file) that `lines_of` corrects only
         for this.
         """
         views = self._views.chosen(self._views.usable().frames)
-        early = pause is not None and self._clock.now() < self._next
-        if views.size < _FEWEST or early or int(views[-1]) == self._newest:
+        if not self.due(views, pause):
             return
         with suppress(DataError):  # for example projections without beam; the scan and the fit continue
             self.draw([lines_of(spread(views, _BEFORE_AXIS))], None, pause, views.size)

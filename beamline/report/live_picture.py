@@ -16,6 +16,7 @@ import numpy as np
 from beamline.report.figures import GreyWindow, bright_centre, grey_window, round_length
 from recon.base.arrays import F32
 from recon.base.greys import material_window
+from recon.base.method import Preview
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 from recon.voxels.view_weights import Wedge
@@ -112,6 +113,30 @@ def slice_panels(
         _Panel(image, window, label, note, None if k else bar, unseen=None if k else unseen)
         for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
     ]
+
+
+def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
+    """The middle slice of a moved reference, of this with FBP of what it leaves of the projections, and of the latter.
+
+    Args:
+        n_views: number of projections so far.
+    """
+    at, grid = len(shown.volume.data) // 2, shown.volume.grid
+    moved, volume = shown.moved.data[at], shown.volume.data[at]
+    change = volume - moved
+    window, reach = material_window(moved, volume), float(np.percentile(np.abs(change), _MOST)) or 1.0
+    (moved, volume, change), zoom = _sized((moved, volume, change))
+    grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
+    heading = (
+        f"The moved reference, and FBP of what it leaves of {n_views} projections ({shown.left:.1%} of their norm; "
+        "the smaller, the better the reference fits)"
+    )
+    panels = [
+        _Panel(moved, window, "the moved reference, x → y ↓", grey, (grid.voxel_size / zoom, unit)),
+        _Panel(volume, window, "the reference plus FBP of the rest", "the same greys and scale"),
+        _Panel(change, (-reach, reach), "FBP of the rest: what changed", f"black {-reach:.2g} to white {reach:.2g}"),
+    ]
+    return PictureRow(heading, panels)
 
 
 def _view_panels(view: F32, render: F32) -> list[_Panel]:

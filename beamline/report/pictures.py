@@ -37,6 +37,7 @@ from beamline.report.figures import (
 from recon.base.geometry import Geometry
 from recon.base.greys import material_window
 from recon.base.volume import Grid, Volume
+from recon.voxels.matter_checks import Unexplained
 from recon.voxels.view_weights import Wedge
 
 if TYPE_CHECKING:
@@ -236,17 +237,28 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
     return png(figure)
 
 
-def change(volume: Volume, change: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
-    """The slice with the largest change: the reference, the volume, and the volume minus the reference."""
-    at, grid = int(np.argmax([np.square(part).sum() for part in change.data])), volume.grid
+def change(
+    volume: Volume, change: Volume, left: Unexplained | None, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION
+) -> bytes:
+    """The slice with the largest change: the reference, the volume, the volume minus the reference, and the change in
+    the projections divided by its standard error.
+
+    Args:
+        left: what the moved reference leaves of the projections, of some slices; None: not known.
+    """
+    looked = slice(None) if left is None else slice(left.first, left.first + len(left.significance))
+    first = looked.start or 0
+    at, grid = first + int(np.argmax([np.square(part).sum() for part in change.data[looked]])), volume.grid
     window, most = material_window(volume.data[at]), float(np.percentile(np.abs(change.data[at]), 99.5)) or 1.0
-    figure = new_figure((WIDTH, 3.2), dpi_for(grid.shape[2], WIDTH / 3.3))
-    panels = (
+    figure = new_figure((WIDTH, 3.2 if left is None else 2.6), dpi_for(grid.shape[2], WIDTH / 3.3))
+    panels = [
         (volume.data[at] - change.data[at], f"Moved reference, slice {at}", window, "gray"),
         (volume.data[at], f"Volume, slice {at}", window, "gray"),
         (change.data[at], f"Change ({kind.unit(unit)})", (-most, most), "RdBu_r"),
-    )
-    for axes, (image, title, limits, colours) in zip(figure.subplots(1, 3), panels, strict=True):
+    ]
+    if left is not None:
+        panels.append((left.significance[at - first], "Change / standard error", (-8.0, 8.0), "RdBu_r"))
+    for axes, (image, title, limits, colours) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         drawn = draw_slice(axes, image, planes(grid, unit)[0], title, limits, colours)
         figure.colorbar(drawn, ax=axes, shrink=0.6)
     return png(figure)

@@ -17,7 +17,7 @@ from beamline.scan.control import State
 from beamline.scan.exposures import SLICE, Exposures
 from beamline.scan.ledger import LedgerError
 from beamline.scan.moves import in_words, make_safe, remembered_places, require_in_place, set_shutter_and_sample
-from beamline.scan.references import REFERENCES
+from beamline.scan.references import REFERENCES, copied
 from beamline.scan.supervision import Supervision
 from beamline.scan.tally import BlockTally, astray_views, discrepancies, first_taken, missing_views, recover
 from drivers.base.clock import Clock
@@ -109,6 +109,7 @@ class Acquisition:
         self._raise_outcome()
 
     def _blocks(self) -> Iterator[Frame]:
+        self._supervision.turn()
         place, filter_ = self._timeline.plan.filter, self._devices.filter
         if filter_ is not None and place is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"Moving the filter to {place}"))
@@ -187,6 +188,14 @@ class Acquisition:
         what = block.kind.name.lower(), str(block.mode), block.n_to_take, self.n_frames
         self._sink(BlockStarted(*what, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
+        if recorded := self._supervision.recorded(block):
+            yield from copied(taken, recorded, self.n_frames)
+        else:
+            yield from self._exposed(taken)
+        self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
+
+    def _exposed(self, taken: BlockTally) -> Iterator[Frame]:
+        block = taken.block
         set_shutter_and_sample(self._devices, block, self._warm_up)
         first, looks = self.n_frames, remembered_places(self._devices, block.kind, self._stop)
         yield from self._exposures.take(taken, first)
@@ -195,7 +204,6 @@ class Acquisition:
             self._sink(Warned(astray_views(taken)))
         if block.kind is FrameKind.FLAT:
             self._devices.sample.back()
-        self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
     def _retake(self, views: Block) -> Iterator[Frame]:
         """Take the projections again that supervision wants repeated.

@@ -21,7 +21,7 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.files import CONTROL, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.plan.passes import Choice
-from beamline.storage.run_record import DIED, alive, read_record
+from beamline.storage.run_record import DIED, alive, is_series_folder, read_record
 
 
 class State(StrEnum):
@@ -51,7 +51,7 @@ _TAKING = frozenset({State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING})
 
 NEXT: Mapping[State, frozenset[State]] = {
     State.IDLE: frozenset({State.PREPARING}),
-    State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
+    State.PREPARING: _TAKING | {State.PAUSED, State.FINISHING, State.ABORTED, State.FAILED},
     **{state: (_TAKING - {state}) | {State.ASKING, State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
     State.ASKING: _TAKING | {State.PAUSED, State.FINISHING, State.FAILED},
     State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
@@ -149,8 +149,14 @@ def _taken(request: Path) -> bool:
 
 
 def running(runs: Path) -> list[Path]:
-    """The runs in a folder whose scan is in progress, oldest first."""
-    return sorted(run for run in runs.glob("*/") if alive(parts_of(run)[-1]))
+    """The runs in a folder, also those of a series, whose scan is in progress, oldest first."""
+    within = [place for folder in series_in(runs) for place in folder.glob("*/")]
+    return sorted(run for run in (*runs.glob("*/"), *within) if alive(parts_of(run)[-1]))
+
+
+def series_in(folder: Path) -> list[Path]:
+    """The folders of series of scans in a folder."""
+    return [path for path in folder.glob("*/") if is_series_folder(path)]
 
 
 @dataclass(frozen=True)

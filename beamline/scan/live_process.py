@@ -21,7 +21,7 @@ from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
-from beamline.core.recon_events import LawMeasured, ReconDone
+from beamline.core.recon_events import ALL_SHOWN, LawMeasured, ReconDone
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import describe
 from beamline.scan.live_plan import LivePlan, live_plan
@@ -36,6 +36,7 @@ _SILENCE = 300.0  # real s without output after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
 _AGAIN = 2  # how often it is started again
+_SHOWN_WITHIN = 10.0  # real s after the scan
 _POLL = 0.1  # real s between two checks of its readiness
 _SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
@@ -50,7 +51,9 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
         earlier: files of the same scan, whose projections come first.
     """
     plan = plan or LivePlan()
-    options = {**_common(config), "--seconds": config.recon.seconds}
+    options = _common(config)
+    if config.recon.reference is None:
+        options["--seconds"] = config.recon.seconds
     if plan.binning > 1:
         options["--bin"] = plan.binning
     if plan.every > 1:
@@ -69,35 +72,45 @@ class Commands:
     """The commands that reconstruct a scan: while it runs, or when it is complete; neither: no reconstruction.
 
     Attributes:
+        live: while the scan runs; it makes the volume, unless it only `draws` pictures and ends with the scan.
         remark: a remark for the operator; "" if there is none.
     """
 
     live: LiveCommand | None = None
     afterwards: LiveCommand | None = None
     remark: str = ""
+    draws: bool = False
 
 
 def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     """The commands for the configuration of a scan, or of a resumed run."""
-    method = config.recon.method
+    method, draws = config.recon.chosen_method, config.recon.reference is not None
     if not config.recon.live:
         return Commands()
+    if draws and (series is None or series.end_references is None):
+        how = Commands(_followed(config, series), finished_command(config), draws=True)
+        return replace(how, remark="Pictures are drawn during the scan; the volume is made after it.")
     if not streams(method):
         remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
         remark = "No live volume is made, because only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
+    return Commands(live=_followed(config, series))
+
+
+def _followed(config: Config, series: ResumableRun | None) -> LiveCommand:
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
-    return Commands(live=follow_command(config, plan, series.parts if series else ()))
+    return follow_command(config, plan, series.parts if series else ())
 
 
 def _common(config: Config) -> dict[str, object]:
     recon, axis = config.recon, config.recon.axis
     if axis == "auto" and config.optics.axis_col is not None:
         axis = config.optics.axis_col
-    return {"--method": recon.method, "--axis": axis, "--seed": recon.seed}
+    of_reference = {} if recon.reference is None else {"--reference": recon.reference}
+    return {"--method": recon.chosen_method, "--axis": axis, "--seed": recon.seed, **of_reference}
 
 
 def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:
@@ -173,12 +186,12 @@ class LiveReconstruction:
         self._silence, self.ended = silence, False
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
-        self._ready = threading.Event()
+        self._ready, self._shown = threading.Event(), threading.Event()
         self._process: ChildProcess | None = None
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
         self._changing = threading.Lock()  # protects the process and the wish for another one
         with self._changing:
-            self._start("x")
+            self._start("a" if self._log.exists() else "x")
 
     def _start(self, mode: Literal["a", "x"]) -> None:
         try:
@@ -236,6 +249,13 @@ class LiveReconstruction:
             self._sink(Warned(message, source="recon"))
         return self._done
 
+    def wait_shown(self, stop: Callable[[], bool]) -> None:
+        """Wait until its picture shows all projections or it has ended, at most 10 s; `stop` ends the wait."""
+        deadline = time.monotonic() + _SHOWN_WITHIN
+        while self._process is not None and self._process.running and not stop() and time.monotonic() < deadline:
+            if self._shown.wait(_POLL):
+                return
+
     def close(self) -> None:
         """Terminate it if it is still running."""
         with self._changing:
@@ -279,6 +299,8 @@ class LiveReconstruction:
         match event:
             case StateEntered(state="ready"):
                 self._ready.set()
+            case StateEntered(state=state) if state == ALL_SHOWN:
+                self._shown.set()
             case LawMeasured():
                 self._on_law(event)
             case Done():

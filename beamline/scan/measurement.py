@@ -33,7 +33,7 @@ from beamline.scan.live_process import LiveReconstruction, abort_watch, live_sho
 from beamline.scan.moves import SAFE, UNSAFE, WRITTEN
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.recorder import Recorder
-from beamline.scan.references import REFERENCES, ReferenceReport
+from beamline.scan.references import REFERENCES, ReferenceReport, recorded_in
 from beamline.scan.resume import ResumableRun
 from beamline.scan.supervision import PAUSE_POLL, BeamLog, Supervision, beam_log
 from beamline.simulate import LabelLog, labels_path, write_labels
@@ -64,6 +64,9 @@ class FrameSource(Protocol):
         """The frames in the order of the file. Raises LedgerError after the last one if some are missing."""
 
 
+Turn = Callable[["Measurement", Callable[[], bool]], None]
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """The frames of a scan on connected devices, from the first one to the closed file.
@@ -74,6 +77,8 @@ class Measurement:
         source_of: makes the object that delivers the frames if another program controls the scan; None: this program
             does, with the devices.
         child: starts the live reconstruction.
+        turn: returns when the scan may begin; `poll` waits a moment, and returns whether Enter was pressed.
+        first_state: the scan with the darks and flats of this scan; None: it takes its own.
     """
 
     config: Config
@@ -87,6 +92,8 @@ class Measurement:
     source_of: Callable[[Measurement], FrameSource] | None = None
     child: Callable[..., ChildProcess] = ChildProcess
     pause: PauseRequest = field(default_factory=PauseRequest)
+    turn: Turn = lambda measurement, poll: None
+    first_state: Path | None = None
 
     @cached_property
     def states(self) -> StateMachine:
@@ -123,12 +130,13 @@ class Measurement:
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
         )
 
-    def take(self, command: Sequence[str] | None, release: Callable[[], None]) -> RunResult:
+    def take(self, command: Sequence[str] | None, release: Callable[[], None], *, draws: bool = False) -> RunResult:
         """Take the scan, and close its file.
 
         Args:
             command: the command of the live reconstruction.
             release: called when the instrument is free for another scan.
+            draws: the live reconstruction only draws pictures, and ends with the scan.
         """
         storage, shape = self.config.storage, self.ready.timing.shape
         if sentence := prepare_memory(self.instrument.frame_memory, self.ready.timeline, shape):
@@ -147,10 +155,10 @@ class Measurement:
                 log, on_law = self.folder / RECON_LOG, self.decider.add_law
                 follower = LiveReconstruction(command, log, self.sink, on_law, child=self.child)
                 ending.callback(follower.close)
-            return self._acquire_and_follow(writer, follower, release)
+            return self._acquire_and_follow(writer, follower, release, draws)
 
     def _acquire_and_follow(
-        self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
+        self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None], draws: bool
     ) -> RunResult:
         recorder = self._recorder(writer)
         beam = beam_log(self.config.devices.beam_monitor, self.instrument.beam_monitor, self.sink, self.pause)
@@ -201,7 +209,9 @@ class Measurement:
             sample=self.config.sample.name,
         )
         self.sink(ScanDone(result))
-        if follower is not None:
+        if follower is not None and draws:
+            follower.wait_shown(lambda: self.stop.aborting or not closed)
+        elif follower is not None:
             useless = not closed or isinstance(ended.error, ReferencesError)
             aborting = abort_watch(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))
             recon = follower.finish(live_should_end(self.stop, useless), aborting)
@@ -259,6 +269,8 @@ class Measurement:
                 next_pass=None if self.config.scan.decide == "off" else decider,
                 pass_ended=recorder.end_pass,
                 n_retakable=lambda missing: len(self._to_retake(recorder, missing)[0]),
+                turn=lambda: self.turn(self, lambda: wait_in_pause(recorder)),
+                recorded=lambda block: () if self.first_state is None else recorded_in(self.first_state, block),
             ),
         )  # fmt: skip
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamline.config.beam import NoBeamMonitor
-from beamline.config.load import Config, at_energies, camera_settings, plan_of, quantities, resolved_yaml
+from beamline.config.load import Config, camera_settings, each_scan, plan_of, quantities, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.events import json_of
@@ -56,15 +56,24 @@ class EnergyNeeds(NamedTuple):
     total_bytes: int
 
 
+class StateNeeds(NamedTuple):
+    """Time (s) and disk space (bytes) of the scan of one state, by its number."""
+
+    state: int
+    duration: float
+    total_bytes: int
+
+
 @dataclass(frozen=True, eq=False)
 class DryRun:
     """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
-    For a series of energies it is the first scan; `energies` lists the needs of each scan.
+    For a series it is the first scan; `energies` or `states` lists the needs of each scan.
 
     Attributes:
         disk: an existing folder on the disk of the file.
-        needs: of all scans.
+        needs: of all scans, with the time between states.
+        every: s from the begin of one state to the next; None: another program says when.
     """
 
     plan: ScanPlan
@@ -75,6 +84,8 @@ class DryRun:
     needs: ScanNeeds
     disk: Path
     energies: tuple[EnergyNeeds, ...] = ()
+    states: tuple[StateNeeds, ...] = ()
+    every: float | None = None
 
     def lines(self) -> list[str]:
         """Lines of text, without violations: `refuse_violations` states them."""
@@ -87,9 +98,21 @@ class DryRun:
                 "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
+        if self.states:
+            lines.append(f"{'states':<10}{self._states_in_words()}")
         if needs.dose_gy is not None:
             lines.append(f"{'dose':<10}{needs.dose_gy:.4g} Gy")
         return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
+
+    def _states_in_words(self) -> str:
+        longest, every = max(one.duration for one in self.states), self.every
+        when = "each when `beamline resume` is sent" if every is None else f"one every {hms_text(every)}"
+        late = every is not None and longest > every
+        more = f"; a state takes {hms_text(longest)}, so the next one begins later than planned" if late else ""
+        return (
+            f"{len(self.states)}, one scan like this of each, {when}: {hms_text(self.needs.duration)} and "
+            f"{size(self.needs.total_bytes)} in total{more}"
+        )
 
     def data(self) -> Mapping[str, Any]:
         """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
@@ -109,6 +132,7 @@ class DryRun:
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
             "energies": [need._asdict() for need in self.energies],
+            "states": [need._asdict() for need in self.states],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
@@ -166,7 +190,7 @@ def dry_run(
     Args:
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) of a series whose scans are already complete; never all of them.
+        whole: energies (keV) or numbers of states of a series whose scans are already complete; never all of them.
         locks: function that states what is wrong with the file locks of a folder, such as `no_locks`, which writes
             there.
 
@@ -174,8 +198,8 @@ def dry_run(
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
             timeline's violations.
     """
-    each = [one for one in at_energies(settings) if one.scan.energy not in whole]
-    if len(each) > 1:  # a scene is read at both ends of the energy range
+    each = [one for one in each_scan(settings) if (one.scan.state or one.scan.energy) not in whole]
+    if settings.scan.energies is not None and len(each) > 1:  # a scene is read at both ends of the energy range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
     there = disk_of(runs or Path(settings.storage.folder))
@@ -186,15 +210,21 @@ def dry_run(
         DryRun(plan, timeline, stage, camera, free, _needs(one, timeline), there)
         for one, plan, timeline in zip(each, plans, timelines, strict=True)
     ]
-    worked_plan = worked[0] if settings.scan.energies is None else _of_energies(worked)
+    worked_plan = _of_series(settings, each, worked) if settings.series else worked[0]
     return replace(worked_plan, timeline=_lockable(worked_plan.timeline, locks(there)))
 
 
+def _copied(config: Config) -> frozenset[str]:
+    """The names of the kinds of frames that are copied."""
+    return frozenset({FrameKind.DARK.name, FrameKind.FLAT.name} if config.copies_references else ())
+
+
 def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
-    """The needs of a scan at one energy."""
+    """The needs of one scan. Darks and flats that are copied from the first state take no time."""
     rate = config.optics.dose_rate_gy_s
+    copied = _copied(config)
     return ScanNeeds(
-        timeline.parts,
+        {part: seconds for part, seconds in timeline.parts.items() if part.upper() not in copied},
         timeline.n_frames,
         timeline.total_bytes,
         dose_gy=None if rate is None else rate * timeline.in_beam,
@@ -205,8 +235,8 @@ def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
 
 def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
     """What the scan will ask the operator to do."""
-    by_hand = config.devices.by_hand
-    kinds = [block.kind for block in timeline.blocks if block.n_to_take]
+    by_hand, copied = config.devices.by_hand, _copied(config)
+    kinds = [block.kind for block in timeline.blocks if block.n_to_take and block.kind.name not in copied]
     opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
     moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
     for device, states, request in (
@@ -222,14 +252,25 @@ def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
         yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
 
 
-def _of_energies(each: Sequence[DryRun]) -> DryRun:
-    """The first of several scans, with the violations of all of them."""
-    needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
-    total = replace(each[0], energies=tuple(needs), needs=all_needs(one.needs for one in each))
+def _of_series(settings: Config, configs: Sequence[Config], each: Sequence[DryRun]) -> DryRun:
+    """The first of several scans, with the needs and the violations of all of them."""
+    states, all_of_them = settings.scan.states, [one.needs for one in each]
+    total = replace(each[0], needs=all_needs(all_of_them))
+    if states is None:
+        sizes = ((one.timeline.duration, one.timeline.total_bytes) for one in each)
+        needs = [EnergyNeeds(one.scan.energy or 0.0, *of) for one, of in zip(configs, sizes, strict=True)]
+        total = replace(total, energies=tuple(needs))
+    else:
+        numbers = [config.scan.state or 0 for config in configs]
+        of_states = [StateNeeds(n, one.duration, one.total_bytes) for n, one in zip(numbers, all_of_them, strict=True)]
+        breaks = sum(max((states.every_s or 0.0) - one.duration, 0.0) for one in all_of_them[:-1])
+        parts = {**total.needs.parts, "wait": breaks}
+        total = replace(total, states=tuple(of_states), every=states.every_s, needs=replace(total.needs, parts=parts))
+    what = "energies" if states is None else "states"
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
     if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"free some space, choose another storage.folder, or set fewer energies: {len(each)} energies "
+            f"free some space, choose another storage.folder, or set fewer {what}: {len(each)} {what} "
             f"need {size(total.needs.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
@@ -244,7 +285,7 @@ def _worked(
     free: int,
 ) -> Timeline:
     """The timeline, with a remark on the live volume."""
-    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.method
+    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.chosen_method
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or not streams(method):
         return worked

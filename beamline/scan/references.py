@@ -2,17 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
+from beamline.config.load import Config
 from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
+from beamline.core.files import SCAN
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest, check_block
 from beamline.monitor.evidence import Evidence, FrameStatistics, photons
 from beamline.monitor.references import ReferenceLimits, reference_findings
 from beamline.plan.plan import Block
+from beamline.scan.tally import BlockTally
+from beamline.storage.interrupted import scan_file
+from beamline.storage.readers.open import open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
+
+
+def first_state(config: Config, series: Path) -> Path | None:
+    """The scan of the first state in the folder of a series, whose darks and flats this scan copies; None: it takes its
+    own."""
+    if not config.copies_references:
+        return None
+    runs = [run for end in ("", "-*") for run in series.glob(f"*_state1{end}/") if (run / SCAN).is_file()]
+    return scan_file(max(runs)) if runs else None
+
+
+def recorded_in(scan: Path, block: Block) -> Sequence[Frame]:
+    """Darks or flats of another scan for a block; empty if it does not have enough of them, or the block is of another
+    kind."""
+    if block.kind not in REFERENCES:
+        return ()
+    with open_scan(scan) as source:
+        rows = source.table.of_kind(block.kind)[: block.n]
+        return [source.table.frame(row, source.read([row])[0]) for row in rows.tolist()] if rows.size == block.n else ()
+
+
+def copied(taken: BlockTally, frames: Sequence[Frame], first: int) -> Iterator[Frame]:
+    """The frames of another scan as those of a block, numbered from row `first`; `taken` counts them."""
+    for trigger, frame in enumerate(frames):
+        taken.frames += 1
+        taken.rows[trigger] = first + trigger, frame.time
+        yield replace(frame, index=first + trigger, trigger=trigger)
+
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
 VIEWS = 4  # projections that are enough for a median

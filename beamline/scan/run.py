@@ -30,9 +30,10 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.live_plan import live_plan
-from beamline.scan.live_process import LiveCommand, Standby, follow_command, reconstruct
-from beamline.scan.measurement import FrameSource, Measurement
+from beamline.scan.live_process import Commands, LiveCommand, Standby, follow_command, reconstruct
+from beamline.scan.measurement import FrameSource, Measurement, Turn
 from beamline.scan.preflight import ReadyScan, all_of, preflight
+from beamline.scan.references import first_state
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
 from beamline.scan.watchdog import watched
@@ -49,10 +50,10 @@ def run_scan(
     sinks: Sequence[Sink] = (),
     stop: StopRequest | None = None,
     *,
-    live: LiveCommand | None = None,
+    live: LiveCommand | Commands | None = None,
     instrument: ConnectedDevices | None = None,
     ask: Ask | None = None,
-    afterwards: LiveCommand | None = None,
+    turn: Turn | None = None,
 ) -> RunResult:
     """Run the scan that `config` describes.
 
@@ -61,8 +62,8 @@ def run_scan(
             its own configuration.
         sinks: in addition to events.jsonl and user.log in the run's folder.
         stop: ends the scan from another thread or a signal handler.
-        live: gives the command line of a live reconstruction; None: there is none.
-        afterwards: gives the command line of a reconstruction of the complete scan; a scan that ends early has none.
+        live: gives the command line of a live reconstruction, or the commands for the scan; None: there is none.
+        turn: see `Measurement`; None: the scan begins at once.
         instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
         ask: asks the operator, if the shutter or the sample is moved by hand.
 
@@ -74,9 +75,10 @@ def run_scan(
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases the frames taken so far are
             in the file; the event `scan_done` says how many, and `failed` why.
     """
-    if config.scan.energies is not None:
+    if config.series:
+        one, several = ("energy", "energies") if config.scan.states is None else ("state", "states")
         raise ConfigError(
-            "set scan.energy instead of scan.energies, which lists several scans: this call runs one "
+            f"set scan.{one} instead of scan.{several}, which lists several scans: this call runs one "
             "scan. Nothing was started."
         )
     began = time.monotonic()
@@ -97,11 +99,14 @@ def run_scan(
             sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
             if series is not None:
                 series.lock.release()  # from here on the lock of the part keeps other processes away
-            measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series)
+            first = first_state(config, series.run.parent if series else place)
+            measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series, first_state=first)
+            measurement = measurement if turn is None else replace(measurement, turn=turn)
             stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
             guarded = stack.enter_context(_watched(measurement))  # until the instrument is free for another scan
             guarded.callback(connected.close)
-            return _to_its_end(measurement, live, afterwards, guarded.close)
+            how = live if isinstance(live, Commands) else Commands(live=live)
+            return _to_its_end(measurement, how, guarded.close)
 
 
 def _watched(measurement: Measurement) -> ExitStack:
@@ -146,7 +151,8 @@ def record_scan(
         measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of, child=child)
         stack.enter_context(verbs_taken(folder, stop, measurement.pause))
         views = live_plan(ready.timing.shape, ready.plan.angles.size, free_memory())
-        return _to_its_end(measurement, follow_command(config, views) if live else None, None, lambda: None)
+        how = Commands(live=follow_command(config, views) if live else None)
+        return _to_its_end(measurement, how, lambda: None)
 
 
 def _announcing(
@@ -183,7 +189,8 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
 
 def _named(config: Config) -> str:
     """The end of a run folder's name."""
-    return config.sample.name + ("" if config.scan.energy is None else f"_{config.scan.energy:.7g}keV")
+    number = "" if config.scan.state is None else f"_state{config.scan.state}"
+    return config.sample.name + number + ("" if config.scan.energy is None else f"_{config.scan.energy:.7g}keV")
 
 
 def _refuse_stop(stop: StopRequest) -> None:
@@ -192,23 +199,21 @@ def _refuse_stop(stop: StopRequest) -> None:
         raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
 
-def _to_its_end(
-    measurement: Measurement, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]
-) -> RunResult:
+def _to_its_end(measurement: Measurement, how: Commands, release: Callable[[], None]) -> RunResult:
     """Run the whole scan, and end it by the event `done` or `failed`."""
     states, series, folder, sink = measurement.states, measurement.series, measurement.folder, measurement.sink
     volume, timeline = (series.run if series else folder) / RECON, measurement.ready.timeline  # of all parts
     try:
         states.enter(State.PREPARING, "Preparing" if series is None else series.in_words)
-        command = None if live is None else live(folder / SCAN, volume)
+        command = None if how.live is None else how.live(folder / SCAN, volume)
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         sink(RunStarted(folder, folder / SCAN, measurement.config.sample.name, *planned))
         if series is not None:
             _set_aside([volume, volume.with_name(REPORT)], folder.name, states, sink)
-        result = measurement.take(command, release)
-        if afterwards is not None:  # Ctrl-C ends only the reconstruction
+        result = measurement.take(command, release, draws=how.draws)
+        if how.afterwards is not None:  # Ctrl-C ends only the reconstruction
             began = time.monotonic()
-            words = afterwards(result.path, volume)
+            words = how.afterwards(result.path, volume)
             recon = reconstruct(words, folder / RECON_LOG, sink, measurement.stop)
             result = replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
     except BaseException as error:

@@ -16,7 +16,7 @@ from beamline.core.events import Event, FrameStored, NextChosen, ScanDone, Sink,
 from beamline.core.files import CONFIG, EVENTS, SCAN, STAMP, is_below, parts_of
 from beamline.core.text import one_line, size
 from beamline.plan.passes import ended_by
-from beamline.scan.control import State, running
+from beamline.scan.control import State, running, series_in
 from beamline.storage.interrupted import next_step
 from beamline.storage.run_record import DIED, FlagCounts, RecordFile, RunRecord, alive, read_record, write_record
 from beamline.storage.writer_lock import held
@@ -63,9 +63,8 @@ class Run:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """The folders of runs in a folder, newest first, including those of the energies of a series."""
-    within = [path for path in folder.glob("*/") if not is_below(path, EVENTS) and (path / CONFIG).is_file()]
-    runs = [run for place in (folder, *within) for run in place.glob("*/") if is_below(run, EVENTS)]
+    """The folders of runs in a folder, newest first, including those of a series."""
+    runs = [run for place in (folder, *series_in(folder)) for run in place.glob("*/") if is_below(run, EVENTS)]
     return sorted(runs, key=lambda run: (_began(run), _numbered(run)), reverse=True)
 
 

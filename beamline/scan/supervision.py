@@ -17,9 +17,10 @@ from beamline.core.events import BeamRead, Sink, Warned
 from beamline.core.stop import Cause, PauseRequest
 from beamline.core.text import count
 from beamline.plan.passes import Choice, Passes
-from beamline.plan.plan import Retake
+from beamline.plan.plan import Block, Retake
 from beamline.scan.control import State, StateMachine
 from drivers.base.errors import DeviceError
+from drivers.base.frame import Frame
 from drivers.base.protocols import BeamMonitor, BeamReading
 
 PAUSE_POLL = 0.05  # real s between checks of a paused scan
@@ -61,6 +62,10 @@ class Supervision:
     # n_retakable: called before `next_pass` with the triggers without a frame; how many projections `retakes` would
     # return
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
+    # turn: called before anything moves; returns when the scan may begin
+    turn: Callable[[], None] = lambda: None
+    # recorded: frames of a block of darks or flats that another scan has taken; empty: this scan takes its own
+    recorded: Callable[[Block], Sequence[Frame]] = lambda block: ()
 
 
 class BeamGuard:

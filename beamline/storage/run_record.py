@@ -16,7 +16,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from beamline.core.events import json_of
-from beamline.core.files import CONFIG, RECORD, SETTINGS, bytes_below
+from beamline.core.files import CONFIG, EVENTS, RECORD, SETTINGS, bytes_below, is_below
 from beamline.storage.writer_lock import WriterLock, held
 
 DIED = "died"  # State of a part whose process has ended without writing its last one
@@ -66,6 +66,11 @@ def read_record(part: Path) -> RunRecord | None:
         record = _RECORDS.validate_json(bytes_below(part, RECORD, SETTINGS), strict=True)
         return record if record.over or lives is not False else replace(record, state=DIED)
     return None
+
+
+def is_series_folder(folder: Path) -> bool:
+    """True if the folder has a configuration, but is not the folder of a run."""
+    return (folder / CONFIG).is_file() and not is_below(folder, EVENTS) and read_record(folder) is None
 
 
 def write_record(part: Path, record: RunRecord) -> None:

@@ -196,6 +196,21 @@ class Ending:
 
 
 @dataclass(frozen=True, eq=False)
+class Preview:
+    """What a method shows of a scan that still runs, see `Method.preview`.
+
+    Attributes:
+        volume: the sample so far, [z, y, x] in 1/mm.
+        moved: the reference that was moved to it.
+        left: norm of what the moved reference leaves of the projections, divided by their norm; 0: it explains all.
+    """
+
+    volume: Volume
+    moved: Volume
+    left: float
+
+
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
     """Result of a reconstruction: the volume and what the method reports about it.
 
@@ -346,6 +361,10 @@ class Method(Checked, ABC):
     @abstractmethod
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory of `run` in bytes, without the projections and (if `weighted`) without their weights."""
+
+    def preview(self, views: Views) -> Preview | None:
+        """What the method can show of a scan that still runs, from the projections so far; None: nothing."""
+        return None
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
         """[view] True for the projections it uses.

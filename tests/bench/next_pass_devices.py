@@ -120,7 +120,7 @@ def scanned(config: Config, folder: Path) -> Scanned:
 
     how = commands_of(config)
     with patch.object(Decider, "__call__", timed), suppress(ScanStopped):
-        run_scan(config, folder, [note], stop, live=how.live, afterwards=how.afterwards)
+        run_scan(config, folder, [note], stop, live=how)
     with open_scan(path) as source:
         return Scanned(source.decisions, len(source.table), tuple(waits), time.monotonic() - begin)
 

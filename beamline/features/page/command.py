@@ -219,6 +219,9 @@ def view(
     over each other and an FBP slice. You can change axis and tilt there, and copy them as options for `recon`. TIFFs
     count as a volume, unless their names, a file of angles or an option show that they are a scan.
 
+    A volume that was reconstructed with a reference (`recon --reference`) is shown below the moved reference, with
+    their difference: what changed.
+
     OTHER is shown below VOLUME at the same positions; the difference is shown if both have the same shape. For volumes
     above 512 MB, slices across y and x are binned, except those of an OME-Zarr (`beamline export` makes one). NAME is
     an array in a file with several arrays, for example FILE.h5::/entry/data. Only this computer can open the page. To
@@ -241,7 +244,7 @@ def view(
         return
     from beamline.features.page.app import viewer  # these load HDF5 and the server
     from beamline.features.page.serve import open_port, start
-    from beamline.page.volume import ShownVolume
+    from beamline.page.volume import ShownVolume, moved_reference
 
     with ExitStack() as opened:
         source = None if named[0][1] is not None else _scan(named[0][0], scan_facts)
@@ -256,6 +259,8 @@ def view(
             serve_shown(server, browse)
             return
         volumes = [opened.enter_context(closing(ShownVolume(path, dataset=name))) for path, name in named]
+        if other is None and named[0][1] is None and (before := moved_reference(named[0][0], opened)) is not None:
+            volumes.insert(0, opened.enter_context(closing(before)))
         server = start(lambda access: viewer(volumes, access), open_port(bind, port))
         serve_shown(server, browse)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 
 from beamline.cli.options import json_events
-from beamline.cli.scan import ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
+from beamline.cli.scan import ScanRequest, faults_of, rehearsed_lines, run_one, take_series
 from beamline.config.load import Config
 from beamline.core.errors import AlarmError, BeamlineError, ConfigError, ScanStopped, exit_code, user_message
 from beamline.core.events import Done, Event, Failed, RunStarted, Sink, StateEntered
@@ -37,7 +37,7 @@ class QueueStatus(StrEnum):
 
 
 Taken = tuple[Path, Sequence[str]]
-"""A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
+"""A finished scan, or series of scans: its path, and the faults of its frames, a sentence each."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def take_all(request: ScanRequest) -> None:
     """Plan the scans of a queue, then run them, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
         plan = plan_queue(
-            request.files, request.overrides, place=request.output, rehearse=request.rehearse,
+            request.files, request.settings, place=request.output, rehearse=request.rehearse,
             no_live=request.unless_live,
         )  # fmt: skip
         for scan in plan.scans:
@@ -177,8 +177,8 @@ def _take_next(
         ask_operator(f"Scan {n + 1} of {of}: put the sample {config.sample.name} in place.")
     click.echo(f"Scan {n + 1} of {of}: {config.sample.name}", err=True)
     sinks: list[Sink] = [json_sink, run]
-    if config.scan.energies is not None:
-        done = take_energies(config, request, sinks, stop)
+    if config.series:
+        done = take_series(config, request, sinks, stop)
         return done.folder, [fault for result in done.results for fault in faults_of(result)]
     with ExitStack() as held:
         result = run_one(config, None, request, sinks, held, stop)

@@ -113,7 +113,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: boo
     import recon
     from beamline.api import Selection
     from beamline.core.quantities import VoxelKind
-    from beamline.scan.energies import scans_of
+    from beamline.scan.series import scans_of
     from beamline.storage.volumes.base import bare_record
     from beamline.storage.volumes.files import write_volume
 

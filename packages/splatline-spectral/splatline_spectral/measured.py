@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
-from beamline.scan.energies import scans_of
+from beamline.scan.series import scans_of
 from beamline.storage.hdf5 import open_hdf5, readable
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan

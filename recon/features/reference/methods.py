@@ -12,12 +12,14 @@ from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions, Prior
 from recon.base.geometry import Geometry
-from recon.base.method import Method, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import Method, Preview, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.features.reference.choice import ReferenceVerdict, asked, not_moved, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import require_finite
+from recon.features.reference.preview import preview_of
 from recon.voxels.choice import TrialChoice
 from recon.voxels.iterative import solve_views, watched
 from recon.voxels.projector import Projector, volume_slices
@@ -82,11 +84,11 @@ class FromReference(Method):
         return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
     def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
-        if self.reference is None:
-            return ReferenceVerdict(False, "none was given")
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
             return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
+        if self.reference is None:
+            return ReferenceVerdict(False, "none was given")
         return asked(trial, choice, self.reference)
 
     def _from_reference(self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -113,6 +115,10 @@ class FromReference(Method):
             volume, settings, tuple(history), method=self.name, chosen=f"The reference was used: {verdict.because}",
             change=Volume(volume.data - state.moved, volume.grid), displacement=state.displacement,
         )  # fmt: skip
+
+    def preview(self, views: Views) -> Preview | None:
+        """The moved reference plus FBP of what it leaves, on the voxels of these projections, see `preview_of`."""
+        return None if self.reference is None else preview_of(self.reference, views)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """As for `otherwise`."""

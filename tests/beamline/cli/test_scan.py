@@ -342,10 +342,8 @@ class ByHand(ManualShutter):
 def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def run_scan(
-        config: object, runs: object, sinks: object, stop: object, *, ask: Any, live: Any = None, afterwards: Any = None
-    ) -> Any:
-        command = live or afterwards
+    def run_scan(config: object, runs: object, sinks: object, stop: object, *, ask: Any, live: Any) -> Any:
+        command = live.live or live.afterwards
         asked.append(command and list(command(Path("scan.h5"), Path("recon.h5"))))
         raise KeyboardInterrupt
 

@@ -23,7 +23,7 @@ class Drawn:
 
     headings: list[str] = field(default_factory=list)
 
-    def write_slices(self, slices: object, n_views: int, heading: str, unseen: object) -> None:
+    def write_slices(self, slices: object, n_views: int, heading: str, unseen: object, *below: object) -> None:
         self.headings.append(heading)
 
 

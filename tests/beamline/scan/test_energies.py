@@ -124,7 +124,7 @@ def test_a_series_that_was_stopped_goes_on(
             assert (kinds == FrameKind.PROJECTION).sum() == VIEWS
     assert all(digests(series)[name] == before[name] for name in whole)
     with monkeypatch.context() as without:
-        without.setattr("beamline.scan.energies.connect", None)  # nothing is missing: no device is connected
+        without.setattr("beamline.scan.series.connect", None)  # nothing is missing: no device is connected
         assert beamline("scan", "--resume", series, "--json").exit_code == 0
     other = beamline("scan", config, "--set", "scan.energies=[8.3, 8.4]", "--resume", series)
     assert other.exit_code == 2 and "`- 8.32` instead of `- 8.3`" in other.stderr.replace("\n", " ")

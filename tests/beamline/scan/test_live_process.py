@@ -20,7 +20,7 @@ from beamline.plan.passes import Choice
 from beamline.scan import live_process
 from beamline.scan import measurement as module
 from beamline.scan.live_plan import LivePlan
-from beamline.scan.live_process import LiveReconstruction, Standby, follow_command
+from beamline.scan.live_process import Commands, LiveReconstruction, Standby, follow_command
 from beamline.scan.run import run_scan
 from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument
@@ -353,7 +353,12 @@ with h5py.File(sys.argv[1]) as file:
 
     def scan() -> RunResult:
         return run_scan(
-            small(), tmp_path, [events.append], stop, instrument=instrument.connected(), afterwards=script(checks)
+            small(),
+            tmp_path,
+            [events.append],
+            stop,
+            instrument=instrument.connected(),
+            live=Commands(afterwards=script(checks)),
         )
 
     if stopped:

@@ -92,8 +92,8 @@ def test_values_that_do_not_go_together_and_limits_are_found_at_once(tmp_path: P
     changed = {"config": tmp_path / "a.yaml", "scan.period_s": 0.001}
     one, other = plan_queue([tmp_path / "a.yaml", changed], place=tmp_path).scans
     energy, axis = faults(one)
-    assert "a.yaml:89: optics.energy_kev = 25000 keV is outside" in energy
-    assert "a.yaml:91: optics.axis_col 9000 is outside the columns of the frame" in axis
+    assert "a.yaml:91: optics.energy_kev = 25000 keV is outside" in energy
+    assert "a.yaml:93: optics.axis_col 9000 is outside the columns of the frame" in axis
     assert faults(other)[0] == energy and faults(other)[-1] == axis
     assert "--set scan.period_s=0.001: scan.period_s 0.001 is below the camera's minimum" in "\n".join(faults(other))
     assert one.warnings == () or "energy" in one.warnings[0]

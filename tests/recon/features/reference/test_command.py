@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,16 +16,21 @@ import pytest
 from beamline.cli.recon import recon as command
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Sink
+from beamline.page.tiles import TileRegion
+from beamline.page.volume import moved_reference
 from beamline.projections.selection import Selection
+from beamline.reconstruct import live_reference
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.reference import with_reference
+from beamline.report.live_picture import PictureRow, reference_row
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
+from recon.base.method import Preview
 from recon.features.reference.methods import FromReference
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
-from tests.recon.features.reference.scene import Discs, N, packed, scanned
+from tests.recon.features.reference.scene import LEVEL, Discs, N, packed, scanned
 
 QUICK = "--axis", str((N - 1) / 2), "--quality", "preview"
 AFTER = replace(packed(), turn=np.radians(0.8), shift=(1.5, -1.0), slit=4)
@@ -67,7 +74,21 @@ def test_the_result_says_that_the_reference_was_used_and_shows_the_change(folder
         assert missing > 0.3, "the slit is in the change"
         shifts = [data[f"displacement_{axis}"] for axis in "zyx"]
         assert all(each.shape == record.grid.shape and each.attrs["units"] == record.length_unit for each in shifts)
-    assert "Change since the reference" in out.with_suffix(".html").read_text()
+    page = out.with_suffix(".html").read_text()
+    assert "Change since the reference" in page and "divided by its standard error" in page
+    median = float(re.findall(r"displaced by ([0-9.]+) voxels", page)[0])
+    assert abs(median - np.hypot(*AFTER.shift)) < 0.5
+
+
+def test_the_viewer_shows_the_moved_reference_above_the_state(folder: Path) -> None:
+    with ExitStack() as opened:
+        before = moved_reference(folder / "out.h5", opened)
+        assert before is not None and before.facts()["name"] == "out.h5::moved reference"
+        with h5py.File(folder / "out.h5") as file, closing(before):
+            expected = file["entry/data/data"][1] - file["entry/data/change"][1]
+            tile = before.cut(0, 1, TileRegion(0, N, 0, N))
+            np.testing.assert_allclose(tile.values, expected)
+        assert moved_reference(folder / "good_volume.h5", opened) is None
 
 
 def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
@@ -86,12 +107,36 @@ def test_a_scan_as_the_reference_is_reconstructed_once(folder: Path) -> None:
     assert not (folder / "x.h5").exists()
 
 
+def test_the_picture_of_a_followed_scan_shows_the_moved_reference_and_the_slit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = list[Preview]()
+
+    def row(shown: Preview, n_views: int, unit: str) -> PictureRow:
+        assert n_views == 24
+        drawn.append(shown)
+        return reference_row(shown, n_views, unit)
+
+    monkeypatch.setattr(live_reference, "reference_row", row)
+    out = tmp_path / "out.h5"
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(folder / "good_volume.h5"), *QUICK[:2], "--follow",
+                    "-o", str(out))  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert out.exists() and out.with_name("out.live.png").exists()
+    (shown,) = drawn
+    gap = (replace(AFTER, slit=-1).volume - AFTER.volume)[0]
+    change = (shown.volume.data - shown.moved.data)[len(shown.moved.data) // 2]
+    slit = -float((change * gap).sum() / np.square(gap).sum()) * LEVEL / np.percentile(shown.moved.data, 99)
+    assert slit > 0.4, "the slit is in FBP of the rest"
+    assert abs(change[gap == 0]).mean() < 0.1 * abs(change[gap > 0.5 * gap.max()]).mean()
+
+
 @pytest.mark.parametrize(
     ("options", "error"),
     [
         (("--reference", "none.h5"), "none.h5 does not exist"),
         (("--reference", "good_volume.h5", "-m", "fbp"), "--reference works only with from-reference"),
-        (("--reference", "good_volume.h5", "--follow"), "it needs a finished scan"),
+        (("-m", "from-reference"), "--method from-reference needs --reference GOOD"),
         (("--reference", "good_volume.h5", "--uncertainty"), "error bars are not calibrated for it"),
     ],
 )
@@ -110,6 +155,14 @@ def test_a_reference_with_a_voxel_that_is_not_finite_is_refused(folder: Path) ->
     done = beamline("recon", str(folder / "state.h5"), "--reference", str(spoilt), *QUICK, "-o", str(folder / "y.h5"))
     assert done.exit_code != 0 and "1 of 16384 voxels of the reference are not finite" in done.output
     assert not (folder / "y.h5").exists()
+
+
+def test_a_scan_is_not_reconstructed_in_vain_for_too_few_projections(folder: Path, tmp_path: Path) -> None:
+    done = beamline("recon", str(folder / "state.h5"), "--reference", str(folder / "good.h5"), *QUICK, "--views",
+                    "every:2", "--no-report", "-o", str(tmp_path / "few.h5"))  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "The reference was not used: whether it helps cannot be tested" in " ".join(done.output.split())
+    assert not (tmp_path / "good_reference.h5").exists()
 
 
 def test_an_output_with_the_name_of_the_volume_of_the_reference_is_refused_at_once(folder: Path) -> None:

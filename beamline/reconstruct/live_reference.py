@@ -1,0 +1,85 @@
+"""Pictures of a state while it is scanned: FBP of its projections, and the moved reference with FBP of the rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.core.events import Sink
+from beamline.core.sinks import Warnings
+from beamline.projections.correction import apply, survey
+from beamline.projections.views import select
+from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.snapshots import FEWEST, LiveSlices, Snapshots
+from beamline.report.live_picture import PictureRow, reference_row
+from beamline.storage.readers.base import ScanSource
+from drivers.base.clock import Clock
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.method import Preview
+from recon.base.view_data import Views
+from recon.base.views import spread
+
+_SIDE, _ROWS = 256, 8  # columns and rows of the picture at most; rows as wide as binned columns
+_MOST_VIEWS = 180  # projections that are corrected for a picture
+
+
+class ReferencePictures:
+    """Draws a scan that is followed until its end, for a method that needs all of its projections.
+
+    Attributes:
+        snapshots: has the path of the picture.
+    """
+
+    def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
+        self._views, self._warn = FollowedViews(select(source, options.selection)), warn
+        self.snapshots = Snapshots(options, source, sink, clock, warn)
+        self._slices = LiveSlices(
+            self._views, self.snapshots, clock, row_of(options.method.preview, self.snapshots.unit)
+        )
+        self._search, stated = AxisSearch(), options.selection.axis_col
+        self._axis = source.axis_col if stated is None else stated
+
+    def draw(self, pause: float | None) -> None:
+        """Draw the projections so far, if there are new ones, and `pause` s and the time of the last drawing have
+        passed. None: the scan has ended, draw now."""
+        views = self._views.chosen(self._views.usable().frames)
+        if views.size < FEWEST or not self._slices.due(views, pause):
+            return
+        with suppress(DataError):  # for example, flats are still to come; the scan and the reconstruction continue
+            plan = survey(self._views.scan.renewed())
+            if self._axis is None or self._search.estimate is not None:
+                self._search, self._axis = self._search.look(
+                    self._views, plan, views, self._axis, pause is None, self._warn
+                )
+            lines = apply(plan, spread(views, _MOST_VIEWS))
+            self._slices.draw([lines], self._axis, pause, views.size)
+
+
+def row_of(
+    preview: Callable[[Views], Preview | None], unit: str
+) -> Callable[[Sequence[F32], Geometry], PictureRow | None]:
+    """A function that gives the row of a picture with the preview of projections; None: there is no preview."""
+
+    def row(views: Sequence[F32], geometry: Geometry) -> PictureRow | None:
+        shown = preview(middle_of(views, geometry))
+        return None if shown is None else reference_row(shown, len(views), unit)
+
+    return row
+
+
+def middle_of(views: Sequence[F32], geometry: Geometry) -> Views:
+    """The middle rows of projections, binned to at most 256 columns."""
+    rows, cols = geometry.detector_shape
+    factor = min(math.ceil(cols / _SIDE), rows)
+    some = min(rows, _ROWS * factor)
+    first = (rows - some) // 2
+    part = geometry.rows(first, first + some).binned(factor)
+    n, m = part.detector_shape
+    data = np.stack([np.asarray(view[first : first + n * factor, : m * factor], np.float32) for view in views])
+    return Views(data.reshape(len(data), n, factor, m, factor).mean((2, 4)), part)

@@ -1,0 +1,275 @@
+"""Series: scans of one sample, one at each energy or of each state, in one folder; the series can be continued later.
+
+Each scan has an ordinary run folder within the folder of the series, so that every program that reads runs can read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from beamline.config.load import Config, changed, each_scan, load, override_of, resolved_yaml
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
+from beamline.core.files import CONFIG, RECON, RECON_LOG, SCAN, create_run_folder, run_of, write_whole
+from beamline.core.run_result import RunResult
+from beamline.core.sinks import Warn, fan_out
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import clock_after, connect
+from beamline.scan.control import State
+from beamline.scan.exposures import SLICE
+from beamline.scan.live_process import Commands, reconstruct
+from beamline.scan.measurement import Measurement
+from beamline.scan.preflight import dry_run, refuse_violations
+from beamline.scan.resume import (
+    NoFrame,
+    NothingMissing,
+    NotJoined,
+    ResumableRun,
+    open_for_resume,
+    recover_run,
+)
+from beamline.scan.run import run_scan
+from beamline.scan.runs import describe
+from beamline.storage.interrupted import scan_file
+from drivers.base.clock import SystemClock
+from drivers.in_beam import Ask
+
+CommandsOf = Callable[[Config, ResumableRun | None], Commands]
+
+
+@dataclass(frozen=True)
+class SeriesRun:
+    """A finished series.
+
+    Attributes:
+        folder: of the series.
+        scans: keV of each energy, or number of each state, and its scan file.
+        results: of the scans that were taken now.
+    """
+
+    folder: Path
+    scans: tuple[tuple[float, Path], ...]
+    results: tuple[RunResult, ...]
+
+
+def is_series(folder: Path) -> bool:
+    """True if a folder contains a series of scans."""
+    if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
+        return False
+    return bool(load(folder / CONFIG, environment={}).series)
+
+
+def scans_in(folder: Path, warn: Warn) -> list[Path]:
+    """The scan file of each energy or state of a series that has one, in the order of the configuration.
+
+    Args:
+        warn: function that gets a sentence on scans that are incomplete or do not exist.
+
+    Raises:
+        DataError: there is no scan.
+    """
+    config = load(folder / CONFIG, environment={})
+    runs = _runs(folder, config)
+    files = [scan_file(run) for run in runs if run is not None]
+    whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
+    if files and len(whole) < len(runs):
+        warn(
+            f"{folder}: {len(whole)} of {len(runs)} {_kind(config)} have a complete scan; {len(files)} with frames are "
+            f"used. `beamline scan --resume {folder}` takes the missing scans."
+        )
+    if not files:
+        raise DataError(
+            f"{folder} has no scan yet: `beamline scan --resume {folder}` takes the scans. Nothing was written."
+        )
+    return files
+
+
+def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
+    """The scans at these paths; the folder of a series stands for its scans, see `scans_in`."""
+    return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [scan_file(path)]))
+
+
+def run_series(
+    config: Config,
+    place: Path | None,
+    sinks: Sequence[Sink],
+    stop: StopRequest,
+    commands: CommandsOf,
+    *,
+    series: Path | None = None,
+    ask: Ask | None = None,
+) -> SeriesRun:
+    """Run the scans of a series in turn; devices stay connected.
+
+    Args:
+        place: the folder in which the series gets its own; None: the configured one.
+        stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
+        commands: of the reconstruction of each scan. If a volume needs the complete scan of a state, it is made after
+            the last state, because the next state would have to wait for it.
+        series: the folder of a series to be continued: complete scans are kept, and a scan that ended early is
+            continued.
+
+    Raises:
+        ConfigError: a limit is exceeded at one of the scans; nothing has moved. What `run_scan` raises: the scans
+            before it are complete, and a warning names the folder with which the series can be continued.
+    """
+    each, send = each_scan(config), fan_out(*sinks)
+    with ExitStack() as held:
+        jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
+        complete = [(_value(one), job) for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)]
+        if series is not None and len(complete) == len(each):
+            return SeriesRun(series, tuple(complete), ())
+        planned = dry_run(config, series or place, whole=[value for value, _ in complete])
+        refuse_violations(planned.timeline)
+        last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
+        clock = clock_after(config, last)
+        instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
+        folder = series or _new_folder(config, place or Path(config.storage.folder))
+        turns = _Turns(config.scan.states.every_s if config.scan.states else None)
+        seconds = {need.state: need.duration for need in planned.states}
+        scans, results, later = list[tuple[float, Path]](), list[RunResult](), list[tuple[Path, Commands]]()
+        for n, (one, job) in enumerate(zip(each, jobs, strict=True), 1):
+            if isinstance(job, Path):
+                scans.append((_value(one), job))
+                later.append((job, commands(one, None) if config.scan.states else Commands()))
+                continue
+            _tell(StateEntered(_kind(config), f"{_named(one)} ({n} of {len(each)})"), sinks)
+            for warning in job.left_out if job else ():
+                _tell(Warned(warning), sinks)
+            try:
+                how = commands(_within(one, seconds.get(n)), job)
+                if how.remark:
+                    _tell(StateEntered(_kind(config), how.remark), sinks)
+                taken = run_scan(
+                    one, job or folder,
+                    [lambda event: None if isinstance(event, RunDone) else send(event)],  # more scans follow
+                    stop, live=replace(how, afterwards=None) if config.scan.states else how, instrument=instrument,
+                    turn=turns.wait if config.scan.states else None,
+                )  # fmt: skip
+            except BaseException:
+                _after_failure(folder, _named(one), len(each), sinks)
+                raise
+            results.append(taken)
+            scans.append((_value(one), taken.path))
+            later.append((taken.path, how if config.scan.states else Commands()))
+    _volumes(later, stop, sinks)
+    return SeriesRun(folder, tuple(scans), tuple(results))
+
+
+@dataclass
+class _Turns:
+    """When each state begins: `every` s after the one before, or (None) when `beamline resume` is sent. The first one
+    begins at once."""
+
+    every: float | None
+    last: float | None = field(default=None, init=False)
+
+    def wait(self, measurement: Measurement, poll: Callable[[], bool]) -> None:
+        """Wait until the scan may begin; a stop ends the wait, and a pause prolongs it."""
+        clock, stop, pause, states = (
+            measurement.instrument.clock, measurement.stop, measurement.pause, measurement.states,
+        )  # fmt: skip
+        name, due = _named(measurement.config), clock.now()
+        if self.last is not None and self.every is not None:
+            due, late = self.last + self.every, due - self.last - self.every
+            if late > SLICE:
+                measurement.sink(Warned(f"{name} begins {late:.0f} s late, because the state before it took longer."))
+                due = clock.now()
+            else:
+                states.enter(states.state, f"{name} begins in {-late:.0f} s")
+            while (left := due - clock.now()) > 0 and not stop.stopping:
+                clock.sleep(min(SLICE, left))
+        elif self.last is not None:
+            pause.pause(f"{name} waits for its trigger")
+        if self.last is not None and pause.reason and not stop.stopping:
+            poll()  # ignore earlier input
+            states.enter(State.PAUSED, f"Paused before the first frame: {pause.reason}")
+            while pause.reason and not stop.stopping:
+                if poll():
+                    pause.resume()
+            due = clock.now()
+        self.last = due
+
+
+def _within(one: Config, seconds: float | None) -> Config:
+    """The configuration of a state whose live volume is finished before the next state begins."""
+    every = one.scan.states.every_s if one.scan.states else None
+    if every is None or seconds is None:
+        return one
+    spare = max(every - seconds, _LEAST_SECONDS)
+    return changed(one, [override_of("recon.seconds", min(one.recon.seconds, spare))])
+
+
+_LEAST_SECONDS = 1.0  # of the last fit of a live volume
+
+
+def _volumes(scans: Sequence[tuple[Path, Commands]], stop: StopRequest, sinks: Sequence[Sink]) -> None:
+    """Make the volumes that need complete scans, unless they exist already."""
+    for path, how in scans:
+        run = run_of(path.parent)
+        if how.afterwards is not None and not (run / RECON).exists() and not stop.stopping:
+            _tell(StateEntered("states", f"Reconstructing {run.name}"), sinks)
+            reconstruct(how.afterwards(path, run / RECON), run / RECON_LOG, fan_out(*sinks), stop)
+
+
+def _kind(config: Config) -> str:
+    return "states" if config.scan.states else "energies"
+
+
+def _value(one: Config) -> float:
+    """The energy in keV, or the number of the state."""
+    return one.scan.state or one.scan.energy or 0.0
+
+
+def _named(one: Config) -> str:
+    return f"State {one.scan.state}" if one.scan.states else f"Energy {one.scan.energy or 0.0:.7g} keV"
+
+
+def _new_folder(config: Config, place: Path) -> Path:
+    folder = create_run_folder(place, f"{config.sample.name}_{_kind(config)}", SystemClock().now())
+    write_whole(folder / CONFIG, resolved_yaml(config))  # what --resume goes by
+    return folder
+
+
+def _runs(series: Path, config: Config) -> list[Path | None]:
+    """The newest run folder of each scan of a series; None: there is none."""
+    if not is_series(series):
+        raise ConfigError(f"{series} is not the folder of a series of scans. Nothing was changed.")
+    run_of_value = dict[float, Path]()
+    for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
+        run_of_value[_value(load(run / CONFIG, environment={}))] = run
+    return [run_of_value.get(value) for value in config.series]
+
+
+def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
+    """What is left to do for a scan: nothing (its scan file), the rest of a run, or a new scan (None)."""
+    if run is None:
+        return None
+    try:
+        return held.enter_context(open_for_resume(run))
+    except NoFrame:
+        return None
+    except (NotJoined, NothingMissing):
+        recover_run(run)  # sets the final state in the record of a run whose process was killed in its last fit
+    except DataError as error:
+        raise DataError(
+            f"{error} If {run} cannot be recovered, move it to another place: --resume then takes this scan again."
+        ) from None
+    return scan_file(run)
+
+
+def _tell(event: Event, sinks: Sequence[Sink]) -> None:
+    fan_out(*sinks)(replace(event, time=SystemClock().now()))
+
+
+def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> None:
+    """Report how the series can be continued; remove its folder if it contains no scan."""
+    if any(path.is_dir() for path in folder.iterdir()):
+        said = f"The series of {of} scans ended at {name.lower()}. `beamline scan --resume {folder}` continues it."
+        _tell(Warned(said), sinks)
+        return
+    (folder / CONFIG).unlink()
+    folder.rmdir()
