@@ -93,7 +93,8 @@ def _sector(
 
 
 def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
-    """n of the projections, evenly spread over the distinct angles in a period, or over all if these are too few."""
+    """n of the projections, evenly spread over the distinct angles in a period, or over all projections if the distinct
+    angles are too few."""
     once = np.sort(np.mod(theta[views], period))
     gaps = np.diff(once, append=once[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
@@ -106,7 +107,7 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: 
 
 
 def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most `n` of the frames, evenly spread. For a 360° scan, half as many, each with its opposite projection.
+    """At most `n` of the frames, evenly spread. For a 360° scan, n / 2 frames, each with its opposite projection.
 
     Args:
         angles: [frame], radians.
@@ -132,11 +133,11 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 def used_and_kept_back(
     n_views: int, held_out: tuple[int, ...], early_stop: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of the projections that a fit uses, and of the held-out ones, ascending.
+    """Numbers of the projections that a fit uses, and numbers of the held-out projections, both ascending.
 
     Raises:
-        ValueError: a number is not that of a projection, all projections are held out, or none is and `early_stop`
-            needs some.
+        ValueError: a number does not belong to a projection; all projections are held out; or no projection is held out
+            although `early_stop` needs some.
     """
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
