@@ -36,7 +36,8 @@ from recon.voxels.view_weights import covers_the_circle, density_errors, unseen_
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LOOKED_AT, _LARGEST = 2**16, 1e15  # values in the sample; largest line integral (true ones end at about 15)
+# number of values in the sample; largest line integral (measured ones end at about 15)
+_LOOKED_AT, _LARGEST = 2**16, 1e15
 
 
 def reconstruct(
@@ -57,10 +58,10 @@ def reconstruct(
         masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
         `Counts` instead. The method then gets line integrals, with weights that represent the likelihood of the counts
         (`recon.prep.counts.line_integrals`). These weights are multiplied by `use.weights`.
-        method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
-            settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
+        method: a name, for a method with its default settings ("auto", or one of `recon.methods.names`). Or a method
+            with given settings, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
-        projections see, so a smaller box is identical to that part of the whole volume.
+            projections see. So if you ask for a smaller box, its voxels are identical to those of the whole volume.
         seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
         of threads.
         device: where the method computes: "cpu" or "cuda" (the current CUDA device).
@@ -90,7 +91,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if not chosen.allow_negative:  # a method with that setting can make such voxels
+    if not chosen.allow_negative:  # only a method with the setting `allow_negative` can make negative voxels
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
@@ -144,7 +145,8 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
 
 
 def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
-    """Warn of the densities of a direct method. Iterative methods explain the line integrals, so theirs are right."""
+    """Warn that the densities of a direct method are wrong. Those of iterative methods are right, because these methods
+    explain the line integrals."""
     if geometry.is_cone or not isinstance(method, Direct) or not (unseen := unseen_wedges(geometry)):
         return
     missing = sum(wedge.size for wedge in unseen)
@@ -159,7 +161,8 @@ def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
 
 
 def _warn_of_half_acquisition(data: NDArray[np.float32], geometry: Geometry) -> None:
-    """Warn if a sample reaches beyond the edge near the axis, and no full circle shows what is beyond that edge."""
+    """Warn if a sample reaches beyond the detector edge near the axis, and the scan is not a full circle, which would
+    show the part beyond that edge."""
     if not geometry.is_off_middle or covers_the_circle(geometry.angles):
         return
     left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from recon.base.arrays import F64, some_values
 
 _SAMPLE = 200_000  # number of values in the sample
-_SPLIT = (
-    0.7  # share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
-)
+# share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
+_SPLIT = 0.7
 _LEAST = 2e-4  # smallest share of the values in a class
 _MOST = 8  # classes
 _FREQUENT = 0.03  # share of all voxels that are not air

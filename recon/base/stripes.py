@@ -22,10 +22,8 @@ _SEEN = 3.5
 # smallest ratio of the odd to the even part. For pixel sensitivities both parts are equal; for layers of the sample the
 # odd part is almost 0
 _ONE_SIDED = 0.5
-_STEADY_BLOCKS, _STEADY_BLOCK = (
-    8,
-    8,
-)  # number of contiguous blocks of projections; number of projections in the smallest block
+# number of contiguous blocks of projections; number of projections in the smallest block
+_STEADY_BLOCKS, _STEADY_BLOCK = 8, 8
 AT_AXIS = 4.0  # columns on either side of the axis; a body this small on the axis looks like a ring
 _FEWEST_MIRRORED = 20  # mirrored columns
 

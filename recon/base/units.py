@@ -17,9 +17,8 @@ _ROUND = 0.01  # tolerance, as a share of 360° or 180°
 _OPAQUE = 15.0  # line integral; no detector measures a transmission of exp(-15) in nine of ten pixels
 _LOOKED_AT = 2**16  # number of values in the sample
 _VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # size of the sample in which transmission is searched for
-_LEVEL = (
-    0.15  # tolerance of the beam level in transmission: its difference from 1, and its difference between projections
-)
+# tolerance of the beam level in transmission: its difference from 1, and its difference between projections
+_LEVEL = 0.15
 _NOT_ABOVE = 0.03  # share of the beam; nine values in ten are at most this much above it
 _EDGE = 32  # one of this many columns belongs to an edge
 _SIGMAS = 3.0

@@ -175,9 +175,8 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     return tensor
 
 
-NEEDLES_LIMIT = (
-    0.2  # share of the mass in needle-shaped Gaussians above which a warning is given, see docs/published.md
-)
+# share of the mass in needle-shaped Gaussians above which a warning is given, see docs/published.md
+NEEDLES_LIMIT = 0.2
 
 # standard deviation, in pixels, below which projections do not resolve a Gaussian; ratio of longest to shortest width
 _THIN, _LONG = 0.5, 10.0

@@ -255,7 +255,7 @@ def _material(
         raise ValueError(
             f"check that the projections are line integrals (-log of the transmission) and that the rotation axis is "
             "right: the initial volume contains no material, because "
-            "only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
+            f"only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
             f"{unit:.3g} 1/mm"
         )
     return data, unit, candidates

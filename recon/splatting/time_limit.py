@@ -183,9 +183,9 @@ class FinalFit(Iterative):
         finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
         if not ((finished and reached.step >= reached.steps) or stop.stopped):
             warnings.warn(
+                "to get the full quality, reconstruct the finished scan: "
                 f"{self.seconds:g} s were not enough for the final fit. It made {reached.step} of {reached.steps} "
-                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement. To get "
-                "the full quality, reconstruct the finished scan",
+                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement",
                 stacklevel=2,
             )
         settings = {
