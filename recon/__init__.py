@@ -1,5 +1,5 @@
-"""Tomographic reconstruction: arrays in, arrays out. The main functions are `recon.correct`, `find_axis` and
-`reconstruct`.
+"""Tomographic reconstruction of splatline: arrays in, arrays out. The main functions are `recon.correct`, `find_axis`
+and `reconstruct`.
 
 The classes of values (Geometry, Grid, Volume, RunControl, DataUse) are imported at once. torch and numba are imported
 when a function that computes is first used, so that a program that only plans a scan starts quickly.

@@ -125,8 +125,8 @@ def masked(
     if empty.size:
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"leave out {empty.size} of {len(projections)} projections (numbers {empty[:8].tolist()} ...): they contain "
-            f"no usable value ({within}, with a weight above 0)"
+            f"leave out {empty.size} of {len(projections)} projections (numbers {empty[:8].tolist()} ...): they "
+            f"contain no usable value ({within}, with a weight above 0)"
         )
     filled = np.array(projections, np.float32)
     known = np.ones(projections.shape, np.float32) if weight is None else np.array(weight, np.float32)

@@ -1,4 +1,5 @@
-"""Runs one trial: reconstructs and measures. Also the data that all trials of a scan share."""
+"""Runs one trial: reconstructs a volume and measures its quality. The module also has the data that all trials of a
+scan share."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ _UNWATCHED = RunControl()
 
 
 class TrialRun(NamedTuple):
-    """What a trial runs: a method on projections, for a volume on this grid."""
+    """The work of a trial: a method, the projections, and the grid of the volume."""
 
     method: Method
     prepared: PreparedProjections
@@ -43,22 +44,22 @@ class TrialRun(NamedTuple):
 
 
 class TrialScan(Protocol):
-    """The scan of some trials: what each trial runs, and how good its volume is.
+    """The scan that trials reconstruct. It gives the work of each trial, and measures the quality of its volume.
 
     Attributes:
-        truth: the volume [z, y, x] of all trials, if it is known.
+        truth: the ground truth [z, y, x] of all trials, if it is known.
     """
 
     truth: F32 | None = None
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
-        """What a trial runs. Raises ValueError for a setting or projections that do not exist."""
+        """The work of a trial. Raises ValueError if a setting or the projections do not exist."""
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """Figures of merit of a volume by name, and the squared residual of each held-out projection."""
+        """Figures of merit of a volume by name, and the squared residual in each held-out projection."""
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with the conclusions from all of its trials."""
+        """The table with the conclusions from all trials added."""
         return table
 
 
@@ -67,10 +68,10 @@ class TrialData(TrialScan):
     """The data that all trials of a scan share.
 
     Attributes:
-        prepared: the projections that may be used, and the held-out projections that no trial uses. Weights from the
-            monitor are removed, because trials are compared with equal weight for all rays.
+        prepared: the projections that trials may use, and the held-out projections that no trial uses. Weights from the
+            monitor are removed, because trials are compared with equal weights for all rays.
         truth: the ground truth [z, y, x] on Grid.matching(geometry).
-        references: further volumes on the same grid that trials are compared with, by method.
+        references: further volumes on the same grid, by method, with which trials are compared.
         regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None if there are none.
         seed: random seed of all trials.
     """
@@ -83,7 +84,7 @@ class TrialData(TrialScan):
 
     @property
     def geometry(self) -> Geometry:
-        """Geometry of the projections that may be used."""
+        """Geometry of the projections that trials may use."""
         return self.prepared.geometry
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
@@ -109,10 +110,10 @@ class TrialData(TrialScan):
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
-    """The projections of a row of a study, each the mean of a window of projections.
+    """The projections of a row of a study. Each is the mean of a window of projections.
 
-    The transmissions are averaged, -log(mean(exp(-p))), not the logarithms, as in a longer exposure. The weight of a
-    ray is the smallest weight in its window.
+    As in a longer exposure, the transmissions are averaged and not their logarithms: -log(mean(exp(-p))). The weight of
+    a ray is the smallest weight in its window.
     """
     groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
@@ -134,18 +135,20 @@ def run_trial(
     control: RunControl = _UNWATCHED,
     cpu: Callable[[], float] = time.process_time,
 ) -> tuple[Outcome, F32 | None]:
-    """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x] (None if it failed)."""
+    """Reconstruct the volume of a trial and measure it. Returns the outcome, and the volume [z, y, x] (None if the
+    trial failed)."""
     try:
         method, prepared, grid, seed, device = data.asked_by(trial)
         trial = replace(trial, views=prepared.geometry.n_views)
-        warm_up(method, prepared.geometry, device=device)  # so that compilation is in no trial's time
+        warm_up(method, prepared.geometry, device=device)  # so that the time of a trial does not include compilation
         reset_peak_memory()
         before = cpu()
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             in_time = control if trial.seconds_asked is None else control.by(control.now() + trial.seconds_asked)
             result = run_on(method, prepared, grid, seed, in_time, device)
-        cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
+        # read before the quality is measured, because that needs memory, too
+        cpu_seconds, peak = cpu() - before, peak_memory()
         figures, squared = data.measured(trial, result.volume)
     except (ValueError, MemoryError) as error:
         message = str(error) if isinstance(error, ValueError) else user_message(error)
