@@ -1,4 +1,5 @@
-"""Recording: the page's data from a scan file, also a growing one. All calls must come from one thread (HDF5)."""
+"""Recording: the data of the page, from a scan file that may still be growing. All calls must come from one thread
+(HDF5)."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ from beamline.storage.writers import layout
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Whole frames in a scan file, its status (`running`, `complete`, `stopped` or `failed`), and the time of the
-    newest frame, s since the Unix epoch; None without one."""
+    """Number of complete frames in a scan file, its status (`running`, `complete`, `stopped` or `failed`), and the time
+    of the newest frame in s since the Unix epoch (None if there is no frame)."""
 
     frames: int
     status: str
@@ -32,9 +33,7 @@ class ScanProgress:
 class Recording:
     """A scan file of this program, opened for reading while it may still be written.
 
-    Raises:
-        NotReadyError: the file is just being made.
-        DataError: the file is not a scan of this program.
+    Raises: NotReadyError: the file is being created. DataError: the file is not a scan of this program.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +72,8 @@ class Recording:
         return ScanProgress(n, datasets.text_of(status) if finished[()] else "running", newest)
 
     def facts(self) -> dict[str, Any]:
-        """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
+        """Facts that do not change: sample, shape, pixel size in mm (null: unknown), axis, and checks of the
+        monitor."""
         pixel = datasets.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS)
         axis = datasets.dataset(self._file, layout.AXIS_COL)
         return {
@@ -96,7 +96,8 @@ class Recording:
         return {"first": first, **{name: self._column(path, first, frames) for name, path in names.items()}}
 
     def flags(self) -> list[dict[str, Any]]:
-        """Each flag of each frame: frame, check, whether it is an alarm, score, region [row, row, col, col] or null."""
+        """Every flag of every frame: frame, check, whether it is an alarm, score, and region [row, row, col, col] or
+        null."""
         frame_flags = read_flags(self._file, self.progress().frames)
         listed = []
         for frame in np.flatnonzero(frame_flags.flagged):
@@ -119,7 +120,7 @@ class Recording:
     def picture(
         self, frame: int, region: TileRegion, *, corrected: bool
     ) -> tuple[NDArray[np.float32], TileRegion, int]:
-        """Part of a frame, binned to a tile: counts, or transmission.
+        """Part of a frame, binned to a tile, as counts or as transmission.
 
         Returns:
             Values, the region that they show, and their binning. Without darks and flats, `corrected` gives counts.
@@ -150,7 +151,8 @@ class Recording:
         """
         views = frames_in(self._file, self.progress().frames).views
         views = views[views >= first]
-        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
+        # otherwise a whole frame would be read for each row
+        packed = self._data.id.get_create_plist().get_nfilters() > 0
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
         at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
         hdf5.look_again(source)
@@ -178,7 +180,7 @@ class Recording:
         return [_json_number(value) for value in values] if values.dtype.kind == "f" else values.tolist()
 
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Means of the first darks and flats, at most eight each; None until there are some of both."""
+        """Means of the first darks and flats, at most eight of each; None until there are darks and flats."""
         if self._dark_and_flat is None:
             table = frames_in(self._file, frames)
             darks, flats = table.darks[:8], table.flats[:8]
