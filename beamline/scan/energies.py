@@ -1,4 +1,4 @@
-"""Energies: a series of scans of one sample, one per energy, in one folder; the series can be continued later.
+"""Energies: a series of scans of one sample, one scan per energy, in one folder. The series can be continued later.
 
 Each scan has an ordinary run folder within the folder of the series, so that every program that reads runs can read it.
 """
@@ -41,9 +41,8 @@ class SeriesRun:
     """A finished series of energies.
 
     Attributes:
-        folder: of the series.
-        scans: keV and the scan file of each energy.
-        results: of the scans that were taken now.
+        folder: folder of the series. scans: energy in keV and scan file of each scan. results: results of the scans
+            that were taken now.
     """
 
     folder: Path
@@ -59,7 +58,7 @@ def is_series(folder: Path) -> bool:
 
 
 def scans_in(folder: Path, warn: Warn) -> list[Path]:
-    """The scan file of each energy of a series that has one, in the order of the configuration.
+    """The scan files of a series, for each energy that has one, in the order of the configuration.
 
     Args:
         warn: function that gets a sentence on energies whose scan is incomplete or does not exist.
@@ -83,7 +82,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
 
 
 def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
-    """The scans at these paths; the folder of a series stands for its scans, see `scans_in`."""
+    """The scans at these paths. The folder of a series stands for all of its scans, see `scans_in`."""
     return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [scan_file(path)]))
 
 
@@ -97,18 +96,17 @@ def run_energies(
     series: Path | None = None,
     ask: Ask | None = None,
 ) -> SeriesRun:
-    """Run a scan at each of `scan.energies` in turn; devices stay connected.
+    """Run a scan at each of `scan.energies`, one after the other. The devices stay connected.
 
     Args:
-        place: the folder in which the series gets its own; None: the configured one.
-        stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
-        commands: of the reconstruction of each scan.
-        series: the folder of a series to be continued: complete scans are kept, and a scan that ended early is
-            continued.
+        place: folder in which the folder of the series is created; None: the configured folder. stop: request that ends
+            the current scan and the series. `sinks`, `ask`: as in `run_scan`, for all scans. commands: commands for the
+            reconstruction of each scan. series: folder of a series to continue. Complete scans are kept, and a scan
+            that ended early is continued.
 
     Raises:
-        ConfigError: a limit is exceeded at one of the energies; nothing has moved. What `run_scan` raises: the scans
-            before it are complete, and a warning names the folder with which the series can be continued.
+        ConfigError: a limit is exceeded at one of the energies; nothing has moved. All errors of `run_scan`: the
+            earlier scans are complete, and a warning names the folder with which the series can be continued.
     """
     each, send = at_energies(config), fan_out(*sinks)
     with ExitStack() as held:
@@ -149,12 +147,12 @@ def run_energies(
 
 def _new_folder(config: Config, place: Path) -> Path:
     folder = create_run_folder(place, f"{config.sample.name}_energies", SystemClock().now())
-    write_whole(folder / CONFIG, resolved_yaml(config))  # what --resume goes by
+    write_whole(folder / CONFIG, resolved_yaml(config))  # used by --resume
     return folder
 
 
 def _runs(series: Path, config: Config) -> list[Path | None]:
-    """The newest run folder of each energy of a series; None: there is none."""
+    """The folder of the newest run at each energy of a series; None: there is no run."""
     if not is_series(series):
         raise ConfigError(f"{series} is not the folder of an energy series. Nothing was changed.")
     run_of_energy = dict[float | None, Path]()
@@ -164,7 +162,8 @@ def _runs(series: Path, config: Config) -> list[Path | None]:
 
 
 def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
-    """What is left to do for an energy: nothing (its scan file), the rest of a run, or a new scan (None)."""
+    """The remaining work for an energy: nothing (the scan file is returned), the rest of a run, or a new scan
+    (None)."""
     if run is None:
         return None
     try:
@@ -172,7 +171,7 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
     except NoFrame:
         return None
     except (NotJoined, NothingMissing):
-        recover_run(run)  # sets the final state in the record of a run whose process was killed in its last fit
+        recover_run(run)  # sets the final state in the record of a run whose process was killed during the final fit
     except DataError as error:
         raise DataError(
             f"{error} If {run} cannot be recovered, move it to another place: --resume then takes this scan again."
@@ -185,7 +184,7 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 
 
 def _after_failure(folder: Path, n: int, of: int, sinks: Sequence[Sink]) -> None:
-    """Report how the series can be continued; remove its folder if it contains no scan."""
+    """Report how the series can be continued. If the folder contains no scan, remove it."""
     if any(path.is_dir() for path in folder.iterdir()):
         _tell(Warned(f"The series ended at energy {n} of {of}. `beamline scan --resume {folder}` continues it."), sinks)
         return

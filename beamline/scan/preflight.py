@@ -1,4 +1,4 @@
-"""Preflight: check a scan before anything moves, without devices (dry run) or with connected ones."""
+"""Preflight: checks a scan before anything moves, without devices (dry run) or with connected devices."""
 
 from __future__ import annotations
 
@@ -40,11 +40,12 @@ from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, Tr
 from drivers.orca_quest import PITCH_MM
 from recon.methods import streams
 
-Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earlier files of the same scan
+# Function that removes from a plan the frames that earlier files of the same scan contain
+Remaining = Callable[[ScanPlan], ScanPlan]
 
 
 def all_of(plan: ScanPlan) -> ScanPlan:
-    """The whole plan."""
+    """Returns the whole plan unchanged."""
     return plan
 
 
@@ -58,13 +59,12 @@ class EnergyNeeds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DryRun:
-    """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
+    """A scan that was planned without devices: plan, timeline, limits of stage and camera, and free bytes on the disk.
 
-    For a series of energies it is the first scan; `energies` lists the needs of each scan.
+    For a series of energies, this is the first scan, and `energies` lists the needs of each scan.
 
     Attributes:
-        disk: an existing folder on the disk of the file.
-        needs: of all scans.
+        disk: an existing folder on the disk of the file. needs: needs of all scans together.
     """
 
     plan: ScanPlan
@@ -77,7 +77,7 @@ class DryRun:
     energies: tuple[EnergyNeeds, ...] = ()
 
     def lines(self) -> list[str]:
-        """Lines of text, without violations: `refuse_violations` states them."""
+        """The plan as lines of text. Violations are not included; `refuse_violations` reports them."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
         each, needs = self.energies, self.needs
         if each:
@@ -92,7 +92,7 @@ class DryRun:
         return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
 
     def data(self) -> Mapping[str, Any]:
-        """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
+        """The numbers in these lines, for programs, in s, rad, bytes and pixels."""
         worked, views = self.timeline, self.timeline.views
         return {
             **self.needs.data(),
@@ -117,7 +117,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Warnings of implausible values, for example because of a wrong unit; empty if all are plausible."""
+    """Warnings about implausible values, for example because of a wrong unit; empty if all values are plausible."""
     theta = np.degrees(plan_of(config).angles)
     ends = float(np.ptp(theta))
     spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
@@ -138,7 +138,8 @@ def _doubt_optics(config: Config) -> str:
     """
     optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
+    # mm; half the width of the field of view
+    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
             f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
@@ -164,18 +165,17 @@ def dry_run(
     """Compute the plan of a configuration without devices.
 
     Args:
-        runs: where the file would be, for the free disk space; default: the configured folder.
-        remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) of a series whose scans are already complete; never all of them.
-        locks: function that states what is wrong with the file locks of a folder, such as `no_locks`, which writes
-            there.
+        runs: folder in which the file would be, for the free disk space; default: the configured folder. remaining:
+            function that returns the part of the plan that must still be taken. whole: energies (keV) of a series whose
+            scans are already complete; never all of them. locks: function that returns a sentence if files cannot be
+            locked in a folder, such as `no_locks`, which writes there.
 
     Raises:
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
-            timeline's violations.
+            violations of the timeline.
     """
     each = [one for one in at_energies(settings) if one.scan.energy not in whole]
-    if len(each) > 1:  # a scene is read at both ends of the energy range
+    if len(each) > 1:  # the scene is read at both ends of the energy range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
     there = disk_of(runs or Path(settings.storage.folder))
@@ -207,7 +207,7 @@ def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
     """What the scan will ask the operator to do."""
     by_hand = config.devices.by_hand
     kinds = [block.kind for block in timeline.blocks if block.n_to_take]
-    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
+    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # its state at the start is not known
     moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
     for device, states, request in (
         ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),
@@ -223,7 +223,7 @@ def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
 
 
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
-    """The first of several scans, with the violations of all of them."""
+    """The first of several scans, with the violations of all scans."""
     needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
     total = replace(each[0], energies=tuple(needs), needs=all_needs(one.needs for one in each))
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
@@ -253,7 +253,7 @@ def _worked(
 
 
 def _lockable(worked: Timeline, no_locking: str) -> Timeline:
-    """The plan, with a violation if files in its folder cannot be locked."""
+    """The plan, with an additional violation if files in its folder cannot be locked."""
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
 
@@ -267,10 +267,9 @@ def refuse_violations(worked: Timeline) -> None:
 
 
 def disk_of(folder: Path) -> Path:
-    """`folder`, or its nearest existing parent, which is on the same disk.
+    """`folder` if it exists, otherwise its nearest existing parent, which is on the same disk.
 
-    Raises:
-        ConfigError: a file has this name, or the disk does not exist.
+    Raises: ConfigError: a file has the name of the folder, or the disk does not exist.
     """
     folder = folder.absolute()
     if link := broken_link(folder):
@@ -293,10 +292,10 @@ class ReadyScan:
 
     plan: ScanPlan
     timeline: Timeline
-    settings: CameraSettings  # of the camera for the projections, as it accepted them
-    timing: CameraTiming  # of the camera with these settings
+    settings: CameraSettings  # settings of the camera for the projections, as the camera has accepted them
+    timing: CameraTiming  # timing of the camera with these settings
     monitor: Monitor  # before the first frame
-    info: ScanInfo  # written into the file before the first frame
+    info: ScanInfo  # metadata that are written into the file before the first frame
 
 
 def preflight(
@@ -309,9 +308,9 @@ def preflight(
     """Read the limits of the devices, and compute the plan for them. Nothing moves.
 
     Args:
-        runs: where the file will be, for the free disk.
-        remaining: the part of the plan that is still to be taken.
-        check_stop: function that is called between long steps, such as loading kernels; an exception from it ends them.
+        runs: folder in which the file will be, for the free disk space. remaining: function that returns the part of
+            the plan that must still be taken. check_stop: function that is called between long steps, such as loading
+            kernels; an exception from it ends the work.
 
     Raises:
         ConfigError: the plan is impossible, limits are exceeded (all are listed), or the simulated scene cannot be
@@ -339,10 +338,10 @@ def ready_scan(
     info: ScanInfo,
     check_stop: Callable[[], None] = lambda: None,
 ) -> ReadyScan:
-    """A planned scan, with the state of the monitor before the first frame; the sections `monitor` and `storage` of
+    """A planned scan, with the state of the monitor before the first frame. The sections `monitor` and `storage` of
     `config` are used."""
     monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
-    # The first call compiles, which must not happen while frames arrive.
+    # The first call compiles kernels, which must not happen while frames arrive.
     check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     check_stop()
@@ -354,7 +353,8 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
         saturation=_saturation(timing),
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
-        step=usual_step(np.radians(np.degrees(plan.angles[:: plan.frames_per_view]))),  # as the file states them
+        # in the form in which the file states them
+        step=usual_step(np.radians(np.degrees(plan.angles[:: plan.frames_per_view]))),
         frames_per_view=plan.frames_per_view,
         stored=plan.stored,
         cone=info.source_distance_mm is not None,
@@ -363,7 +363,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
 
 
 def _saturation(timing: CameraTiming) -> int:
-    """The count from which a pixel is saturated."""
+    """The number of counts from which a pixel counts as saturated."""
     return int(2**timing.bits - 1)
 
 
@@ -397,13 +397,13 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Metadata of the file that do not depend on the plan; filter and energy as currently set. Raises DeviceError if a
-    device does not answer.
+    """Metadata of the file that do not depend on the plan. Filter and energy have their present values. Raises
+    DeviceError if a device does not answer.
     """
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
-        # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
+        # The cone beam of the scene in the form of NXtomo, in which the pixel size is that on the detector.
         source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     energy = None if devices.monochromator is None else devices.monochromator.energy()

@@ -1,4 +1,5 @@
-"""Run: one scan from configuration to file, in a folder of its own, reported by events, and closed in any case."""
+"""Run: one scan, from the configuration to the file, in a separate folder. Events report its progress, and the file is
+closed in every case."""
 
 from __future__ import annotations
 
@@ -57,22 +58,21 @@ def run_scan(
     """Run the scan that `config` describes.
 
     Args:
-        runs: the folder in which the run gets its own; default: the configured one. Or the run that is continued, with
-            its own configuration.
-        sinks: in addition to events.jsonl and user.log in the run's folder.
-        stop: ends the scan from another thread or a signal handler.
-        live: gives the command line of a live reconstruction; None: there is none.
-        afterwards: gives the command line of a reconstruction of the complete scan; a scan that ends early has none.
-        instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
-        ask: asks the operator, if the shutter or the sample is moved by hand.
+        runs: folder in which the folder of the run is created (default: the configured folder); or the run to continue,
+            with its own configuration. sinks: event sinks in addition to events.jsonl and user.log in the folder of the
+            run. stop: request that can end the scan from another thread or a signal handler. live: function that
+            returns the command line of a live reconstruction; None: no live reconstruction. afterwards: function that
+            returns the command line of a reconstruction of the complete scan. It is not used if the scan ends early.
+            instrument: connected devices, which stay open at the end; None: the devices of `config` are opened and
+            closed here. ask: function that asks the operator, if the shutter or the sample is moved by hand.
 
     Raises:
         ConfigError: the plan exceeds a limit, or the instrument differs from that with which the run began; nothing has
             moved.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
-        DataError: frames are missing (LedgerError), or the disk failed. In all these cases the frames taken so far are
-            in the file; the event `scan_done` says how many, and `failed` why.
+        DataError: frames are missing (LedgerError), or the disk failed. In all of these cases the frames taken so far
+            are in the file. The event `scan_done` gives their number, and `failed` gives the reason.
     """
     if config.scan.energies is not None:
         raise ConfigError(
@@ -96,16 +96,16 @@ def run_scan(
         with ExitStack() as stack:
             sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
             if series is not None:
-                series.lock.release()  # from here on the lock of the part keeps other processes away
+                series.lock.release()  # from here on, the lock of the part keeps other processes away
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
-            guarded = stack.enter_context(_watched(measurement))  # until the instrument is free for another scan
+            guarded = stack.enter_context(_watched(measurement))  # held until the instrument is free for another scan
             guarded.callback(connected.close)
             return _to_its_end(measurement, live, afterwards, guarded.close)
 
 
 def _watched(measurement: Measurement) -> ExitStack:
-    """A watchdog for the scan of a real instrument; it ends when the stack is closed."""
+    """Start a watchdog for the scan of a real instrument. The watchdog ends when the stack is closed."""
     config, guarded = measurement.config, ExitStack()
     if config.simulation is None:
         without = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
@@ -123,22 +123,22 @@ def record_scan(
     *,
     live: Standby | None,
 ) -> RunResult:
-    """Record a scan that another program controls, in a run folder of its own, as `run_scan` records one of this
+    """Record a scan that another program controls, in the folder of a new run, as `run_scan` records a scan of this
     program.
 
-    Nothing waits for the live reconstruction, no watchdog runs, and no device is operated.
+    The scan does not wait for the live reconstruction, no watchdog runs, and no device is operated.
 
     Args:
-        config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor are used.
-        source_of: makes the object that delivers the frames, from the measurement that takes them.
-        runs: the folder in which the run gets its own.
-        live: starts a live reconstruction; None: there is none.
+        config: configuration, of which the sections sample, storage, monitor, references, recon, scan and
+            devices.beam_monitor are used. source_of: function that makes the object that delivers the frames, given the
+            measurement that receives them. runs: folder in which the folder of the run is created. live: function that
+            returns the command line of a live reconstruction; None: no live reconstruction.
 
     Raises:
         LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
     """
     began = time.monotonic()
-    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # whose devices are never used
+    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # its devices are never used
     with ExitStack() as stack:
         folder = create_run_folder(runs, config.sample.name, others.clock.now())
         sink = _announcing(config, ready, folder, others.clock, sinks, stack)
@@ -152,10 +152,10 @@ def record_scan(
 def _announcing(
     config: Config, ready: ReadyScan, folder: Path, clock: Clock, sinks: Sequence[Sink], stack: ExitStack
 ) -> Sink:
-    """One sink for the run's record, its logs and `sinks`, each reached by a thread until the stack closes; it begins
-    with the settings that the devices had before they were opened."""
+    """One sink for the record of the run, its logs and `sinks`. A thread passes events on to each, until the stack
+    closes. The first events state the settings that the devices had before they were opened."""
     record, *logs = _logs(config, ready, folder, stack)
-    # The record has a thread of its own, so that a blocked terminal does not delay it.
+    # The record has a separate thread, so that a blocked terminal does not delay it.
     announcers = [Announcer(each, clock) for each in ([record], [*logs, *sinks])]
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
@@ -165,10 +165,10 @@ def _announcing(
 
 
 def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
-    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written next to
-    them.
+    """The record of the run, events.jsonl and user.log. They are open until the stack closes. The configuration is
+    written next to them.
 
-    events.jsonl is created last: with it the folder counts as a run.
+    events.jsonl is created last, because a folder with this file counts as a run.
     """
     try:
         (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -182,12 +182,12 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
 
 
 def _named(config: Config) -> str:
-    """The end of a run folder's name."""
+    """The end of the name of a run's folder."""
     return config.sample.name + ("" if config.scan.energy is None else f"_{config.scan.energy:.7g}keV")
 
 
 def _refuse_stop(stop: StopRequest) -> None:
-    """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
+    """Raise ScanAborted if a stop was requested. (Before anything moves, a stop counts as an abort.)"""
     if stop.stopping:
         raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
@@ -195,7 +195,7 @@ def _refuse_stop(stop: StopRequest) -> None:
 def _to_its_end(
     measurement: Measurement, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]
 ) -> RunResult:
-    """Run the whole scan, and end it by the event `done` or `failed`."""
+    """Run the whole scan, and send the event `done` or `failed` at its end."""
     states, series, folder, sink = measurement.states, measurement.series, measurement.folder, measurement.sink
     volume, timeline = (series.run if series else folder) / RECON, measurement.ready.timeline  # of all parts
     try:
@@ -227,8 +227,8 @@ def _to_its_end(
 
 
 def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sink) -> None:
-    """Rename volume and report of the projections before this part of a run, because the volume of all parts gets their
-    names.
+    """Rename the volume and the report that were made from earlier parts of a run, because the volume of all parts gets
+    their names.
     """
     for path in filter(os.path.lexists, files):
         aside = path.with_stem(f"{path.stem}.before-{part}")
@@ -239,7 +239,7 @@ def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sin
                     states.state, f"{path.name}, the volume of the earlier projections, was renamed to {aside.name}"
                 )
             )
-        except OSError as error:  # on Windows, if a viewer has it open
+        except OSError as error:  # happens on Windows if a viewer has the file open
             sink(
                 Warned(
                     f"There is no volume of all parts of the run, because {path} could not be renamed "
