@@ -181,9 +181,7 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     light = through @ weights
     try:
         exact, _ = nnls(through, light)
-    except (
-        RuntimeError
-    ):  # the energies are so nearly dependent (for example around an edge) that the search does not converge
+    except RuntimeError:  # too nearly dependent (as around an edge), so the search does not converge
         return np.arange(weights.size), weights
     enough = np.flatnonzero(exact)
     through = through[:, enough]
