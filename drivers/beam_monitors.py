@@ -28,9 +28,10 @@ class ElectrometerQuery:
     """Query of an electrometer, and the form of its reply.
 
     Attributes:
-        query: command that asks for a reading. It must have no side effects, because it is also the probe of the line
+        query: command that requests a reading. It must have no side effects, because it is also used to probe the line
             (see `SerialLine`).
-        pattern: regular expression that every reply contains; any other reply counts as a disturbed line.
+        pattern: regular expression that every reply must contain. If a reply does not contain it, the line counts as
+            disturbed.
         setup: commands without a reply, sent once before the first query.
         line_end: line end of commands and replies.
     """
@@ -159,7 +160,7 @@ class PageSource:
 
 
 def url_problem(url: str) -> str:
-    """Why a URL cannot be read; "" if it can."""
+    """The reason why a URL cannot be read; "" if it can be read."""
     try:
         parts = urlsplit(url)
         legal = parts.scheme == "file" or (parts.scheme in ("http", "https") and bool(parts.hostname))
@@ -251,7 +252,7 @@ class TextBeamMonitor:
 
 
 def pattern_problem(pattern: str) -> str:
-    """Why a pattern cannot be used; "" if it can."""
+    """The reason why a pattern cannot be used; "" if it can be used."""
     try:
         groups = re.compile(within_a_line(pattern)).groups
     except re.error as error:

@@ -1,5 +1,5 @@
-"""Devices in the beam that another device moves (a stage with named positions, a digital output) or the operator by
-hand.
+"""Devices in the beam that are moved by another device (a stage with named positions, a digital output) or by the
+operator.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class StagePlaces:
 class PlacedStage:
     """A stage that moves to named places. Implements `drivers.base.protocols.Filter` and `Watchable`.
 
-    Each call reads the position of the stage, because a person may have moved it, and moves the stage only if it is
-    elsewhere.
+    Each call reads the position of the stage, because a person may have moved it. The stage moves only if it is not at
+    the requested place.
     """
 
     def __init__(self, stage: RotationStage, places: StagePlaces, clock: Clock, name: str = "filter") -> None:
@@ -202,16 +202,17 @@ class OutputShutter:
 
 
 Ask = Callable[[str], None]
-"""Function that shows the operator a request and returns when it is confirmed.
+"""Function that shows a request to the operator and returns when the operator has confirmed it.
 
-Otherwise it raises the caller's error.
+If the operator does not confirm it, the function raises the error of the caller.
 """
 
 
 class _Manual:
     """A device that the operator moves; `_state` is the state that the operator confirmed last.
 
-    None: the state is not known, for example while the operator is asked, or after a request that was not confirmed.
+    The state None means that the state is not known: before the first answer, while the operator is asked, or after a
+    request that was not confirmed.
     """
 
     _name = ""

@@ -26,7 +26,8 @@ ROI_STEP = 4
 BINNINGS = (1, 2, 4)
 MODEL = "C15550-20UP"
 LINE_TIME = MappingProxyType({"standard": 7.2e-6, "ultra_quiet": 172.8e-6, "photon_number": 172.8e-6})
-"""Line time in s, for two rows; also the shortest exposure. Photon number resolving is as slow as ultra quiet."""
+"""Line time in s for two rows, which is also the shortest exposure. The mode for photon number resolving is as slow as
+ultra quiet."""
 LINE_TIMES = MappingProxyType(
     {MODEL: LINE_TIME, "C15550-22UP": {"standard": 7.2e-6, "ultra_quiet": 34.0e-6, "photon_number": 34.0e-6}}
 )
@@ -96,13 +97,13 @@ class LightPath:
 
         Args:
             gain: counts per photoelectron as measured by photon transfer. If `electrons` arrive together, the variance
-                is 1 + electrons times that of single ones.
+                is 1 + electrons times the variance for single electrons.
         """
         return (1 + self.electrons) / (gain * self.absorbed * self.electrons)
 
 
 def refusal(settings: CameraSettings, model: str = MODEL) -> str:
-    """Why the camera would reject the settings, with the legal values; "" if it accepts them."""
+    """The reason why the camera would reject the settings, with the legal values; "" if it would accept them."""
     if settings.readout not in LINE_TIME:
         return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:
@@ -173,7 +174,7 @@ class TriggerPolarity(StrEnum):
 
 
 class GlobalExposure(StrEnum):
-    """Time at which the rows start to expose after a pulse.
+    """Way in which the rows start to expose after a pulse.
 
     DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all together. Because rows are read one after the
     other, later rows are then exposed longer, unless the light is shut off.

@@ -1,7 +1,8 @@
-"""Tomographic reconstruction of splatline, from arrays to arrays: `recon.correct`, `find_axis`, `reconstruct`.
+"""Tomographic reconstruction of splatline: arrays in, arrays out. The main functions are `recon.correct`, `find_axis`
+and `reconstruct`.
 
-The classes of values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and
-numba at their first use, so that a program that only plans a scan starts quickly.
+The classes of values (Geometry, Grid, Volume, RunControl, DataUse) are imported at once. torch and numba are imported
+when a function that computes is first used, so that a program that only plans a scan starts quickly.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from recon.compiled import use_compiled_kernels
 from recon.methods import REGISTRY
 
 __path__ = extend_path(__path__, __name__)  # another folder recon/ without __init__.py on the path adds its modules
-use_compiled_kernels()  # before numba is imported, which happens when something is computed
+use_compiled_kernels()  # must run before numba is imported, which happens when something is computed
 
 # libgomp reads this when torch or numba load it. Without it, idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.

@@ -23,14 +23,14 @@ from recon.voxels.iterative import VoxelMethod, scaled_problem, threads_for, wat
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial, TrialSettings
 
-_SMALLEST = 64  # pixels a side: smaller detectors are not binned
+_SMALLEST = 64  # detectors with fewer pixels along a side are not binned
 
 
 @dataclass(frozen=True, eq=False)
 class Auto(Method):
-    """Tries methods on a part of the scan, and takes the simplest one that is about as good as the best one.
+    """Tries methods on a part of the scan, and takes the simplest method that is about as good as the best one.
 
-    A method is good if its volume predicts the held-out projections well.
+    The measure of a method is how well its volume predicts the held-out projections.
 
     The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows
     contain little material, the part is all rows at half the resolution. One of eight projections is held out. Test
@@ -39,7 +39,8 @@ class Auto(Method):
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
-        least_gain: share by which a costlier method must lower the residual in the held-out projections.
+        least_gain: a costlier method is taken only if it lowers the residual in the held-out projections by at least
+            this share.
     """
 
     name: ClassVar[str] = AUTO
@@ -57,7 +58,7 @@ class Auto(Method):
             raise ValueError("candidates must contain at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The result of the chosen method, with the reason for the choice.
+        """Reconstruct with the chosen method. The result also contains the reason for the choice.
 
         Raises:
             ValueError: no candidate can use these projections.
@@ -67,7 +68,7 @@ class Auto(Method):
         return self.run_chosen(choice, problem, replace(control, decide=decide))
 
     def run_chosen(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """`run` with a choice that was made before, and with `control.decide`."""
+        """The same as `run`, for a choice that was made before. `control.decide` must be given."""
         assert control.decide is not None
         control.decide.prior = choice.prior
         chosen, result = self._run_choice(choice, problem, control)
@@ -77,7 +78,8 @@ class Auto(Method):
     def _run_choice(
         self, choice: TrialChoice, problem: ReconProblem, control: RunControl
     ) -> tuple[Method, Reconstruction]:
-        """The chosen candidate and its result. If none was chosen, the last candidate whose library can be loaded."""
+        """The chosen candidate and its result. If no candidate was chosen, the last candidate whose library can be
+        loaded is used."""
         chosen = self.candidates[-1 if choice.at is None else choice.at]
         try:
             return chosen, chosen.run(replace(problem, device=chosen.device_of(problem)), control)
@@ -96,7 +98,8 @@ class Auto(Method):
         return self.tried(problem, control)[0]
 
     def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
-        """As `choose`, and the test reconstructions; None if there were none, or if they were stopped."""
+        """The choice, as from `choose`, and the test reconstructions. These are None if there were none, or if they
+        were stopped."""
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("all projections are zero, so there is nothing to reconstruct")
@@ -122,8 +125,9 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With "preview", only the first two candidates are tried. With "best", a costlier method is taken even if
-        it is only slightly better, each test of a fit runs to its end, and the last iterations use half voxels."""
+        """The method for a preset. "preview" tries only the first two candidates. "best" takes a costlier method even
+        if it is only slightly better, runs each test of a fit to its end, and uses half voxels in the last
+        iterations."""
         if quality == "preview":
             return replace(self, candidates=tuple(with_halves(each, False) for each in self.candidates[:2]))
         if quality == "best":
@@ -138,7 +142,7 @@ class Auto(Method):
 
 
 def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates: tuple[Method, ...]) -> Trial | None:
-    """The test reconstructions of a problem; None: no projections of it can be held out."""
+    """The test reconstructions of a problem; None if no projections of the problem can be held out."""
     # In a slab, progress counts only slices.
     silent = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(_sweeps(each) for each in candidates)
@@ -149,12 +153,13 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
 
 
 def _sweeps(method: Method) -> int:
-    """Iterations of the test reconstructions of a method; for a method without any, those of its volume."""
+    """Number of iterations of the test reconstructions of a method; if a method has none, the number of iterations of
+    its volume."""
     return method.trial_sweeps or (method.iterations if isinstance(method, VoxelMethod) else 0)
 
 
 def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:
-    """The problem binned 2 x 2, or not binned if its detector is small; and a text that says which of the two."""
+    """The problem binned 2 x 2 (not binned if its detector is small), and a text that says whether it is binned."""
     if min(problem.geometry.detector_shape) < _SMALLEST:
         return problem, "all rows"
     views = replace(problem.views.masked(), weights=None).binned(2)

@@ -1,4 +1,5 @@
-"""axis_by_views: finds the rotation axis that predicts held-out projections best; for cone beams."""
+"""axis_by_views: finds the column of the rotation axis with which held-out projections are predicted best. It is meant
+for cone beams."""
 
 from __future__ import annotations
 
@@ -23,13 +24,14 @@ COLS = 128  # columns; enough to find the axis to 0.05 of their pixels. More tak
 VIEWS = 90  # projections that suffice
 _LEAST_VIEWS = 12
 _ONE_IN = 3  # share of held-out projections: one in three
-_WIDEST = 0.1875  # largest distance from the start, as a share of the columns
-_TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the same axis
-_WIDER = 2.0  # width of the box, in fields of view, that holds the sample outside the field of view
-_STEPS = 8  # most moves of the parabola's middle towards its vertex
-_WHOLE = 0.999  # share of a binned pixel that must have measured something
-_SHADOWED = 3  # factor on the iterations: material in half of the projections converges late and shifts the axis
-_CLEAR = 0.1  # share by which the best axis must lower the typical residual
+_WIDEST = 0.1875  # largest distance of the axis from the start, as a share of the number of columns
+_TV_WEIGHT = 3e-3  # every weight that suppresses the noise in the volume gives the same axis
+_WIDER = 2.0  # width of the box for a sample that is wider than the field of view, in fields of view
+_STEPS = 8  # largest number of moves of the parabola's middle towards its vertex
+_WHOLE = 0.999  # share of a binned pixel that must have data
+# factor on the iterations: material that only half of the projections see converges late and shifts the axis
+_SHADOWED = 3
+_CLEAR = 0.1  # share by which the best axis must lower the typical residual for the estimate to be confident
 
 
 def axis_by_views(
@@ -39,23 +41,24 @@ def axis_by_views(
     *,
     lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
-    """The axis column for which a volume of two thirds of the projections predicts the other projections best.
+    """The column of the rotation axis with which a volume from two thirds of the projections predicts the other third
+    best.
 
-    The residual has only one minimum if the search begins within some tenths of the detector's width of the axis. The
-    search starts with coarse steps and halves the step around the best candidate. At the end, three candidates are
-    computed on finer pixels. The minimum of the parabola through their residuals is the column. If the sample is wider
-    than the field of view, the box of voxels is twice as wide. For a 180° scan of a sample wider than the field of view
-    in a parallel beam, use `find_axis` instead.
+    Start the search within some tenths of the detector's width from the axis, because there the residual has only one
+    minimum. The search begins with coarse steps and halves the step around the best candidate. At the end, the
+    residuals of three candidates are computed on finer pixels. The minimum of the parabola through these three
+    residuals is the result. If the sample is wider than the field of view, the box of voxels is twice as wide. For a
+    180° scan of a sample wider than the field of view in a parallel beam, use `find_axis` instead.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
         geometry: geometry of these projections; the search begins at its `axis_col`.
-        progress: takes the number of candidates tried so far.
-        lit: [row, col] or [view, row, col], pixels that measured something; None: all.
+        progress: function that gets the number of candidates tried so far. lit: bool [row, col] or [view, row, col],
+            True for pixels with data; None: all pixels have data.
 
     Returns:
-        The estimate. `confident` is False if the residual of the best candidate is nearly as large as that of the
-        others.
+        The estimate. `confident` is False if the residual of the best candidate is nearly as large as the residuals of
+        the others.
 
     Raises:
         AxisError: the best candidate is farther from `axis_col` of `geometry` than a fifth of the detector's width, or
@@ -99,10 +102,11 @@ def axis_by_views(
 
 @dataclass(eq=False)
 class _Residuals:
-    """The residual of the held-out projections for a position of the axis, in columns of the data; computed once.
+    """The residual of the held-out projections for each position of the axis, in columns of the data. Each residual is
+    computed only once.
 
     Attributes:
-        data, geometry, lit: the binned projections, their geometry, and the pixels that measured something.
+        data, geometry, lit: the binned projections, their geometry, and True for pixels with data.
         bin: number of columns of the data in a binned pixel.
         axis_col: position of the axis in this geometry, in columns of the data.
         grid: the grid for all candidates; None: each candidate has its own.
@@ -124,7 +128,8 @@ class _Residuals:
         cls, data: F32, geometry: Geometry, lit: NDArray[np.bool_] | None, size: tuple[int, int], sweeps: int,
         width: float, ask: Callable[[float], None],
     ) -> _Residuals:  # fmt: skip
-        """Residuals of projections binned to about `size` (columns, rows), from the rows around `axis_row`."""
+        """The residuals of projections that are binned to about `size` (columns, rows) and taken from the rows around
+        `axis_row`."""
         rows, axis_col = geometry.detector_shape[0], geometry.axis_col
         binning = max(1, min(rows, geometry.detector_shape[1] // size[0]))
         if (height := size[1] * binning) < rows:
@@ -154,7 +159,7 @@ class _Residuals:
             matter = _norm(measured)
             if matter == 0:
                 raise AxisError(
-                    "give the axis, because it cannot be determined: the held-out projections show no material"
+                    "give the axis: it cannot be determined, because the held-out projections show no material"
                 )
             self.found[axis_col] = _norm(measured - images * lit) / matter
             self.ask(axis_col)
@@ -162,7 +167,7 @@ class _Residuals:
 
 
 def _coarse_optimum(residual: _Residuals, geometry: Geometry) -> tuple[float, float]:
-    """The best column, within half a coarse pixel, and the median residual of the columns tried."""
+    """The best column, accurate to half a coarse pixel, and the median residual of the columns tried."""
     cols, start = geometry.detector_shape[1], geometry.axis_col
     step = _WIDEST / 3 * cols
     best = min((start + n * step for n in range(-3, 4)), key=residual)

@@ -1,4 +1,5 @@
-"""error_bars: the standard deviation of each voxel, from two refits with different weights of the projections."""
+"""error_bars: estimates the standard deviation of each voxel from two refits with different weights of the
+projections."""
 
 from __future__ import annotations
 
@@ -29,12 +30,17 @@ LEAST_VIEWS = 8
 
 _EXTRA = 0.5  # one half of the projections weighs this much more, the other half this much less
 _SHARE = 0.2  # share of a method's iterations in each of the two refits
-_WINDOW = 7  # side in voxels of the cube over which variances are averaged; a single one is uncertain by a factor 1.4
-_CLASSES = 4  # classes of the gradient, averaged separately, because edges vary more than their surroundings
+# side, in voxels, of the cube over which variances are averaged; the variance from a single voxel is uncertain by a
+# factor of 1.4
+_WINDOW = 7
+# number of classes of the gradient; variances are averaged separately in each, because edges vary more than their
+# surroundings
+_CLASSES = 4
 _EDGE = 0.7  # voxels; standard deviation of the blur before the gradient
 _SAMPLED = 2**20  # number of voxels from which the limits of the classes are computed
-_OF_RUN = ("units", "weight", "balance", "strength", "threshold")  # decisions of the run that a refit follows
-_LIMITS = "limits"  # name of a decision that only error bars make; tells them from decisions of the run
+_OF_RUN = ("units", "weight", "balance", "strength", "threshold")  # decisions of the run that a refit uses again
+# name of a decision that only error bars make; it distinguishes their decisions from those of the run
+_LIMITS = "limits"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,27 +61,27 @@ def error_bars(
 ) -> ErrorBars | None:
     """The standard deviation of each voxel of `volume`, which `method` made from the projections of `problem`.
 
-    The projections, in the order of their angles, are divided into two halves, with every other projection in each. An
-    iterative method continues from the volume twice, with fewer iterations. In the first refit, one half weighs 1.5 and
-    the other 0.5; in the second refit it is the reverse. Half the difference of the refits, divided by 0.5, has the
-    variance of the noise. This is a jackknife of two groups, by weights (Shao & Tu 1995, The Jackknife and Bootstrap,
-    2.3). Incomplete convergence is the same in both refits and cancels. For a fit, the voxel method that made or
-    refined the volume makes the refits. FBP is linear: half the difference of the FBPs of both halves is the FBP of the
-    projections with alternating signs.
+    The projections, in the order of their angles, are assigned alternately to two halves. An iterative method continues
+    from the volume twice, with fewer iterations. In the first refit, one half has weight 1.5 and the other 0.5; in the
+    second refit, the weights are exchanged. Half the difference of the two refits, divided by 0.5, has the same
+    variance as the noise of the volume. This is a jackknife of two groups, by weights (Shao & Tu 1995, The Jackknife
+    and Bootstrap, 2.3). The error from incomplete convergence is the same in both refits and cancels. If the method is
+    a Gaussian fit, the voxel method that refined its volume makes the refits. FBP is linear: half the difference of the
+    FBPs of both halves is the FBP of the projections with alternating signs.
 
-    A single squared difference is a poor estimate of the variance. So it is averaged over 7³ voxels, separately in four
-    classes of the gradient. Noise is one part of the error. The other part is the blur and the smoothing of the method,
-    which refits do not show. So the result is √((a s)² + (b g)²), where s is the deviation by the refits and g the
-    change of the volume from voxel to voxel. `Method.error_bars` has a and b. They were chosen on simulated scans, so
-    that about 68 % of the true voxels are within one deviation (docs/error_bars.md).
+    The squared difference in a single voxel is a poor estimate of the variance. So it is averaged over 7³ voxels,
+    separately in four classes of the gradient. Noise is one part of the error. The other part is the blur and the
+    smoothing of the method, which refits do not show. So the result is √((a s)² + (b g)²). Here s is the deviation from
+    the refits, and g is the change of the volume from voxel to voxel. `Method.error_bars` has the factors a and b. They
+    were chosen on simulated scans, so that about 68 % of the true values are within one deviation (docs/error_bars.md).
 
     Args:
-        method: the method that made the volume; not one that chooses among methods.
+        method: the method that made the volume. A method that chooses among methods, such as `Auto`, is not allowed.
         decided: the decisions of the run, or `ErrorBars.decided` of another slab.
-        control: is told the progress after each iteration, and may then stop the computation.
+        control: gets the progress after each iteration, and may stop the computation there.
 
     Returns:
-        None if `control` stopped it.
+        The error bars; None if `control` stopped the computation.
 
     Raises:
         ValueError: error bars of the method are not calibrated, there are fewer than eight projections, or the fit
@@ -85,8 +91,8 @@ def error_bars(
     if method.error_bars is None:
         known = ", ".join(names_where(lambda each: each.error_bars))
         raise ValueError(
-            f"the error bars of {method.name} are not calibrated. Use one of the methods with calibrated error bars: "
-            f"{known}"
+            f"use one of the methods with calibrated error bars: {known}. The error bars of {method.name} are not "
+            f"calibrated"
         )
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
@@ -117,7 +123,8 @@ def error_bars(
 
 
 def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Method:
-    """The method whose refits show the noise; for a fit, the voxel method that made or last refined its volume.
+    """The method that makes the refits: the given method, or for a Gaussian fit, the voxel method that last refined its
+    volume.
 
     Raises:
         ValueError: the fit has no voxel refinement.
@@ -140,7 +147,7 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
 
 
 def alternating(geometry: Geometry) -> F32:
-    """Signs [view]: 1 and -1 alternating in the order of the angles."""
+    """Signs [view]: alternately 1 and -1, in the order of the angles."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     signs = np.empty(order.size, np.float32)
     signs[order] = 1 - 2 * (np.arange(order.size) % 2)
@@ -161,7 +168,8 @@ def _refitted(
     decided: Mapping[str, Sequence[Any]],
     control: RunControl,
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
-    """Half the difference of two refits, divided by the extra weight, and their decisions; None: it was stopped."""
+    """Half the difference of two refits, divided by the extra weight, and the decisions of the refits. None if it was
+    stopped."""
     refit = method.refit(_SHARE)
     sweeps, begin, done = refit.iterations, control.now(), 0
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
@@ -194,7 +202,8 @@ def _refitted(
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:
-    """The decisions of a run that refits use. If a weight changed during the run, they use its last value."""
+    """The decisions of a run that refits use again. If a weight changed during the run, the refits use its last
+    value."""
     kept = {name: list(decided[name]) for name in _OF_RUN if name in decided}
     return {name: sweeps * made[-1:] if name == "balance" else made for name, made in kept.items()}
 
@@ -216,7 +225,7 @@ def _limits(gradient: F32, classes: int) -> list[float]:
 
 
 def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:
-    """The mean of the squares over a window, only over voxels whose gradient is in the same class."""
+    """The mean of the squares over a window. Only voxels whose gradient is in the same class are averaged."""
     if not limits:
         out = uniform_filter(squares, _WINDOW)
     else:

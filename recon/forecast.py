@@ -1,4 +1,4 @@
-"""forecast: the expected duration of a reconstruction, from a few timed iterations on a part of the scan."""
+"""forecast: predicts the duration of a reconstruction from a few timed iterations on a part of the scan."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.priors import STEPS
 
 VOXELS = 2**20
-"""Number of voxels in the timed part: so many that they do not fit into the caches of a processor several times."""
+"""Number of voxels in the timed part. It is so large that the part does not fit into the caches of a processor."""
 
 _ROWS, _VIEWS = 48, 128  # largest numbers of rows and projections in the timed part
-_ITERATIONS, _PATCH_STEPS, _FIT_STEPS = 4, 2 * STEPS, 12  # timed ones; of the first one only the end is known
+# number of timed iterations; only the end of the first one is known
+_ITERATIONS, _PATCH_STEPS, _FIT_STEPS = 4, 2 * STEPS, 12
 _LEAST_COLS = 32
-_NOISE = np.float32(0.01)  # noise of the projections; without it the weight of total variation would be 0
-_RENDER = 1 / 3  # rendering a projection, as a share of a fit step, which also computes the gradient
+_NOISE = np.float32(0.01)  # noise of the simulated projections; without noise the weight of total variation would be 0
+_RENDER = 1 / 3  # time to render a projection, as a share of the time of a fit step (which also computes the gradient)
 
 
 class Forecast(NamedTuple):
@@ -43,7 +44,7 @@ class Forecast(NamedTuple):
 
     Attributes:
         choice_seconds: duration of the test reconstructions that choose a method or the weight of a prior.
-        volumes: duration of the volume after them, by the name of each method that may be chosen.
+        volumes: duration of the volume itself, by the name of each method that may be chosen.
     """
 
     choice_seconds: float
@@ -59,7 +60,8 @@ class Forecast(NamedTuple):
 
 
 class RunTiming(NamedTuple):
-    """Timing of a run: seconds outside its iterations, seconds of each iteration, and the planned number."""
+    """Timing of a run: seconds outside its iterations, seconds of one iteration, and the planned number of
+    iterations."""
 
     fixed: float
     each: float
@@ -74,12 +76,13 @@ class RunTiming(NamedTuple):
 
 
 def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Forecast | None:
-    """Expected duration of a method for these projections and voxels; None: unknown, because it makes several volumes.
+    """Expected duration of a method for these projections and voxels. None: the duration is unknown, because the method
+    makes several volumes.
 
     Call `recon.warm_up` first, so that the kernels are compiled before they are timed.
 
     Args:
-        now: the clock in s. With a clock of processor time, the result holds for a machine on which nothing else runs.
+        now: the clock in s. With a clock of processor time, the result is that of a machine on which nothing else runs.
 
     Raises:
         ValueError: the method cannot use the projections.
@@ -88,7 +91,8 @@ def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Fore
 
 
 class Timing:
-    """Durations of methods for given projections and voxels, timed on a part of them at the first request."""
+    """Durations of methods for given projections and voxels. At the first request, a method is timed on a part of
+    them."""
 
     def __init__(self, geometry: Geometry, grid: Grid, now: Clock, voxels: int = VOXELS) -> None:
         self._geometry, self._grid, self._now, self._voxels = geometry, grid, now, voxels
@@ -124,7 +128,8 @@ class Timing:
         return (self._now() - begin) * _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
 
     def pace(self, method: Method, of_trial: bool = False) -> RunTiming:
-        """Expected timing of an iterative method in all voxels, from a part of them or from the rows of a test."""
+        """Expected timing of an iterative method in all voxels, computed from a timed part of the voxels, or from the
+        rows of a test reconstruction."""
         key = f"{of_trial} {method!r}"
         if key not in self._paces:
             part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
@@ -134,8 +139,8 @@ class Timing:
                 further = method.further_sweeps(self._geometry, self._grid)
                 pace = pace._replace(planned=min(pace.planned, method.usual_sweeps) + further)
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
-            # A step that does not use all projections costs the same for any number of them: it grows with the samples
-            # along a ray.
+            # A step that uses only some projections takes the same time, however many projections there are. Its time
+            # grows with the number of samples along a ray.
             along = max(self._grid.shape) / max(part.grid.shape)
             self._paces[key] = pace.scaled(scale, scale if on_voxels else along)
         return self._paces[key]
@@ -189,7 +194,8 @@ class Timing:
         return 2 * _RENDER * self._geometry.n_views * self.fit_pace(method).each / method.fit.views_per_step
 
     def _of_choice(self, candidates: tuple[Method, ...]) -> Forecast:
-        """Expected duration of a method that tries others. The search for their prior is done once for all of them."""
+        """Expected duration of a method that tries other methods. The search for a prior is made once for all of
+        them."""
         each = [self.of(candidate) for candidate in candidates]
         if not self._trial_share:
             return each[-1]
@@ -207,10 +213,10 @@ class Timing:
 
 
 def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:
-    """Noisy projections of a cylinder with some of the rows and columns, and the grid that matches them.
+    """Noisy projections of a cylinder with some of the rows and columns, and the grid that matches these projections.
 
     Args:
-        voxels: approximate number of voxels; None: all columns of all projections, which direct methods need together.
+        voxels: approximate number of voxels; None: all columns of all projections, which direct methods need.
     """
     rows, cols = geometry.detector_shape
     height = min(rows, most_rows)
@@ -236,7 +242,8 @@ def _work(geometry: Geometry, grid: Grid) -> float:
 
 
 def _covered(voxels: float, gaussians: float) -> float:
-    """A number proportional to the pixels that Gaussians as wide as their distances cover in a projection."""
+    """A number proportional to the number of pixels that the Gaussians cover in a projection, if each is as wide as the
+    distance to its neighbours."""
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 

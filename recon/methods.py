@@ -1,6 +1,7 @@
 """The registry of reconstruction methods: one line for each method, here or in the folder of its feature.
 
-A line says where the class of the method is. So the names are known without loading the libraries of the methods.
+A line gives the module and the name of the method's class. So the names of methods are known without loading their
+libraries.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ BASELINE = "fbp"  # Reports compare all methods with this one
 def _entry(name: str, method: type[Method]) -> MethodEntry:
     """The registry's line for a method of another package."""
     if not issubclass(method, Method):
-        raise ValueError("its class must derive from one of the classes in recon.base.method_kinds")
+        raise ValueError("the class must derive from one of the classes in recon.base.method_kinds")
     if method.name != name:
         raise ValueError(f"the `name` of its class is {method.name!r}; expected the name of the entry point")
     entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
@@ -63,7 +64,7 @@ def _entry(name: str, method: type[Method]) -> MethodEntry:
 
 
 METHODS = Registry("method", REGISTRY, _entry, reserved=(AUTO,))
-"""All methods, including those of other packages."""
+"""The registry of all methods, including those of other packages."""
 
 
 def names() -> tuple[str, ...]:
@@ -77,7 +78,8 @@ def names_of_one_volume() -> tuple[str, ...]:
 
 
 def names_of_trials() -> tuple[str, ...]:
-    """Names of the methods that make one volume from the projections alone, so that a trial can compare them."""
+    """Names of the methods that make one volume and need nothing but the projections, so that a trial can compare these
+    methods."""
     return tuple(name for name, entry in METHODS.items() if not (entry.several or entry.reference))
 
 
@@ -87,7 +89,7 @@ def names_compared() -> tuple[str, ...]:
 
 
 def streams(name: str) -> bool:
-    """Whether a method can reconstruct during the scan; False for AUTO. Imports nothing.
+    """Whether a method can reconstruct during the scan; False for AUTO. The function imports no module of this project.
 
     Raises:
         ValueError: the name is unknown.
@@ -111,7 +113,7 @@ def taking(field: str) -> tuple[str, ...]:
 
 
 def has_setting(method: type[Method], field: str) -> bool:
-    """Whether the settings class has this field; "fit.loss" is the field `loss` in the default value of `fit`."""
+    """Whether the settings class has this field. "fit.loss" means the field `loss` in the default value of `fit`."""
     value: Any = method()
     *outer, last = field.split(".")
     for name in outer:
@@ -129,7 +131,7 @@ def setting_names(method: Any) -> list[str]:
 
 
 def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
-    """A method with these settings, named as in `taking`; other settings have their defaults.
+    """A method with these settings, which are named as in `taking`. Other settings have their defaults.
 
     Raises:
         ValueError: the method does not have the setting, or the value is not allowed.
@@ -144,7 +146,7 @@ def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
 
 
 def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
-    """A method, or a part of its settings, with these settings changed; named as in `taking`."""
+    """A method, or a part of its settings, with these settings changed. The settings are named as in `taking`."""
     flat = {name: setting for name, setting in settings.items() if "." not in name}
     nested: dict[str, dict[str, Any]] = {}
     for name, setting in settings.items():

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 
-_CLUSTERED = 20_000  # values from which centres are computed
+_CLUSTERED = 20_000  # number of values from which the centres are computed
 _STARTS = 8
 MOST = 6
 
@@ -30,9 +30,11 @@ class Clusters:
 
     @property
     def threshold(self) -> float:
-        """Half-way between the brightest centre and the centre of the largest other cluster.
+        """Threshold between particles and the rest: half-way between the brightest centre and the centre of the largest
+        other cluster.
 
-        Clusters between these two are voxels at edges, mixtures of both. The edge is half-way (ISO 50 % rule).
+        Clusters between these two contain voxels at edges, which are mixtures of both. An edge is assumed half-way (ISO
+        50 % rule).
         """
         return float(self.centres[-1] + self.centres[:-1][self.shares[:-1].argmax()]) / 2
 
@@ -47,7 +49,7 @@ def k_means(values: NDArray[np.floating], k: int, seed: int = 0) -> F64:
 
 
 def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) -> Clusters:
-    """Divide grey values into k clusters. k None: the elbow rule chooses 2 to 5, see `elbow`.
+    """Divide grey values into k clusters. If k is None, the elbow rule chooses 2 to 5 clusters, see `elbow`.
 
     Raises:
         ValueError: as for `k_means`, or k is below 2.
@@ -68,8 +70,8 @@ def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) 
 def elbow(inertias: F64) -> int:
     """The number of clusters at the elbow of the mean squared distances W for 1, 2, ... clusters; at least 2.
 
-    The elbow is the sharpest bend of log(W). W itself (Thorndike 1953) has its sharpest bend at 2 for any number of
-    equal steps of grey value, because it falls as 1 / k² up to that number.
+    The elbow is the sharpest bend of log(W). Thorndike (1953) takes the sharpest bend of W. But if a sample has several
+    grey values at equal steps, W falls as 1 / k² up to their number, and its sharpest bend is always at 2.
     """
     if inertias.size < 3:
         return 2
@@ -87,7 +89,7 @@ def _sampled(values: NDArray[np.floating], seed: int) -> F64:
 
 
 def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
-    """Centres, ascending, and the mean squared distance of the values to them."""
+    """Centres, ascending, and the mean squared distance of the values to their centres."""
     from scipy.cluster.vq import ClusterError, kmeans2
 
     if np.unique(sample).size < k:

@@ -35,7 +35,8 @@ from recon.voxels.view_weights import covers_the_circle, density_errors, unseen_
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LOOKED_AT, _LARGEST = 2**16, 1e15  # values in the sample; largest line integral (true ones end at about 15)
+# number of values in the sample; largest line integral (measured ones end at about 15)
+_LOOKED_AT, _LARGEST = 2**16, 1e15
 
 
 def reconstruct(
@@ -61,7 +62,7 @@ def reconstruct(
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
-        projections see, so a smaller box is identical to that part of the whole volume.
+            projections see. So if you ask for a smaller box, its voxels are identical to those of the whole volume.
         seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
         of threads.
         device: where the method computes: "cpu" or "cuda" (the current CUDA device).
@@ -142,7 +143,8 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
 
 
 def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
-    """Warn of the densities of a direct method. Iterative methods explain the line integrals, so theirs are right."""
+    """Warn that the densities of a direct method are wrong. Those of iterative methods are right, because these methods
+    explain the line integrals."""
     if geometry.is_cone or not isinstance(method, Direct) or not (unseen := unseen_wedges(geometry)):
         return
     missing = sum(wedge.size for wedge in unseen)

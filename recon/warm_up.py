@@ -27,7 +27,7 @@ _SHAPE, _VIEWS = (12, 16), 4
 _SEVERAL = 12  # factor on the number of projections, for methods that make several volumes
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 _RECONSTRUCTED: set[tuple[object, ...]] = set()
-"""Small examples, with method and geometry, whose kernels this process has already loaded."""
+"""The small examples (method and geometry) whose kernels this process has already loaded."""
 
 
 def warm_up(
@@ -40,9 +40,9 @@ def warm_up(
 ) -> None:
     """Compile all kernels of a method by reconstructing a small example.
 
-    For a fit this takes 1 to 2 minutes the first time on a machine, and a fraction of a second later. A process
-    reconstructs each example once. numba stores compiled kernels next to the package (or in the user's cache folder),
-    once for each kind of processor.
+    For a fit, this takes 1 to 2 minutes the first time on a machine, and a fraction of a second each later time. A
+    process reconstructs each example once. numba stores compiled kernels next to the package (or in the user's cache
+    folder), once for each kind of processor.
 
     Kernels for another kind of geometry, first volume or ray are compiled only if they are needed. Tilted projections,
     a cone or weights add a sixth of the time. The start "tv" adds a third, and a short cone scan with exact rays adds
@@ -52,15 +52,17 @@ def warm_up(
         method: the method with the settings of the later run; None: the default method with its default settings.
         geometry: geometry of the later run; None: a parallel beam without roll and tilt.
         weighted: True if the rays have weights, or values that are not finite.
-        on_kernel: function called after each compiled function with their number so far; never called if all are
-            cached.
+        on_kernel: function called after each compiled function, with the number of functions compiled so far. It is
+            never called if all kernels are cached.
 
     Raises:
         ValueError: the method cannot use such projections.
     """
     method = method or by_name(DEFAULT)()
     if geometry is not None:
-        method.views_wanted(geometry)  # the error names the missing degrees of this geometry, not those of the example
+        method.views_wanted(
+            geometry
+        )  # with this geometry, an error states the missing degrees of the later run, not those of the example
     data, views = toy_of(geometry, _SEVERAL if isinstance(method, Series) else 1)
     where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
@@ -104,11 +106,11 @@ def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
 
 
 def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geometry]:
-    """Line integrals [view, row, col] of a Gaussian in four small projections, which run the same kernels as
-    `geometry`.
+    """Line integrals [view, row, col] of a Gaussian in four small projections, and their geometry. They run the same
+    kernels as `geometry`.
 
-    They have the same beam, roll, tilt and shifts as `geometry`, and also cover 360° or not. The four projections are
-    repeated `times` times.
+    The four projections have the same beam, roll, tilt and shifts as `geometry`. They cover 360° if `geometry` does.
+    The four projections are repeated `times` times.
     """
     once = views = _views_like(geometry)
     for _ in range(times - 1):
@@ -134,7 +136,7 @@ def _views_like(geometry: Geometry | None) -> Geometry:
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
         leaning = (geometry.roll != 0) | (geometry.tilt != 0) | geometry.centres.any(axis=1)
-        # If only some projections are tilted, the same is true here.
+        # If only some projections of `geometry` are tilted, only some are tilted here.
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     return views

@@ -1,9 +1,9 @@
 """Python interface for operators: connect to the instrument, scan, watch, check and reconstruct, from a script or a
 notebook.
 
-`docs/python.md` begins with three scripts. Everything here calls the functions behind the commands: files, checks,
-messages and errors are the same. Importing this package loads neither torch nor a driver; each function loads
-its modules at its first call.
+`docs/python.md` begins with three scripts. The functions of this package call the same code as the commands, so files,
+checks, messages and errors are the same. Importing this package loads neither torch nor a driver. Each function loads
+its modules when it is first called.
 """
 
 from __future__ import annotations

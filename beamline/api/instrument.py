@@ -30,14 +30,14 @@ from recon.base.registry import loaded
 
 Say = Callable[[str], None]
 
-_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets again
+_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that every scan sets itself
 
 
 class ScanResult(RunResult):
-    """A `RunResult` as scripts and notebooks get it."""
+    """Result of a scan for scripts and notebooks: a `RunResult` that a notebook can display."""
 
     def _repr_html_(self) -> str:
-        """HTML for a notebook: the middle projection as counts, and what the scan and its monitor say."""
+        """HTML for a notebook: the middle projection as counts, and the results of the scan and of its monitor."""
         flags = [(check, level, n) for check, levels in self.flags.items() for level, n in levels.items()]
         facts = {
             "scan": f"{self.status}, {count(self.n_frames, 'frame')}, {size(self.bytes)}, {self.seconds:.1f} s",
@@ -51,7 +51,7 @@ class ScanResult(RunResult):
             with open_scan(self.path) as source:
                 views = source.table.views
                 pixels, (low, high) = grey(source.read([int(views[views.size // 2])])[0])
-        except (DataError, IndexError) as error:  # the file was moved, or has no projection
+        except (DataError, IndexError) as error:  # the file was moved, or it has no projection
             return html(self.sample or "scan", np.zeros((1, 1), np.uint8), {**facts, "picture": str(error)})
         return html(self.sample or "scan", pixels, {**facts, "grey": f"black {low:.4g}, white {high:.4g} counts"})
 
@@ -61,7 +61,7 @@ class Instrument:
 
     Attributes:
         config: the configuration of the devices.
-        last: result of the newest scan, even if the scan raised an error; None before the first scan, and if the newest
+        last: result of the newest scan, even if that scan raised an error. None before the first scan, or if the newest
             scan took no frame.
     """
 
@@ -93,26 +93,26 @@ class Instrument:
         stop: StopRequest | None = None,
         on_event: Callable[[Event], None] | None = None,
     ) -> ScanResult:
-        """Run a scan, as `beamline scan` does: in a new folder, with every frame checked and a file that stays
-        readable.
+        """Run a scan in the same way as `beamline scan`: in a new folder, with a check of every frame, and with a file
+        that stays readable after a failure.
 
-        The first Ctrl-C stops the scan cleanly, the second aborts it; both also end a loop over samples. Python
-        delivers signals only to the main thread: use `stop` in other threads.
+        The first Ctrl-C stops the scan cleanly, the second aborts it; both also end a loop over samples. In other
+        threads than the main thread use `stop`, because Python delivers signals only to the main thread.
 
         Args:
-            sample: name of the sample, in the file and in the folder's name; None: the configured one.
+            sample: name of the sample, which is written to the file and into the folder's name; None: the configured
+                name.
             energy_kev: energy of the beam, written to the file. If a monochromator is configured, it moves to this
                 energy.
-            set: values that replace those of the configuration for this scan only, such as {"scan.angles.views":
-                90}.
+            set: configuration values for this scan only, such as {"scan.angles.views": 90}.
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
-            stop: ends the scan from another thread.
-            on_event: gets every event of the run, in a separate thread.
+            stop: request with which another thread can end the scan.
+            on_event: function that gets every event of the run. It is called in a separate thread.
 
         Raises:
-            ConfigError: a wrong value, an exceeded limit, or a value that would require opening the devices again;
-                nothing has moved.
+            ConfigError: a value is wrong, exceeds a limit, or would require opening the devices again. Nothing has
+                moved.
             DeviceError: a device failed.
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
@@ -186,15 +186,15 @@ def connect(
 
     Args:
         config: path of the configuration file.
-        set: values that replace those of the file, such as {"scan.angles.views": 90}.
-        ask: function that asks the operator to move the shutter or the sample by hand, and returns when that is
-            done. None: ask at the terminal.
-        say: function that gets a sentence on what happens, as the commands print it (`print`, a logger's `info`);
+        set: values that replace values of the file, such as {"scan.angles.views": 90}.
+        ask: function that asks the operator to move the shutter or the sample by hand, and returns when the operator
+            has done it. None: ask at the terminal.
+        say: function that gets each message that a command would print, for example `print` or the `info` of a logger;
             None: no messages.
 
     Raises:
         ConfigError: the configuration is wrong; the message lists every fault with file, line, key and allowed values.
-        DeviceError: a device does not answer; those opened before it are closed again.
+        DeviceError: a device does not answer. The devices that were opened before it are closed again.
     """
     refuse_wrong_arguments(connect, locals())
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
@@ -219,27 +219,28 @@ def plan(
     set: Mapping[str, object] | None = None, output: str | Path | None = None, rehearse: bool = False,
     live: bool = True,
 ) -> QueuePlan:  # fmt: skip
-    """Plan several scans, as `beamline scan A B --dry-run` does: which can run, how long they take, what they need.
+    """Plan several scans, as `beamline scan A B --dry-run` does: which of them can run, how long they take, and what
+    they need.
 
-    No device is used. If a scan cannot run, the other scans are planned nevertheless. A hundred scans take less than a
-    second, not counting the import.
+    No device is used. If a scan cannot run, the other scans are still planned. Planning a hundred scans takes less than
+    a second, not counting the import.
 
     Args:
-        scans: each a configuration file; a table of scans (.csv); a row of such a table as a mapping, such as
-            {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}; or a plan of bluesky, such as
-            `fly(scan)`, which is read without running it and cannot be run afterwards.
-        set: values that replace those of all configurations, such as {"scan.angles.views": 90}.
-        output: folder in which the folders of the runs would be created; None: `storage.folder`.
+        scans: each is one of four things. (1) A configuration file. (2) A table of scans (.csv). (3) A row of such a
+            table as a mapping, such as {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}. (4) A
+            plan of bluesky, such as `fly(scan)`; it is read without running it, and cannot be run afterwards.
+        set: values that replace values in all configurations, such as {"scan.angles.views": 90}.
+        output: folder in which the scans would create the folders of their runs; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.
         live: False: without live reconstructions, even if `recon.live` is on.
 
     Returns:
         `scans` in their order, each with `valid`, `faults` (each with message, file and line) and `needs`: `duration`
-        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what the `operator` has to do. The plan's own
-        `needs` are the sums of those that can run.
+        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what the `operator` has to do. The `needs` of
+        the plan itself are the sums over the scans that can run.
 
     Raises:
-        ConfigError: an argument of the wrong type. What is wrong with a scan is in its `faults`.
+        ConfigError: an argument has the wrong type. Errors in a scan do not raise; they are listed in its `faults`.
     """
     refuse_wrong_arguments(plan, locals())
     described = list[Path | Mapping[str, object] | PlannedScan]()
@@ -264,7 +265,7 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
 
 
 def _result(events: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
-    """The result of a scan, taken from its events; None if it ended before its file was made."""
+    """The result of a scan, taken from its events. None if the scan ended before its file was made."""
     scan = next((event for event in events if isinstance(event, ScanDone)), None)
     recon = next((event for event in events if isinstance(event, ReconDone)), None)
     if scan is None:

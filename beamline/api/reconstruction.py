@@ -1,4 +1,5 @@
-"""Reads, watches, checks and reconstructs a scan file from Python; returns volumes, numbers and findings."""
+"""Functions that read, follow, check and reconstruct a scan file from Python. They return volumes, numbers and
+findings."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ from recon.base.choices import AUTO
 from recon.base.method import Method
 from recon.base.volume import Volume
 
-ReconResult = ReconRecord  # what scripts get
+ReconResult = ReconRecord  # names that scripts import from here
 
 
 def reconstruct(
@@ -57,8 +58,8 @@ def reconstruct(
 ) -> ReconResult:
     """Reconstruct a finished scan of any format, as `beamline recon` does.
 
-    The first Ctrl-C during a fit or iterations ends them with the volume reached so far (`ended_early`), the second
-    discards it.
+    The first Ctrl-C during a fit or during iterations ends the work with the volume reached so far (`ended_early`). The
+    second Ctrl-C discards the volume.
 
     Args:
         path: a scan file, or the folder of a run.
@@ -68,18 +69,18 @@ def reconstruct(
         rows: detector rows to use, such as slice(500, 756); the volume has one slice per row.
         views: projections to use: all, fixed:90, first:60, every:2, ... as for the option --views.
         binning: number of pixels averaged along each side.
-        selection: other options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
-            `beamline.projections.corrections`; the arguments above take precedence.
-        output: file of the volume, as for the option -o (.h5, .tif, .npy, ...), with a report next to it; None: no
-            file is written. A scan that does not fit into the memory needs an output file.
-        say: function that gets a sentence on what happens; None: no messages.
+        selection: further options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)), whose steps are in
+            `beamline.projections.corrections`. The arguments above take precedence.
+        output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to it.
+            None: no file is written. If the scan does not fit into the memory, an output file is required.
+        say: function that gets each message that the command would print; None: no messages.
 
     Raises:
-        ConfigError: an impossible method or selection.
+        ConfigError: the method or the selection is not possible.
         DataError: the path is not a scan, no volume can be made from its data, or the output exists or cannot be
             written.
 
-    In case of an error nothing is written.
+    If an error is raised, nothing has been written.
     """
     refuse_wrong_arguments(reconstruct, locals())
     source, chosen = SourceOptions(scan_file(path), frames_per_view=None), _method(method)
@@ -110,7 +111,7 @@ def _method(method: str | Method) -> Method:
 
 @contextmanager
 def target_of(output: str | Path | None) -> Iterator[OutputPaths]:
-    """Paths of the result and its report; without an output nothing is written."""
+    """Paths of the result and of its report. Without an output, no file is written."""
     if output is not None:
         yield OutputPaths(Path(output), report_beside(Path(output)))
     else:
@@ -140,7 +141,7 @@ def monitor(
     Args:
         path: a scan file, or the folder of a run.
         config: configuration file whose sections `monitor` and `references` give the limits; None: the default limits.
-        set: values that replace those of `config`.
+        set: values that replace values of `config`.
         follow: wait for the end of a scan that is still running.
 
     Raises:
@@ -163,8 +164,8 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
     Frames are counts: `frame.counts` uint16 [row, col].
 
-    If the scan is fast, call this in another process than the scan. In the process of the scan, reading and writing
-    wait for each other, so a slow reader slows the scan down.
+    If the scan is fast, call `stream` in another process than the scan. In the same process, reading and writing wait
+    for each other, so that a slow reader slows the scan down.
 
     Args:
         path: a scan file, or the folder of a run (its newest part). The file need not exist yet.
@@ -183,7 +184,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
 def volumes(run: str | Path) -> Iterator[Volume]:
     """Iterate over the volumes of a run: the live volume after each update, and finally the finished volume. The
-    iteration ends with the run.
+    iteration ends when the run ends.
 
     Args:
         run: folder of the run. If the run has already ended, only its last volume is returned.
@@ -195,13 +196,13 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     folder, shown = Path(run), None
     watch = watched(folder)
     while True:
-        over = describe(folder).over  # asked before the volume, so that none is missed
+        over = describe(folder).over  # asked before the volume is read, so that no volume is missed
         newest_volume = newest(watch.volumes)
         if newest_volume is not None and newest_volume != shown:
             with (
                 suppress(DataError),
                 opened_volume(newest_volume.path) as record,
-            ):  # the next volume is taking its place
+            ):  # the next volume is just replacing this one
                 volume = replace(record.volume, data=np.array(record.volume.data))
                 shown = newest_volume
             if shown is newest_volume:

@@ -1,8 +1,8 @@
 """The camera as a detector of ophyd-async (StandardDetector), for `count`, step scans and fly scans of other plans.
 
-From stage to unstage its frames go into one NXtomo file of this program. If the detector triggers a frame itself, the
-frame has the present angle of the stage. If a pulse on a cable exposes a frame, its angle is unknown (NaN): only a
-complete scan of this program (`TomoScan`) knows which pulse exposed which frame.
+From stage to unstage, the frames of the camera go into one NXtomo file of this program. If the detector triggers a
+frame itself, the frame has the present angle of the stage. If a pulse on a cable exposes a frame, the angle is unknown
+(NaN), because only a complete scan of this program (`TomoScan`) knows which pulse exposed which frame.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource
 
 PATIENCE = 5.0
-"""s beyond the exposure after which a frame that the detector triggered is lost."""
-LOOK_EVERY = 0.2  # s, at a request to stop
+"""s after the exposure at which a frame that the detector triggered counts as lost."""
+LOOK_EVERY = 0.2  # s; wait after a request to stop
 
 
 class ShownFrames(StrictEnum):
-    """The kind of the frames. Shutter and sample are moved accordingly."""
+    """The kind of the frames. Shutter and sample are moved to suit this kind."""
 
     PROJECTION = "projection"
     FLAT = "flat"
@@ -57,7 +57,8 @@ class ShownFrames(StrictEnum):
 
 
 class _Frames(DetectorAcquireLogic):
-    """Frames between stage and unstage, taken and written by a thread. `n`, `settings`: of the next ones."""
+    """Frames between stage and unstage. A thread takes and writes them. `n`, `settings`: number and settings of the
+    next frames."""
 
     def __init__(self, config: Config, instrument: ConnectedDevices, runs: Path | None) -> None:
         self._config, self._instrument = config, instrument
@@ -65,14 +66,15 @@ class _Frames(DetectorAcquireLogic):
         self._runs, self._stop, self._ending = runs or Path(config.storage.folder), Event(), asyncio.Lock()
         self._writer: NXtomoWriter | None = None
         self._task: asyncio.Task[None] | None = None
-        self._lacking = range(0)  # triggers without a frame, of those asked for last
+        self._lacking = range(0)  # triggers without a frame, among those requested last
         self.provider: _Rows | None = None
         self.ended_by: Callable[[], str] = lambda: "success"  # how the plan has ended
         self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
     async def prepare(self, trigger: TriggerSource, n: int, exposure: float, apart: float = 0.0) -> None:
-        """Set the camera; `apart` is the time between exposures, s. Raises DeviceRefused if it does not accept that."""
+        """Set the camera. `apart` is the time between exposures in s. Raises DeviceRefused if the camera does not
+        accept it."""
         if n < 1:
             raise ValueError(f"the camera was prepared for {n} frames; expected 1 or more")
         wanted = camera_settings(self._config, exposure or self._config.scan.exposure_s, trigger)
@@ -80,7 +82,7 @@ class _Frames(DetectorAcquireLogic):
         self.n, self._apart = n, apart
 
     async def new_file(self) -> tuple[Path, tuple[int, int]]:
-        """Create the file in a new run folder; also returns the shape of its frames."""
+        """Create the file in the folder of a new run. Also returns the shape of its frames."""
         await self.ensure_stopped()
         self._writer, self._lacking = await asyncio.to_thread(self._created), range(0)
         self._set_rows(0)
@@ -89,12 +91,13 @@ class _Frames(DetectorAcquireLogic):
     def _created(self) -> NXtomoWriter:
         config, shape = self._config, self._devices.camera.timing.shape
         folder = create_run_folder(self._runs, config.sample.name, self._clock.now())
-        info = replace(scan_info(config, self._instrument), beam_unit=None)  # nobody reads the beam monitor meanwhile
+        # meanwhile no other code reads the beam monitor
+        info = replace(scan_info(config, self._instrument), beam_unit=None)
         bin_ = config.storage.preview_bin
         return NXtomoWriter(folder / SCAN, info, shape, clock=self._clock, preview_bin=bin_)
 
     async def start_acquiring(self) -> None:
-        """Bring shutter and sample to their places, arm, and take frames in the background."""
+        """Bring shutter and sample to their positions, arm the camera, and take frames in the background."""
         kind, loop = FrameKind[(await self.kind.get_value()).name], asyncio.get_running_loop()
         self._stop.clear()
         rows = 0 if self._writer is None else self._writer.rows
@@ -108,12 +111,12 @@ class _Frames(DetectorAcquireLogic):
             await self._task
 
     async def refuse_failure(self) -> None:
-        """Raise what ended the frames early, if anything did."""
+        """Raise the error that ended the frames early, if there was one."""
         if self._task is not None and self._task.done():
             await self._task
 
     async def ensure_stopped(self) -> None:
-        """Stop, disarm, close shutter and file, with the sample back. A second call does nothing."""
+        """Stop and disarm the camera, close shutter and file, and bring the sample back. A second call does nothing."""
         async with self._ending:
             self._stop.set()
             if self._task is not None:
@@ -183,7 +186,7 @@ class _Frames(DetectorAcquireLogic):
             camera.disarm()
 
     def _next(self, patience: float) -> CameraFrame | None:
-        """The next frame; None once the frames are to end. Raises DeviceTimeout if none comes in time."""
+        """The next frame; None if the frames must end. Raises DeviceTimeout if no frame comes in time."""
         waited = 0.0
         while not self._stop.is_set():
             try:
@@ -210,7 +213,8 @@ class _Trigger(DetectorTriggerLogic):
 
 
 class _Rows(StreamResourceDataProvider):
-    """The rows of the file for events, from `first` on: rows before it that no event has had belong to none."""
+    """The rows of the file for events, from `first` on. Earlier rows that no event has used do not belong to any
+    event."""
 
     first = 0
 
@@ -240,11 +244,11 @@ class _File(DetectorDataLogic):
 
 
 class CameraDetector(StandardDetector):
-    """The configured camera. `kind` is what the next frames show; the shutter is closed at the end.
+    """The configured camera. `kind` is the kind of the next frames. The shutter is closed at the end.
 
     Args:
-        instrument: connected devices, which stay open.
-        runs: folder of the run folders; the configured one unless given.
+        instrument: connected devices, which stay open. runs: folder that contains the folders of runs; default: the
+            configured folder.
     """
 
     def __init__(
@@ -257,8 +261,8 @@ class CameraDetector(StandardDetector):
         super().__init__(name)
 
     def stage(self) -> Any:
-        """Begin. bluesky does not tell a device how its plan ends, so the camera listens to the RunEngine that runs
-        this task."""
+        """Begin. bluesky does not inform a device about the end of its plan, so the camera listens to the RunEngine
+        that runs this task."""
         self._triggered, task = None, asyncio.current_task()
         engine = inspect.getcoroutinelocals(task.get_coro()).get("self") if task else None  # type: ignore[arg-type]
         if isinstance(engine, RunEngine):
@@ -285,20 +289,20 @@ class CameraDetector(StandardDetector):
         return self._triggered
 
     async def pause(self) -> None:
-        """After a pause, the plan repeats everything since its last checkpoint. A frame that is exposed now is still
-        written, but no event refers to it."""
+        """Handle a pause. After the pause, the plan repeats everything since its last checkpoint. A frame that is being
+        exposed is still written, but no event refers to it."""
         if self._triggered is not None:
             await asyncio.wait([self._triggered.task])  # the first one makes the file
             if self._frames.provider is not None:
                 self._frames.provider.first = await self.get_index()
 
     async def resume(self) -> None:
-        """Do nothing: the plan triggers again."""
+        """Do nothing, because the plan triggers again."""
 
     async def _wait_for_index(self, *args: Any, **more: Any) -> AsyncIterator[Any]:
         try:
             async for update in super()._wait_for_index(*args, **more):
                 yield update
         except TimeoutError:
-            await self._frames.refuse_failure()  # which tells more than that no frame came
+            await self._frames.refuse_failure()  # this error says more than that no frame came
             raise

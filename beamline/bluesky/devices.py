@@ -1,8 +1,8 @@
 """Devices for a RunEngine (ophyd-async): a whole scan as one flyer, and the rotation stage.
 
-This program runs the scan from trigger to file, in a thread. The RunEngine starts the scan, is told the rows as they
-are written, and waits for its end. Therefore the scan itself detects lost frames, failed devices and a missing beam,
-and `complete` then fails.
+This program runs the scan from trigger to file, in a thread. The RunEngine starts the scan, gets the rows as they are
+written, and waits for the end of the scan. Therefore the scan itself detects lost frames, failed devices and a missing
+beam. In these cases `complete` fails.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from drivers.base.errors import DeviceError
 from drivers.base.protocols import RotationStage
 
 POLL = 0.2
-"""s between two looks at the rows of the file."""
+"""s between two checks of the rows of the file."""
 MARGIN = 10.0
-"""s beyond twice the time of a move after which it has failed."""
+"""s after twice the expected time of a move at which the move counts as failed."""
 
 
 class TomoScan(Device):
-    """A configured scan as flyer and detector; each kickoff is one scan, in a new run folder.
+    """A configured scan as flyer and detector. Each kickoff is one scan, in the folder of a new run.
 
     Args:
-        runs: folder of the run folders; the configured one unless given.
-        instrument: connected devices, which stay open; None: each scan opens and closes those of the configuration.
+        runs: folder that contains the folders of runs; default: the configured folder. instrument: connected devices,
+            which stay open; None: each scan opens and closes the devices of the configuration.
     """
 
     def __init__(
@@ -58,24 +58,24 @@ class TomoScan(Device):
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Do nothing: staging moves no device."""
+        """Do nothing, because staging moves no device."""
         self._refuse_second()
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
         """Stop a scan that is still running, as `beamline stop` does, and close its file."""
         task, self._task = self._task, None
-        if task is None or not task.done():  # a kickoff may be about to begin one
+        if task is None or not task.done():  # a kickoff may be about to begin a scan
             self._stop.stop("the plan ended")
         if task is not None:
             await asyncio.wait([task])
-            task.exception()  # looked at, so that asyncio does not report it
+            task.exception()  # retrieved, so that asyncio does not report it
 
     async def pause(self) -> None:
-        """Pause the scan, as `beamline pause` does, when the plan is paused, also by a suspender.
+        """Pause the scan, as `beamline pause` does, when the plan is paused (also if a suspender pauses it).
 
         Raises:
-            NoReplayAllowed: always once the scan has begun: a second kickoff would be a second scan.
+            NoReplayAllowed: always if the scan has begun, because a second kickoff would be a second scan.
             ConfigError: the scan does not answer.
         """
         if self._task is not None:
@@ -91,7 +91,8 @@ class TomoScan(Device):
         if self._folder is None:
             return
         try:
-            asked = await asyncio.to_thread(ask, self._folder, verb)  # a disk that hangs must not hold the RunEngine
+            # a disk that does not respond must not block the RunEngine
+            asked = await asyncio.to_thread(ask, self._folder, verb)
             while await asyncio.to_thread(asked.state) is None:  # an end of the plan need not wait for it
                 await asyncio.sleep(POLL)
         except ConfigError:
@@ -101,10 +102,11 @@ class TomoScan(Device):
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Start the scan. Raises the errors that occur before its file exists; nothing has moved then."""
+        """Start the scan. Raises the errors that occur before its file exists. In case of such an error nothing has
+        moved."""
         self._refuse_second()
         self._stop, self._folder = StopRequest(), None
-        self._stream = await asyncio.to_thread(ScanStream, self.config, self.name)  # which reads files of angles
+        self._stream = await asyncio.to_thread(ScanStream, self.config, self.name)  # this reads files of angles
         self._task = task = asyncio.create_task(asyncio.to_thread(self._scan))
         while self._folder is None and not task.done():
             await asyncio.sleep(POLL)
@@ -113,8 +115,8 @@ class TomoScan(Device):
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
-        """Wait for the end of the scan. Raises the scan's own error: frames are missing, it was stopped, a device
-        failed.
+        """Wait for the end of the scan. Raises the error of the scan itself: frames are missing, the scan was stopped,
+        or a device failed.
         """
         task, began = self._task, time.monotonic()
         if task is None:
@@ -125,7 +127,7 @@ class TomoScan(Device):
                 name=self.name, current=self._stream.rows, initial=0, target=self._planned, unit="frames",
                 time_elapsed=time.monotonic() - began,
             )  # fmt: skip
-        if self._task is task:  # else it was unstaged: the plan knows why
+        if self._task is task:  # otherwise it was unstaged, and the plan knows why
             task.result()
 
     async def describe_collect(self) -> dict[str, Any]:
@@ -159,7 +161,7 @@ class TomoScan(Device):
 
 
 class Rotation(Device):
-    """The rotation stage, in degrees, at its full speed."""
+    """The rotation stage, with angles in degrees. It moves at its full speed."""
 
     def __init__(self, stage: RotationStage, name: str = "rotation") -> None:
         super().__init__(name)
@@ -169,8 +171,8 @@ class Rotation(Device):
 
     @AsyncStatus.wrap
     async def set(self, value: float) -> None:
-        """Move to the angle and wait, until it is there or `stop(success=True)`. Raises DeviceRefused beyond the
-        limits, DeviceError if the stage stopped short."""
+        """Move to the angle, and wait until the stage is there or `stop(success=True)` is called. Raises DeviceRefused
+        if the angle is beyond the limits, and DeviceError if the stage stopped before reaching the angle."""
         self._setpoint, self._ended = value, (ended := threading.Event())
         await asyncio.to_thread(self._move, math.radians(value), ended)
 
@@ -199,7 +201,7 @@ class Rotation(Device):
 
     def _move(self, angle: float, ended: threading.Event) -> None:
         stage, limits = self._stage, self._stage.limits
-        with self._one_move:  # the one that was stopped may not stand yet
+        with self._one_move:  # the stage that was stopped may not be at rest yet
             seconds = abs(angle - stage.position()) / limits.max_speed + limits.max_speed / limits.acceleration
             try:
                 if not ended.is_set():
@@ -220,7 +222,7 @@ def tomography(config: Config, runs: Path | None = None) -> Iterator[tuple[TomoS
 
 
 def fly(scan: TomoScan, md: Mapping[str, Any] | None = None, flush: float = 0.5) -> Generator[Any, Any, Any]:
-    """A plan: one scan, one run. `flush`: s between two datums. Returns the uid of the run."""
+    """A plan for one scan, which is one run. `flush`: s between two datums. Returns the uid of the run."""
 
     @preprocessors.stage_decorator([scan])
     @preprocessors.run_decorator(md={"plan_name": "fly", "detectors": [scan.name], **(md or {})})
@@ -228,11 +230,12 @@ def fly(scan: TomoScan, md: Mapping[str, Any] | None = None, flush: float = 0.5)
         yield from plan_stubs.declare_stream(scan, name=STREAM, collect=True)
         yield from plan_stubs.kickoff(scan, wait=True)
         completed = yield from plan_stubs.complete(scan, wait=False)
-        while not completed.done:  # a pause makes `wait`, as in collect_while_completing, forget what it waits for
+        # after a pause, `wait` (as in collect_while_completing) no longer knows what it waits for
+        while not completed.done:
             yield from plan_stubs.sleep(flush)
             yield from plan_stubs.collect(scan, name=STREAM)
         yield from plan_stubs.collect(scan, name=STREAM)
-        if (error := completed.exception()) is not None:  # if the RunEngine has not raised it already
+        if (error := completed.exception()) is not None:  # raised here if the RunEngine has not raised it already
             raise error
 
     return (yield from inner())

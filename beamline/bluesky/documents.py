@@ -1,7 +1,7 @@
 """Bluesky documents (event-model) of a scan. Its frames stay in this program's file; a stream datum announces new
 rows.
 
-Each index is one row of the file, including darks and flats. A trigger without a frame has no index.
+Each index is one row of the file; darks and flats have rows, too. A trigger without a frame has no index.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from beamline.scan.preflight import dry_run
 from beamline.storage.writers import layout
 
 Emit = Callable[[str, Mapping[str, Any]], object]
-"""Takes a document: its name and its values."""
+"""Function that takes a document: its name and its values."""
 
 STREAM = "primary"
 REACH = 1.0
-"""s that a proxy of 0MQ has to answer, and at the end to take what it was sent."""
+"""s within which a 0MQ proxy must answer, and at the end must accept the documents sent to it."""
 JOIN = 0.5
-"""s until a proxy takes documents: 0MQ connects in the background, and drops what comes before."""
+"""s until a proxy accepts documents. 0MQ connects in the background, and drops documents that come before."""
 
 
 class Column(NamedTuple):
-    """A dataset of the scan file with a row for each frame, which is a data key."""
+    """A dataset of the scan file with a row for each frame. In bluesky it is a data key."""
 
     dataset: str
     kind: str
@@ -45,7 +45,7 @@ class Column(NamedTuple):
         return frame if self.dataset == layout.DATA else ()
 
 
-COLUMNS = {  # by the ending of the data key
+COLUMNS = {  # by the end of the name of the data key
     "": Column(layout.DATA, "<u2", "counts"),
     "-angle": Column(layout.ANGLE, "<f8", "degree"),
     "-kind": Column(layout.KIND, "<i4", ""),
@@ -64,10 +64,10 @@ def event_model() -> Any:
 
 
 class ScanStream:
-    """The data of one scan as a stream: its keys before it begins, resources and datums while its file grows.
+    """The data of one scan as a stream: data keys before the scan begins, then resources and datums as the file grows.
 
     Args:
-        name: of the data keys: NAME is the frame, NAME-angle, NAME-kind.
+        name: beginning of the names of the data keys: NAME (the frame), NAME-angle, NAME-kind.
     """
 
     def __init__(self, config: Config, name: str) -> None:
@@ -92,19 +92,20 @@ class ScanStream:
         }
 
     def __call__(self, event: Event) -> None:
-        """Take an event of the scan: where its file is, and how many rows of it others can read."""
+        """Process an event of the scan, which gives the path of its file, and the number of rows that other programs
+        can read."""
         if event.source is not None:  # of the live reconstruction
             return
         if isinstance(event, RunStarted):
             self._path, self._emitted, self.rows, self._bundles = event.path, 0, 0, []
         elif isinstance(event, FrameStored):
-            self.rows = max(self.rows, event.n - self._behind)  # the writer flushes at least so often
+            self.rows = max(self.rows, event.n - self._behind)  # the writer flushes at least this often
         elif isinstance(event, ScanDone):
             self.rows = event.result.n_frames
 
     def assets(self, until: int, run_start: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
         """Resources and datums of the rows before `until` that were not emitted yet. `run_start`: uid of the run; None:
-        a RunEngine fills it in.
+        the RunEngine fills it in.
         """
         until = min(until, self.rows)
         if until <= self._emitted:
@@ -196,7 +197,7 @@ class Documents:
 
 
 def file_url(path: Path) -> str:
-    """The URL of a file, as resources state it."""
+    """The URL of a file in the form that resources need."""
     return path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
 
 
@@ -212,11 +213,10 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
     dropped.
 
     Args:
-        address: tcp://HOST:PORT, where the proxy takes documents.
+        address: tcp://HOST:PORT at which the proxy accepts documents.
         warn: function that gets a sentence if no program listens there.
 
-    Raises:
-        ConfigError: another address, or bluesky or pyzmq are not installed.
+    Raises: ConfigError: the address has another form, or bluesky or pyzmq is not installed.
     """
     try:
         from bluesky.callbacks.zmq import Publisher
@@ -241,21 +241,21 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
         except OSError as error:
             warn(f"No program is listening at {address} ({error}): documents are lost until a program listens there.")
         yield publisher
-    finally:  # its own close would wait for ever for a proxy that no longer reads
+    finally:  # the close of Publisher itself would wait for ever for a proxy that no longer reads
         publisher._context.destroy(linger=round(1000 * REACH))
 
 
 def sink(config: Config, place: str, held: ExitStack) -> Sink:
-    """A sink of events that adds the documents to a file, or sends them to a proxy of 0MQ (tcp://HOST:PORT).
+    """A sink of events that appends the documents to a file, or sends them to a 0MQ proxy (tcp://HOST:PORT).
 
     Args:
-        held: closes file and connection.
+        held: exit stack that closes file and connection.
 
     Raises:
         ConfigError: a library is missing, or no proxy answers.
         DataError: the file cannot be written to.
     """
-    event_model()  # where it is missing, no file is made
+    event_model()  # if event-model is missing, no file is made
     if "://" in place:
         warn = partial(click.echo, err=True)
         return Documents(config, held.enter_context(published(place, warn)))

@@ -1,4 +1,5 @@
-"""Estimate of a plan of bluesky: its messages are followed without a RunEngine, so that no device does anything."""
+"""Estimate of a bluesky plan. The messages of the plan are read without a RunEngine, so that no device does
+anything."""
 
 from __future__ import annotations
 
@@ -24,24 +25,25 @@ from beamline.scan.queue_planning import plan_of_config
 from drivers.base.protocols import TriggerSource
 
 MOST = 500_000
-"""Messages after which a plan counts as one without an end: about a second."""
+"""Number of messages (about a second) after which a plan counts as endless."""
 _DONE = SimpleNamespace(done=True, success=True, exception=lambda timeout=None: None)
-"""What a plan gets for a message that a RunEngine answers with a status."""
+"""Answer to the plan for a message that a RunEngine would answer with a status."""
 
 
 @dataclass
 class _Messages:
-    """What the messages of a plan need besides whole scans: moves of the stage, waits, and frames of the camera."""
+    """The needs of the messages of a plan apart from whole scans: moves of the stage, waits, and frames of the
+    camera."""
 
     needs: list[ScanNeeds] = field(default_factory=list)
     faults: list[ScanFault] = field(default_factory=list)
     sample: str = ""
     disk: Path | None = None
     places: dict[Rotation, float] = field(default_factory=dict)
-    values: dict[int, Any] = field(default_factory=dict)  # last one that was set or prepared, by the id of its device
+    values: dict[int, Any] = field(default_factory=dict)  # last value that was set or prepared, by the id of the device
 
     def take(self, message: Msg) -> Any:
-        """Add a message, and return what a plan expects in reply."""
+        """Add a message, and return the reply that the plan expects."""
         argument: Any = message.args[0] if message.args else None
         match message.command, message.obj:
             case "set", Rotation() as stage:
@@ -74,7 +76,7 @@ class _Messages:
             )
 
     def _expose(self, camera: CameraDetector) -> None:
-        """Add the frames of a trigger, as many as the camera was prepared for last."""
+        """Add the frames of a trigger. Their number is that for which the camera was prepared last."""
         config, asked = camera.config, self.values.get(id(camera))
         exposure = getattr(asked, "livetime", 0.0) or config.scan.exposure_s
         timing = config.devices.camera.timing_of(camera_settings(config, exposure, TriggerSource.SOFTWARE))
@@ -87,10 +89,11 @@ class _Messages:
 
 
 def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
-    """The scans that a plan of bluesky starts, in order. The last one stands for all other messages of the plan.
+    """The scans that a bluesky plan starts, in order. The last item contains all other messages of the plan.
 
-    The plan gets no measured values. If it decides by a value that it reads from a device, it cannot be followed, and
-    the result has this fault. Moves count one after the other. The plan is used up.
+    The plan gets no measured values. If it makes a decision with a value that it reads from a device, the plan cannot
+    be followed, and the result states this fault. Moves are counted one after the other. The plan cannot be run
+    afterwards.
     """
     source, scans, others = f"plan {getattr(plan, '__name__', '')}".rstrip(), list[PlannedScan](), _Messages()
     reply = None
@@ -99,14 +102,15 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
             message = plan.send(reply)
             if message.command == "kickoff" and isinstance(message.obj, TomoScan):
                 planned = plan_of_config(message.obj.config, message.obj.runs, source)
-                scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))  # it makes no volume
+                # this item makes no volume
+                scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))
             reply = others.take(message)
         others.faults.append(ScanFault(f"the plan does not end within {MOST} messages"))
     except StopIteration:
         pass
     except ConfigError as error:
         others.faults.append(ScanFault(str(error)))
-    except Exception as error:  # of the plan, which got no measured values
+    except Exception as error:  # an error of the plan, because it got no measured values
         what = f"{type(error).__name__}: {error}"
         others.faults.append(ScanFault(f"the plan cannot be followed without running it ({what})"))
     if others.needs or others.faults:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
 CHOICES = tuple(Choice)
-_LOOKS = 50  # a tenth of a second apart, because the log of events may be written a moment after the state
+# number of attempts, a tenth of a second apart, because the log of events may be written a moment after the state
+_LOOKS = 50
 _EXIT_CODES = (
     "Exit code: 0 the scan has carried out the command, 2 no scan runs in the folder or the scan does not answer, 5 "
     "disk error."
@@ -64,7 +65,7 @@ def _send(run: Path | None, word: str) -> None:
 
 
 def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
-    """Decisions in the log of a part of a run, oldest first, from byte `since` on; empty without a log."""
+    """Decisions in the log of a part of a run, oldest first, from byte `since` on; empty if there is no log."""
     from beamline.core.event_lines import event_in
 
     with suppress(OSError), open_below(part, EVENTS) as log:
@@ -74,8 +75,8 @@ def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
 
 
 def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
-    """Raise ConfigError if the log of the scan, from byte `before` on, does not show that it takes this choice. The
-    choice was not offered, or another one came first.
+    """Raise ConfigError unless the log of the scan, from byte `before` on, shows that the scan takes this choice. If
+    not, the choice was not offered, or another choice came first.
     """
     for _ in range(_LOOKS):
         newer = _decisions(part, before)
@@ -196,7 +197,7 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
         way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference mark. May it turn?"
         try:
             free = click.confirm(way, err=True)
-        except click.Abort:  # Ctrl-C, or the end of input: there is no operator
+        except click.Abort:  # Ctrl-C, or the end of the input, because there is no operator
             click.echo(err=True)
             free = False
         if not free:
@@ -254,7 +255,7 @@ def _runs_of(path: Path) -> list[Path]:
 
 
 def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
-    """Report each repaired file of a run, and the parts that were left out."""
+    """Report each repaired file of a run, and the parts that could not be repaired."""
     for sentence in left_out:
         click.echo(f"Warning: {sentence}", err=True)
     for done in recovered:

@@ -1,4 +1,5 @@
-"""The command `beamline`: loads the subcommand in use, turns errors into exit codes, and survives a closed terminal."""
+"""The command `beamline`: loads the subcommand in use, converts errors to exit codes, and continues if the terminal is
+closed."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ class CommandEntry:
 
     Attributes:
         module: the module with the command. Its function has the name of the command, with "_" for "-".
-        files: True if the results are files or movements, so that the printed output is only a summary.
+        files: True if the results are files or movements. The printed output is then only a summary.
         command: the command itself, if it comes from another package (which is then loaded).
     """
 
@@ -90,7 +91,8 @@ CORE = {
 def feature_commands() -> dict[str, CommandEntry]:
     """The commands of the folders in `beamline.features`, in the order of the folders' names.
 
-    COMMANDS of a folder has the help line and `CommandEntry.files` of each; it is in the folder's module `command`.
+    COMMANDS of a folder has the help line and `CommandEntry.files` of each command. The commands are in the folder's
+    module `command`.
     """
     return {
         name: CommandEntry(f"beamline.features.{folder}.command", help_line, files)
@@ -100,13 +102,13 @@ def feature_commands() -> dict[str, CommandEntry]:
 
 
 def own_commands() -> dict[str, CommandEntry]:
-    """All commands of this package, the core's first."""
+    """All commands of this package; those of the core come first."""
     return {**CORE, **feature_commands()}
 
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands. Other packages are searched only for names that this package does not have."""
+    """All commands. Other packages are searched only for a name that this package does not have."""
     return Registry("command", own_commands(), _entry_of)
 
 
@@ -118,11 +120,11 @@ def _entry_of(name: str, command: object) -> CommandEntry:
 
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
-"""Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
+"""Errors of a pipe without a reader (EINVAL on Windows). They are ignored, because the reader has ended on purpose."""
 
 
 class _Lasting:
-    """A text stream that accepts all text; after the first error it drops it."""
+    """A text stream that accepts all text. After the first error, it drops the text."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -133,7 +135,7 @@ class _Lasting:
             work(*arguments)
         except OSError as error:
             self.error = error
-            os.dup2(os.open(os.devnull, os.O_RDWR), self._stream.fileno())  # what is buffered goes there, too
+            os.dup2(os.open(os.devnull, os.O_RDWR), self._stream.fileno())  # buffered text goes there, too
 
     def write(self, text: str) -> int:
         self._tried(self._stream.write, text)
@@ -147,10 +149,10 @@ class _Lasting:
 
 
 class _Printable:
-    """A text stream that shows the control characters of foreign names and texts instead of sending them to the
-    terminal.
+    """A text stream that replaces control characters in names and texts from outside the program by visible text, so
+    that the terminal does not act on them.
 
-    `unfiltered` is the stream itself, for a progress bar.
+    `unfiltered` is the original stream, which a progress bar needs.
     """
 
     def __init__(self, stream: _Lasting) -> None:
@@ -167,23 +169,26 @@ def guard_streams() -> None:
     """Replace `sys.stdout` and `sys.stderr` by streams that survive a closed terminal and print no control characters.
     If stdin, stdout or stderr was closed, it is opened.
 
-    If one of them stayed closed (`>&-`), the next file to be opened would get its number, and printed text would go
-    into a scan file. Anything that another library prints to stdout, also at the end of the process, goes to stderr.
-    With `--json` it is dropped, because it is not JSON. numba loads colorama, where it is installed (on Windows, click
-    brings it), and colorama prints a control sequence at the end of the process; this numba does not load it.
+    If one of them stayed closed (`>&-`), the next file that is opened would get its number, and printed text would go
+    into a scan file. Text that another library prints to stdout, even at the end of the process, goes to stderr. With
+    `--json` it is dropped, because it is not JSON. If colorama is installed (on Windows, click requires it), numba
+    usually loads it, and colorama prints a control sequence at the end of the process. Here numba is prevented from
+    loading it.
     """
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
     os.close(number)
-    streams: Any = sys  # typeshed knows text files alone
-    if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
+    streams: Any = sys  # typeshed knows only text files as streams
+    # and not an object that a host program put there
+    if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":
         out = open(  # noqa: SIM115
             os.dup(1),
             "w",
             1 if out.isatty() else -1,
             out.encoding,
-            "backslashreplace" if out.errors == "strict" else out.errors,  # a code page of Windows lacks letters
+            # a code page of Windows does not have all letters
+            "backslashreplace" if out.errors == "strict" else out.errors,
             closefd=False,
         )
         os.dup2(os.open(os.devnull, os.O_WRONLY) if "--json" in sys.argv else 2, 1)
@@ -192,7 +197,8 @@ def guard_streams() -> None:
 
 
 def lost_output() -> str:
-    """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
+    """Flush stdout and stderr. Returns why stdout is incomplete; "" if it is complete, or if its reader has closed
+    it."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     error: OSError | None = getattr(sys.stdout, "error", None)
@@ -204,7 +210,8 @@ def _nowhere() -> TextIO:
 
 
 def _command(name: str) -> CommandEntry | None:
-    """The command of this name; other packages are searched (a tenth of a second) only if it is not ours."""
+    """The command of this name. Other packages are searched only if this package has no such command, because the
+    search takes a tenth of a second."""
     return own_commands().get(name) or commands().get(name)
 
 
@@ -224,11 +231,11 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Resolve a command as click does; the error for an unknown name suggests the nearest one.
+        """Resolve a command as click does. The error for an unknown name suggests the most similar name.
 
         If another package adds a command of two words, such as `study structure`, both words are its name.
         """
-        if args[:1] == ["doctor"]:  # its name in version 1.0
+        if args[:1] == ["doctor"]:  # the name of the command in version 1.0
             click.echo("`beamline doctor` is now `beamline check CONFIG --connect`.", err=True)
             args = ["check", "--connect", *(word for word in args[1:] if word != "--session")]
         if (two := " ".join(args[:2])) in ADD_ONS:
@@ -259,7 +266,9 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except (Exit, Abort, ClickException):
             raise
-        except BaseException as error:  # SystemExit, too, which is 0 by itself: no command of ours raises it
+        except (
+            BaseException
+        ) as error:  # SystemExit, too, because no command of ours raises it; its own exit code could be 0
             message = user_message(error)
             if is_defect(error):
                 if ctx.params.get("debug"):
@@ -267,7 +276,7 @@ class LazyGroup(click.Group):
                 left = leave_traceback(error, Path())
                 message += f"; the traceback is in {left}" if left else "; --debug shows where"
                 message += ". Please report it. Files written before the error are unchanged."
-            # A line end that no indent follows is one of a file's name.
+            # A line end without an indent after it belongs to the name of a file.
             click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)
             ctx.exit(exit_code(error))
 
@@ -284,7 +293,7 @@ Exit codes:
   7    the scan is complete, but the monitor raised alarms
   130  interrupted before there was a result, or aborted
 """
-_MOST_THREADS = 4096  # numba starts all of them, and a system that refuses one ends the process
+_MOST_THREADS = 4096  # numba starts all of its threads, and if the system does not allow one of them, the process ends
 
 
 @click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
@@ -315,14 +324,16 @@ def main(debug: bool) -> None:
 def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
-    HDF5 crashes at exit if a file could not be closed, for example on a full disk: the exit code would be -11 instead
-    of 5. If the terminal is closed or the disk accepts no output, the command continues, and the rest of its output is
-    lost.
+    HDF5 crashes at exit if a file could not be closed, for example on a full disk. The exit code would then be -11
+    instead of 5. If the terminal is closed or the disk accepts no output, the command continues, and the rest of its
+    output is lost.
     """
-    warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
+    # numpy's warnings about inf and NaN; the program reports such results in words
+    warnings.simplefilter("ignore", RuntimeWarning)
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
-    os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
-    if os.environ.pop("NUMBA_DISABLE_JIT", None):  # kernels as plain Python take hours, and some are none
+    # the backend of a notebook that started this process may be missing here, and matplotlib would stop with an error
+    os.environ["MPLBACKEND"] = "agg"
+    if os.environ.pop("NUMBA_DISABLE_JIT", None):  # as plain Python, kernels take hours, and some cannot run
         use_compiled_kernels()
     guard_streams()
     code = 0
@@ -330,9 +341,11 @@ def run() -> NoReturn:
         main(prog_name="beamline")
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else BeamlineError.exit_code if end.code else 0
-    except KeyboardInterrupt:  # outside the work of a command, as while its result is printed
+    except KeyboardInterrupt:  # outside the work of a command, for example while its result is printed
         code = INTERRUPTED
-    exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
+    # otherwise Python ends by SIGINT if Ctrl-C came while generated code (as in dataclasses) ran, although it was
+    # caught
+    exec("")
     if lost := lost_output():
         click.echo(f"beamline: the output on stdout is incomplete ({lost}).", err=True)
         command = _command(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))

@@ -30,14 +30,14 @@ def checkpoint_output(path: Path) -> Path:
 
 
 def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
-    """A callback that checks a checkpoint to read. Raises DataError if the file does not exist."""
+    """A callback that checks the path of a checkpoint to read. Raises DataError if the file does not exist."""
     if path is not None and not path.exists():
         raise DataError(f"--{param.name} {path} does not exist. Nothing was changed.")
     return path
 
 
 def levels_of(given: str | Sequence[float]) -> tuple[float, ...]:
-    """Densities from text such as "0.1,0.5", or from a recipe's list. Raises ValueError for others."""
+    """Densities from text such as "0.1,0.5", or from a list in a recipe. Raises ValueError for other values."""
     parts = given.split(",") if isinstance(given, str) else given
     try:
         levels = tuple(float(part) for part in parts)
@@ -49,17 +49,16 @@ def levels_of(given: str | Sequence[float]) -> tuple[float, ...]:
 
 
 def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any]:
-    """Settings of methods by path, removed from the parameter values of a command."""
+    """Remove the settings of methods from the parameter values of a command, and return them by path."""
     of_methods = [param for param in declared(command).values() if param.setting]
     taken = [(param, values.pop(str(param.name))) for param in of_methods]
     return {param.setting: not value if param.inverted else value for param, value in taken if value is not None}
 
 
 def row_settings(command: click.Command, methods: Sequence[str], values: dict[str, Any]) -> dict[str, dict[str, Plain]]:
-    """Settings by method, from the given options of `row_options`; removes these options from `values`.
+    """Settings by method, from the given options of `row_options`. These options are removed from `values`.
 
-    Raises:
-        UsageError: an option that no method takes.
+    Raises: UsageError: no method takes a given option.
     """
     options = {param.setting: name for name, param in declared(command).items() if param.setting}
     settings = settings_of(command, values)
@@ -92,7 +91,7 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
     if method in METHODS and all(param.setting for param in asked.values()):
         own = by_name(method)
         if all(has_setting(own, param.setting) for param in asked.values()):
-            return  # before the other methods are asked, because they load torch
+            return  # checked before the other methods are asked, because they load torch
     owners = {name: takers(param) for name, param in asked.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
         what = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
@@ -100,7 +99,8 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
 
 
 def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
-    """What to do about an option if no method was chosen. Another given option may belong only to other methods."""
+    """What the user can do about an option if no method was chosen. (Another given option may belong only to other
+    methods.)"""
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
         return "add --method with one of these methods."
@@ -108,12 +108,12 @@ def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
-    """The method of this name with its settings; settings of other methods are ignored.
+    """The method of this name with its settings. Settings of other methods are ignored.
 
     Args:
         name: name of a method in `recon.methods`, or that of `recon.Auto`.
         settings: values by path.
-        any_setting: values by path from `--set`; the method must have every one of these settings.
+        any_setting: values by path from `--set`. The method must have every one of these settings.
     """
     if name == AUTO:
         from recon.auto import Auto  # imported here because it loads all methods
@@ -129,7 +129,8 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
 
 
 def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
-    """Parse settings by name from texts of NAME=VALUE separated by spaces; values are JSON, or else plain text."""
+    """Parse settings by name from texts of NAME=VALUE separated by spaces. A value is JSON; if it is not valid JSON, it
+    is plain text."""
     settings: dict[str, Any] = {}
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")
@@ -217,9 +218,9 @@ _WITH_REFERENCE = option(
     excludes=EXCLUDED["reference"],
     type=click.Path(path_type=Path),
     metavar="GOOD",
-    help="Volume of the same sample from an earlier, careful scan, or that scan itself, which is then reconstructed "
-    "first. Its motion, and the grey level of each particle, are estimated from the projections. Held-out projections "
-    "decide whether it is used; if not, the volume is that of auto.",
+    help="Earlier volume of the same sample, or an earlier scan of it, which is then reconstructed first. The motion "
+    "of the sample since then, and the grey level of each particle, are estimated from the projections. Held-out "
+    "projections decide whether the earlier volume is used. If it is not, the result is that of auto.",
 )
 _IN_TIME = together(
     option(
@@ -244,7 +245,7 @@ _IN_TIME = together(
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
-"""The options of methods for every row of a table: length and start of the work."""
+"""The options of methods for every row of a table. They set the length and the start of the work."""
 equal_time = option(
     "--seconds",
     excludes={
@@ -256,7 +257,7 @@ equal_time = option(
     help="Compare the methods in equal time: each reconstruction stops after this number of seconds. Methods without "
     "iterations, such as fbp, take the time they need.",
 )
-"""The time of every row of a table."""
+"""The time limit for every row of a table."""
 method_options = together(
     heading(METHOD),
     _STEPS,
@@ -367,7 +368,7 @@ method_options = together(
         is_flag=True,
         help=(
             "Project the Gaussians as 3D Gaussian splatting does: all rays have the same path length through a "
-            "Gaussian. This has a bias that the default avoids; use it only for comparison."
+            "Gaussian. This causes a bias, which the default avoids. Use this option only for comparison."
         ),
     ),
     option(
@@ -380,4 +381,4 @@ method_options = together(
         "Can be given several times.",
     ),
 )
-"""The options of the fit and of the iterative methods."""
+"""The options of the Gaussian fit and of the iterative methods."""

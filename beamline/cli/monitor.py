@@ -1,4 +1,4 @@
-"""`beamline monitor`: checks every frame of a scan file, with the checks that run during a scan."""
+"""`beamline monitor`: checks every frame of a scan file with the checks that also run during a scan."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def monitor(request: MonitorRequest) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Watched:
-    """Result of checking a scan: the verdict, how the scan ended, and whether the command was stopped."""
+    """Result of the checks of a scan: the verdict, how the scan ended, and whether the command was stopped."""
 
     verdict: ScanVerdict
     ended: Sequence[str]
@@ -169,7 +169,7 @@ def _facts(file: Path, summed: ScanVerdict) -> dict[str, Any]:
 
 
 def table(kinds: Iterable[Kind]) -> list[str]:
-    """Flags as text: three lines for each check and level."""
+    """The flags as text, with three lines for each check and level."""
     from beamline.monitor.checks import CHECKS
 
     units, lines = {check.name: check.unit for check in CHECKS}, []

@@ -27,7 +27,8 @@ from recon.methods import METHODS
 
 
 def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any) -> Any:
-    """The number if it is within the bounds; otherwise raise the usage error that a setting in Python would raise."""
+    """Returns the number if it is within the bounds. Otherwise raises a usage error with the message that the setting
+    has in Python."""
     low, high = "gt" if bounds.min_open else "ge", "lt" if bounds.max_open else "le"
     limits: dict[str, Any] = {low: bounds.min, high: bounds.max}
     if fault := Setting(**limits).fault(number):
@@ -46,7 +47,7 @@ def _bounds_text(bounds: click.FloatRange | click.IntRange) -> str:
 
 
 class FiniteRange(click.FloatRange):
-    """A range of finite numbers; click's own range accepts NaN and infinities."""
+    """A range of finite numbers. (The range of click accepts NaN and infinities.)"""
 
     name = "number"
 
@@ -70,7 +71,7 @@ class WholeRange(click.IntRange):
 
 
 class NameChoice(click.Choice):  # type: ignore[type-arg]
-    """A choice of names whose error suggests the nearest one."""
+    """A choice of names. The error for an unknown name suggests the most similar one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
@@ -83,14 +84,14 @@ class NameChoice(click.Choice):  # type: ignore[type-arg]
 
 
 class MethodChoice(NameChoice):
-    """A choice of methods whose error names the command that runs the method, if another one does."""
+    """A choice of methods. If another command runs the method, the error names this command."""
 
     def refusal(self, value: str) -> str:
         return unknown_method(value, self.choices)
 
 
 def unknown_method(name: str, legal: Iterable[str]) -> str:
-    """Why a method cannot be chosen here, as a sentence without its full stop."""
+    """The reason why a method cannot be chosen here, as a sentence without its full stop."""
     if (entry := METHODS.get(name)) is not None and entry.several in _ELSEWHERE:
         return f"{name!r} {_ELSEWHERE[entry.several]}"
     return unknown("method", name, legal)
@@ -99,7 +100,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 _ELSEWHERE = {
     "times": "reconstructs several volumes at successive times: use beamline recon --volumes N",
 }
-"""For methods that make several volumes: the command that runs them."""
+"""The command that runs a method that makes several volumes."""
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
@@ -113,12 +114,12 @@ class Declared(click.Option):
 
     Args:
         setting: path of a setting in Python, such as `fit.loss`; the option belongs to the methods with this setting.
-        argument: an argument of methods (see `Method.takes`); the option belongs to these methods.
-        inverted: True for a flag that switches the setting off.
+        argument: name of an argument of methods (see `Method.takes`); the option belongs to the methods with this
+            argument. inverted: True for a flag that switches the setting off.
         excludes: long names of options that cannot be combined with this option, each with the reason.
-        needs: another option that this one requires, and the end of the error message without it.
+        needs: another option that this one requires, and the end of the error message if it is missing.
         of_one_call: True if the option belongs to one scan or one call; it is then not written into a recipe.
-        former: long name in the previous version, which is still accepted but not shown in the help.
+        former: long name of the option in the previous version. It is still accepted, but the help does not show it.
     """
 
     def __init__(
@@ -161,11 +162,12 @@ def declared(command: click.Command) -> dict[str, Declared]:
 def refuse_contradictions(
     command: click.Command, given: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
 ) -> None:
-    """Raise UsageError for two options that exclude each other, or one without another that it requires.
+    """Raise UsageError if two given options exclude each other, or if a given option requires another one that is
+    missing.
 
     Args:
-        given: long names of the options that the user gave, and names of other things that options may exclude.
-        shown: how error messages call these other things.
+        given: long names of the options that the user gave, and names of other conditions that options may exclude.
+            shown: the words for these conditions in error messages.
     """
     for name, param in declared(command).items():
         if name not in given:
@@ -222,11 +224,11 @@ def together(*options: Decorator) -> Decorator:
 
 
 def set_by(*options: Decorator | str, **facts: Any) -> Any:
-    """A field of a command's request, and the option that sets it.
+    """A field of the request of a command, with the option that sets it.
 
     Args:
-        options: names of the option, or a ready-made option or argument whose parameter has the name of the field.
-            Headings may come before it.
+        options: names of the option; or an option or argument that was already made, whose parameter has the name of
+            the field. Headings may come before it.
         facts: keyword arguments of `option`.
     """
     return field(metadata={"options": options, "facts": facts})
@@ -238,7 +240,8 @@ def others(*options: Decorator) -> Any:
 
 
 def with_request(request: type) -> Decorator:
-    """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
+    """A decorator that adds the options of the fields of a request, in their order, and calls the command with the
+    request.
 
     Args:
         request: a frozen dataclass whose fields are made by `set_by`; one field may be made by the function `others`.
@@ -267,7 +270,7 @@ def _options_of(
 
 
 def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """A callback that parses an option by `parse`; its ValueError becomes bad usage."""
+    """A callback that parses an option with `parse`. A ValueError of `parse` becomes a usage error."""
 
     def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
         try:
@@ -292,9 +295,10 @@ def _as_volume(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
 
 
 scan_argument = click.argument("file", metavar="FILE|RUN", type=click.Path(path_type=Path), callback=as_scan)
-"""A scan: its file, or the folder of a run, which means the scan file of the run with all parts."""
+"""Type of an argument for a scan: its file, or the folder of a run. A folder means the scan file of the run with all
+parts."""
 volume_argument = click.argument("volume", metavar="VOLUME|RUN", type=click.Path(path_type=Path), callback=_as_volume)
-"""A volume: its file, or the folder of a run, which means the file recon.h5 in it."""
+"""Type of an argument for a volume: its file, or the folder of a run. A folder means the file recon.h5 in it."""
 
 
 def volume_path(text: str) -> Path:
@@ -306,7 +310,7 @@ def volume_path(text: str) -> Path:
 
 
 def refuse_shared(files: Mapping[str, Path | None]) -> None:
-    """Raise UsageError if two of `files`, by option, are the same file, which would then be overwritten.
+    """Raise UsageError if two of `files` (by option) are the same file, because one would overwrite the other.
 
     Only --checkpoint may replace the file of --resume.
     """
@@ -322,7 +326,7 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
 def json_events(as_json: bool) -> Iterator[Sink]:
     """The sink that prints JSON to stdout; without `as_json` it does nothing. An error becomes the event `failed`.
 
-    Anything else that is printed in the block, for example by a plug-in, goes to stderr: stdout has only JSON.
+    Other text that is printed in the block, for example by a plug-in, goes to stderr, so that stdout has only JSON.
     """
     if not as_json:
         yield fan_out()

@@ -20,11 +20,11 @@ from beamline.core.files import SETTINGS, require_regular, text_in
 from recon.base.registry import unknown
 
 _RAW, _TYPED = "beamline.raw", "beamline.typed"
-_PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
+_PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes without quotes
 
 
 class Repeatable(click.Command):
-    """A command that records its options as the user typed them."""
+    """A command that records its options in the form in which the user typed them."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = list(args)
@@ -62,7 +62,7 @@ def _is_of_one_call(option: click.Option) -> bool:
 
 
 def recipe_text(ctx: click.Context, method: str) -> str:
-    """The recipe of this call as YAML: the method, and the given options that are not specific to one scan."""
+    """The recipe of this call as YAML. It has the method, and the given options that are not specific to one scan."""
     values = {
         name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
@@ -72,7 +72,7 @@ def recipe_text(ctx: click.Context, method: str) -> str:
 
 
 def _recipe_value(option: click.Option, value: Any) -> Any:
-    """The value of an option in a recipe; values of a repeatable option are separated by spaces."""
+    """The value of an option as a recipe states it. Values of a repeatable option are separated by spaces."""
     if option.multiple:
         return " ".join(value)
     return os.path.realpath(value) if isinstance(option.type, click.Path) else value
@@ -103,7 +103,7 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 _ALLOWED_IN_RECIPES = ("angles", "angle-rows", "darks", "flats", "scanner-file", "cluster")
-"""Options of one call that are allowed in a recipe, in which they apply to all scans of a batch."""
+"""Options that belong to one call, but are allowed in a recipe. In a recipe they apply to all scans of a batch."""
 
 
 def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
@@ -172,7 +172,7 @@ _ALL = "splatline_help_all"
 
 
 def heading(group: str) -> Decorator:
-    """A decorator that puts the options below it into a group of the help, down to the next heading.
+    """A decorator that puts the options below it, down to the next heading, into a group of the help.
 
     Args:
         group: one of GROUPS.
@@ -203,7 +203,7 @@ class Grouped(Repeatable):
         )  # fmt: skip
 
     def grouped(self) -> list[click.Option]:
-        """The command's own options, without hidden ones."""
+        """The options of the command, without hidden ones."""
         return [param for param in self.params if isinstance(param, click.Option) and not param.hidden]
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -213,7 +213,8 @@ class Grouped(Repeatable):
         helps = [option for option in (self._help_all, self.get_help_option(ctx)) if option is not None]
         if not ctx.meta.get(_ALL):
             by_name = {option.name: option for option in self.grouped()}
-            first = [by_name[name] for name in self.first if name in by_name]  # a feature's option goes with it
+            # without the feature, its option does not exist
+            first = [by_name[name] for name in self.first if name in by_name]
             _section("Options", first + helps, ctx, formatter)
             return
         for group in (*GROUPS, None):

@@ -83,9 +83,8 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     """The options of a reconstruction, from the parameters of a click context of `recon`.
 
     Args:
-        default: the method if the user names none; empty: the usual method for the given options.
-        there: True if the scan must exist. Its existence is checked before the libraries for the computation are
-            loaded.
+        default: the method if the user names none; empty: the usual method for the given options. there: True if the
+            scan must exist. This is checked before the numerical libraries are loaded.
 
     Raises:
         UsageError: options exclude each other, a file is named twice, or the method cannot do what is asked.
@@ -123,13 +122,12 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
 
 
 def _checked_method(context: click.Context, default: str = "") -> str:
-    """The name of the method, after checking that all options can be combined with each other and with the method.
+    """The name of the method, after a check that all options can be combined with each other and with the method.
 
     Args:
         default: the method if the user names none; empty: the usual method for the given options.
 
-    Raises:
-        UsageError: they cannot be combined.
+    Raises: UsageError: the options cannot be combined.
     """
     asked, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
@@ -161,8 +159,8 @@ def _in_time() -> str:
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError for a recipe with options that exclude each other or that do not belong to its method, whatever
-    the scan. The error is one of the command that calls this function."""
+    """Raise UsageError if options of a recipe exclude each other, or do not belong to its method, whatever the scan is.
+    The error is shown as an error of the command that calls this function."""
     try:
         with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
             values = dict(context.params)
@@ -179,7 +177,7 @@ def run_reconstruction(
 
     Args:
         values: parameters of the command; a parameter that is missing counts as not given.
-        more: gives further lines to print after the result.
+        more: function that returns further lines to print after the result.
 
     Raises:
         ScanStopped: the reconstruction was stopped early; the volume was written.
@@ -192,10 +190,11 @@ def run_reconstruction(
     stop = StopOnSignal(ready=options.follow is not None)
 
     def made(event: Event) -> None:
-        """Note when a first volume exists, so that Ctrl-C can keep it.
+        """Record when the first volume exists, so that Ctrl-C can keep it.
 
-        It exists from the first step or iteration of the method itself (events of test reconstructions and of slices
-        have a unit). If several volumes are reconstructed, it exists from the first test reconstruction on.
+        The first volume exists from the first step or iteration of the method itself. (Events of test reconstructions
+        and of slices have a unit.) If several volumes are reconstructed, they exist from the first test reconstruction
+        on.
         """
         of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
         if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.volumes > 1)):
@@ -211,7 +210,7 @@ def run_reconstruction(
         raise DataError(f"The last checkpoint could not be written: {lost} The volume was written: {output}.")
     if record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early. The volume reached so far is in {output}.")
-    if limit is not None:  # there is no default, because no limit suits every sample
+    if limit is not None:  # the limit has no default, because no limit suits every sample
         require(record.metrics, limit)
 
 

@@ -119,8 +119,8 @@ class ScanRequest:
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
-        """The configuration for a run with --no-live (a resumed run keeps this choice); prints what the run does not do
-        for this reason."""
+        """The configuration for a run with --no-live, which a resumed run keeps. The function prints what the run does
+        not do without a live reconstruction."""
         return partial(click.echo, err=True) if self.no_live else None
 
 
@@ -197,7 +197,7 @@ def _one_scan(
         _dry_run(config, request.output, series, json_sink, request.as_json)
         return
     result = run_one(config, series, request, [json_sink], held)
-    held.close()  # documents are sent before the result is printed
+    held.close()  # bluesky documents are sent before the result is printed
     rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
     if not request.as_json:
         click.echo("\n".join([_results(result), *rehearsed]))
@@ -221,7 +221,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
-    """Duration of the rehearsal and of the scan, as lines."""
+    """The duration of the rehearsal, and of the scan at the instrument, as lines."""
     from beamline.plan.timeline import hms_text
     from beamline.scan.preflight import dry_run
 
@@ -233,7 +233,7 @@ def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> 
 
 
 def _refuse_contradictions(request: ScanRequest) -> None:
-    """Raises UsageError for options that exclude each other."""
+    """Raise UsageError for options that exclude each other."""
     context = click.get_current_context()
     refuse_contradictions(context.command, names_given(context))
     if request.file is None and request.run is None:
@@ -253,7 +253,7 @@ def _refuse_contradictions(request: ScanRequest) -> None:
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
-    """Whether these are several configurations, or a table of them."""
+    """Whether the arguments are several configurations, or a table of configurations."""
     return len(files) > 1 or any(file.suffix.lower() == TABLE for file in files)
 
 
@@ -283,7 +283,7 @@ def run_one(
     held: ExitStack,
     stop: StopRequest | None = None,
 ) -> RunResult:
-    """Run the scan, or the rest of the run `series`, with output to the terminal, the page and bluesky documents."""
+    """Run the scan, or continue the run `series`, with output to the terminal, to the page and as bluesky documents."""
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
@@ -364,7 +364,7 @@ def faults_of(result: RunResult) -> list[str]:
 
 
 def _treated(path: Path) -> str:
-    """How a reconstruction will treat flagged views, as a sentence; "" if the file does not say."""
+    """How a reconstruction will treat flagged projections, as a sentence; "" if the file does not state it."""
     from beamline.storage.readers.open import open_scan
     from beamline.storage.rules.flag_policy import flag_policy
 

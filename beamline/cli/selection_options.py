@@ -1,4 +1,5 @@
-"""Options about the scan file, the part of the scan and its corrections, shared by all commands that open a scan."""
+"""Options about the scan file, the selected part of the scan and its corrections. All commands that open a scan share
+them."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ _PATH = click.Path(path_type=Path)
 
 
 underscored = parsed(lambda value: value.replace("-", "_"))
-"""`line-integrals` on the command line becomes `line_integrals`."""
+"""Converts `line-integrals` from the command line to `line_integrals`."""
 
 scan_options = together(
     option(
@@ -148,7 +149,7 @@ light_options = together(
         "water or SiO2.",
     ),
 )
-"""The options whose values `light_asked` takes."""
+"""The options whose values `light_asked` uses."""
 
 
 def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:

@@ -1,7 +1,8 @@
-"""Standby process: loads what a live reconstruction needs before its scan starts, then waits for the command.
+"""Standby process: before a scan starts, it loads the modules that a live reconstruction needs. Then it waits for the
+command.
 
 `python -m beamline.cli.standby` waits for a line of JSON on its stdin, with a file for its stderr and the words of a
-command. From then on it runs as this command. It ends when its stdin closes.
+command. From then on, the process runs as this command. It ends when its stdin closes.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ def main() -> None:
     from recon.warm_up import warm_up
 
     warm_up(R2(finish=0))
-    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as told:  # whoever reads stdin next gets the rest
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as told:  # the next reader of stdin gets the rest
         if not (line := told.readline()):
             return
     log, *words = json.loads(line)

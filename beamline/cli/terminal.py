@@ -48,23 +48,25 @@ if TYPE_CHECKING:
 
 
 SAY_EVERY = 0.2  # s between events on the progress of many frames
-NOTEBOOK = "JPY_PARENT_PID"  # variable of the processes that a Jupyter kernel starts, whose cells imitate a terminal
-PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
+# environment variable of processes that a Jupyter kernel starts; the cells of a notebook imitate a terminal
+NOTEBOOK = "JPY_PARENT_PID"
+PLAIN_EVERY = 5.0  # Real time in s between progress lines on a stream that is not a terminal
 _ITERATIONS = {
     "sweeps of trials": "iterations of test reconstructions (to choose the settings)",
     "sweeps on voxels": "iterations of the voxel refinement",
     "sweeps of error bars": "iterations for the error bars",
-}  # beginning of the unit of a progress event: what the progress line calls it
+}  # beginning of the unit of a progress event: its name in the progress line
 _COUNTED = dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames"))
-# stage: name of its progress bar, and what is counted. Other stages are named after what is counted.
+# stage: name of its progress bar, and name of the items. Other stages are named after their items.
 
 
 class Terminal:
     """A sink that prints events. Leaving it as a context manager removes the progress bar.
 
     Args:
-        stream: where to print (stderr, because stdout is for results). A terminal gets a progress bar, any other
-            stream gets plain lines. So does a cell of a notebook, which keeps each state of a bar as a line.
+        stream: where to print (stderr, because stdout is for results). A terminal gets a progress bar, and any other
+            stream gets plain lines. A cell of a notebook also gets plain lines, because it would keep each state of a
+            bar as a line.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -83,14 +85,15 @@ class Terminal:
             TimeElapsedColumn(),
             console=self._console,
             transient=True,
-            redirect_stdout=False,  # rich's stand-ins let control characters of others through
+            # the streams that rich puts in place would not replace control characters in texts from outside
+            redirect_stdout=False,
             redirect_stderr=False,
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
         self._printed: dict[str, tuple[float, int]] = {}  # real time (s), and frame or step, of the last line
         self._last_text, self._narrated = "", Narration()
-        self._lock = threading.Lock()  # events come from one thread, questions from another
+        self._lock = threading.Lock()  # events come from one thread, and questions to the operator from another
         self._asking = False
 
     def __enter__(self) -> Self:
@@ -141,10 +144,10 @@ class Terminal:
             case FitReached(_, step, steps):
                 self._show("volume", step, steps, fit(event))
             case Failed() | VolumeDone() | RunDone() | Done():
-                pass  # the command prints these itself
+                pass  # the command prints these events itself
             case _:
                 text = "\n".join(lines(event))
-                if text and text != self._last_text:  # a snapshot of the same projections is not printed again
+                if text and text != self._last_text:  # another snapshot with the same projections is not printed again
                     self._last_text = text
                     self._console.print(text)
 
@@ -168,18 +171,19 @@ class Terminal:
 
 @contextmanager
 def events_shown(as_json: bool) -> Iterator[Sink]:
-    """The sink for the events of a command: JSON on stdout, or the terminal. SIGTERM and SIGHUP end the block."""
+    """The sink for the events of a command: JSON on stdout, or text in the terminal. SIGTERM and SIGHUP end the
+    block."""
     with terminated_like_interrupted(), json_events(as_json) as json_sink, Terminal(sys.stderr) as terminal:
         yield json_sink if as_json else terminal
 
 
 class Answer:
-    """The output of a command: events during the work, then the result, as facts for programs or lines for people.
+    """The output of a command: events during the work, and then the result, as facts for programs or as lines for
+    people.
 
     Attributes:
-        sink: takes the events.
-        clock: gives the times of the events.
-        lines: the result as lines for people, once the work is done.
+        sink: receives the events. clock: gives the times of the events. lines: the result as lines for people, when the
+            work is done.
     """
 
     def __init__(self, sink: Sink) -> None:
@@ -198,7 +202,7 @@ class Answer:
         return counting(stage, self.sink, self.clock)
 
     def done(self, facts: object, *lines: str) -> None:
-        """Send the event `done` with the facts. The lines are printed for people when the work has ended."""
+        """Send the event `done` with the facts. When the work has ended, the lines are printed for people."""
         self.sink(Done(facts, time=self.clock.now()))
         self.lines = lines
 
@@ -220,7 +224,7 @@ def rates(frame: FrameStored) -> str:
 
 
 def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
-    """n/N, rate and remaining time if they are known; otherwise `started`."""
+    """n/N with rate and remaining time, if they are known; otherwise `started`."""
     if not (done.of and done.per_s) or done.eta_s is None:
         return "started"
     what = "projections" if what == "views" else what
@@ -252,7 +256,7 @@ def fit(reached: FitReached) -> str:
     parts += [f"{reached.n_gaussians} Gaussians"] if reached.n_gaussians else []
     errors = {"residual": reached.residual, "residual of held-out projections": reached.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    left = "left for this step" if reached.unit else "left"  # because other parts of the work may follow
+    left = "left for this step" if reached.unit else "left"  # not shown, because other parts of the work may follow
     parts += [] if reached.eta_s is None else [f"{timedelta(seconds=round(reached.eta_s))} {left}"]
     return ", ".join(parts)
 
@@ -297,7 +301,7 @@ def results(record: ReconRecord) -> str:
 
 
 def _ended(settings: Mapping[str, Any]) -> str:
-    """How iterations that end by themselves ended; empty for other methods."""
+    """How the iterations ended, for a method whose iterations end by themselves; empty for other methods."""
     words = {
         "still": "converged: the volume no longer changed after {} iterations",
         "stopped": "stopped after {} iterations, before the volume had converged",
@@ -325,7 +329,7 @@ def _metrics_of(record: ReconRecord) -> list[str]:
     return lines
 
 
-LOOK, ACT = "watch", "control"  # Purpose of an address: first word of its line
+LOOK, ACT = "watch", "control"  # Purpose of an address, which is also the first word of its line
 ENDS_WITHIN = 3.0  # s
 
 
@@ -333,7 +337,8 @@ class PageBeside:
     """A sink that serves the page of a run from a separate process, within the context.
 
     Args:
-        say: prints the addresses, one a line. They contain the access tokens, so they must not be logged.
+        say: function that prints the addresses, one per line. They contain the access tokens, so they must not be
+            logged.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -350,13 +355,13 @@ class PageBeside:
             self.serve("watch", str(event.folder), "--control")
 
     def serve(self, *command: str) -> Callable[[bytes], object]:
-        """Start the server of a page by its command; returns what writes to it."""
+        """Start the server of a page with its command. Returns a function that writes to the server."""
         words = [sys.executable, "-m", "beamline.cli.main", *command, "--until-stdin-ends"]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
             child = ChildProcess(words, nowhere, self._pass_on, tether=True, behind=True)
             self._held.callback(child.wait, seconds=ENDS_WITHIN)
-            self._held.callback(child.let_go)  # first: open pages are told that they end
+            self._held.callback(child.let_go)  # called first, so that open pages show that the server ends
             return child.tell
         except OSError as error:
             self._say(f"The page cannot be shown ({error}). The scan is not affected.")

@@ -1,3 +1,3 @@
-"""Configuration: combines YAML file, environment and overrides into one frozen model, or reports errors with file
-and line.
+"""Configuration: combines a YAML file, environment variables and overrides into one frozen model, or reports errors
+with file and line.
 """

@@ -22,8 +22,8 @@ Name = Annotated[str, Setting(min_length=1, max_length=80)]
 
 
 class MotorSection(Section):
-    """A separate motor, of any kind of stage. For a linear axis, every key with deg in its name means the axis's own
-    unit (such as mm).
+    """A separate motor, of any kind of stage. For a linear axis, every key with deg in its name is in the unit of the
+    axis (such as mm).
     """
 
     speed_deg_s: float | None = setting(None, "null: the stage's max_speed_deg_s.", gt=0)
@@ -71,10 +71,9 @@ class StageMover(MotorSection):
         return self
 
     def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
-        """The mover, connected at its port or at `url`. Nothing moves.
+        """Connect the mover at its port, or at `url`. Nothing moves.
 
-        Raises:
-            DeviceError: its stage does not answer, or does not fit.
+        Raises: DeviceError: the stage of the mover does not answer, or is of the wrong kind.
         """
         places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not move")
         rad_per_mm = math.radians(1 / self.mm_per_deg) if self.mm_per_deg else math.nan
@@ -87,7 +86,7 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter whose positions are known only by their names. It is simulated, without an effect on the intensity, or
+    """A filter whose positions have only names. Either the filter is simulated, without an effect on the intensity, or
     the operator changes it by hand."""
 
     kind: Literal["simulated", "manual"]
@@ -139,23 +138,25 @@ class BeamMonitorSection(Section):
     """Keys that all beam monitors share. Each kind is listed in BEAM_MONITORS of a folder of `beamline.config`."""
 
     counterpart: ClassVar[str | None] = None
-    """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
+    """Name of the simulated counterpart, whose port is sim:// with this name; None if there is no simulated
+    counterpart."""
 
     unit: str
     scale: float = setting(1.0, "Factor that converts the reading to `unit`.", gt=0)
     timeout_s: float = setting(2.0, gt=0, le=1e6)
     period_s: float = setting(
-        1.0, "Time between readings during a scan (real time); they are stored in the scan's file.", gt=0, le=1e6
+        1.0, "Real time between readings during a scan. The readings are stored in the file of the scan.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
-        None, "In `unit`: the scan pauses below this value; null: it never pauses.", gt=0
+        None, "In `unit`: the scan pauses if the reading is below this value; null: it never pauses.", gt=0
     )
     resume_above: float | None = setting(
         None,
-        "In `unit`: the scan continues when readings have reached this value again; null: a tenth above pause_below.",
+        "In `unit`: a paused scan continues when the reading has reached this value again; null: a tenth above "
+        "pause_below.",
         gt=0,
     )
-    settle_s: float = setting(5.0, "How long the beam must be back before the scan continues.", ge=0)
+    settle_s: float = setting(5.0, "Time for which the beam must be back before the scan continues.", ge=0)
 
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
@@ -187,10 +188,11 @@ class NoBeamMonitor(Section):
 
 
 class StageOutputShutter(Section):
-    """A shutter on a digital output of the stage's controller, if the controller has outputs that can be set."""
+    """A shutter on a digital output of the controller of the stage. The controller must have outputs that can be
+    set."""
 
     kind: Literal["stage_output"]
-    output: int = setting(doc="Number of the output; it must differ from the output of the trigger pulses.", gt=0)
+    output: int = setting(doc="Number of the output. It must not be the output of the trigger pulses.", gt=0)
     open_high: bool = setting(True, "true: a high output opens the shutter.")
     settle_s: float = setting(0.1, "Time that the blade needs to open or close.", ge=0)
 
@@ -214,7 +216,7 @@ class NoMonochromator(Section):
 
 
 class _Monochromator(Section):
-    range_kev: tuple[Kev, Kev] | None = setting(None, "Lowest and highest energy that a scan may set; null: any.")
+    range_kev: tuple[Kev, Kev] | None = setting(None, "Lowest and highest energy that a scan may set; null: no limits.")
 
     @model_validator(mode="after")
     def _range_rises(self) -> Self:
@@ -225,7 +227,7 @@ class _Monochromator(Section):
 
 
 class SceneMonochromator(_Monochromator):
-    """Sets the energy of the simulated beam; at first it is the energy of the scene."""
+    """Sets the energy of the simulated beam. At the start it is the energy of the scene."""
 
     kind: Literal["simulated"]
     settle_s: float = setting(1.0, "Time that each move takes.", ge=0, le=1e6)

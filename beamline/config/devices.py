@@ -36,24 +36,25 @@ from recon.base.setting import Setting, setting
 
 
 class CameraDriver(Protocol):
-    """A driver's class, which the entry point of a package names.
+    """The class of a driver, which the entry point of a package names.
 
     Attributes:
-        Settings: a frozen dataclass of its settings; fields declare by a `Setting` how a configuration
-        writes them.
+        Settings: a frozen dataclass with the settings of the driver. Each field declares, with a `Setting`, how a
+            configuration writes it.
     """
 
     Settings: type[Any]
 
     def __call__(self, settings: Any, clock: Clock) -> Camera:
-        """The driver, connected. Raises DeviceError if there is no such camera."""
+        """Connect the driver. Raises DeviceError if there is no such camera."""
 
     def timing_of(self, settings: Any, wanted: CameraSettings) -> CameraTiming:
-        """The camera's timing, before it is connected. Raises ValueError for settings that it would refuse."""
+        """The timing of the camera before it is connected. Raises ValueError for settings that the camera would not
+        accept."""
 
 
 CAMERAS: Registry[CameraDriver] = Registry("camera", {}, with_settings, reserved=("dcam", "simulated_orca"))
-"""Kind in a configuration -> the driver."""
+"""For each kind in a configuration, the driver."""
 
 
 Roi = Annotated[
@@ -88,7 +89,7 @@ class _Orca(Section):
     )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        """The timing that the camera will report. Raises ValueError for settings that it would refuse."""
+        """The timing that the camera will report. Raises ValueError for settings that the camera would not accept."""
         return orca_quest.timing(wanted, model=self.model)
 
 
@@ -103,7 +104,7 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
     link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 transfers 17.7 full frames per second, CoaXPress 120.")
     cool_s: float = setting(
         0.0,
-        "Longest time in which a scan waits for the sensor to cool down before it starts; 0: do not wait.",
+        "Longest time for which a scan waits, before it starts, until the sensor is cold; 0: the scan does not wait.",
         ge=0,
         le=1e6,
     )
@@ -117,7 +118,7 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
 
     @property
     def options(self) -> DcamOptions:
-        """The keys as settings of the driver."""
+        """The values of the keys as settings of the driver."""
         options: DcamOptions = read_from(self, DcamOptions)
         return options
 
@@ -126,7 +127,7 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
 
 
 class PluggedCamera(Section):
-    """A camera of another package, with the keys that its settings declare."""
+    """A camera of another package. Its keys are those that its settings declare."""
 
     kind: str
     roi: (
@@ -137,12 +138,12 @@ class PluggedCamera(Section):
             Annotated[int, Setting(gt=0)],
         ]
         | None
-    ) = setting(None, "row0, col0, rows, cols on the sensor; null: all of it.")
+    ) = setting(None, "row0, col0, rows, cols on the sensor; null: the whole sensor.")
     binning: int = setting(1, gt=0)
     readout: str = "standard"
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        """The timing that the camera will report. Raises ValueError for settings that it would refuse."""
+        """The timing that the camera will report. Raises ValueError for settings that the camera would not accept."""
         driver = CAMERAS[self.kind]
         return driver.timing_of(read_from(self, driver.Settings), wanted)
 
@@ -172,7 +173,7 @@ class Simple(Section):
 
 
 def _found(table: str) -> tuple[type[Section], ...]:
-    """Sections of the families of devices, by the table of their folders that has them."""
+    """Sections of the families of devices, by the name of the table in their folders."""
     return tuple(in_folders("beamline.config.families", table).values())
 
 
@@ -248,7 +249,7 @@ class DeviceSection(Section):
         return frozenset(name for name in names if getattr(self, name).kind == "manual")
 
     def simulated_or_not(self) -> dict[str, bool]:
-        """Each device that can be simulated, and whether it is."""
+        """Each device that can be simulated, and whether it is simulated."""
         stage, shutter = self.stage.simulated, self.shutter.kind
         always = {
             "stage": stage,

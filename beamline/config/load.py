@@ -1,5 +1,5 @@
 """Loads a configuration: combines a YAML file, BEAMLINE_* variables and --set overrides into one frozen Config, or
-reports what is wrong.
+reports its faults.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
 NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
-"""For the operator of such a run, where it would decide otherwise."""
+"""Sentence for the operator of such a run, if the scan would otherwise make decisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReadConfig:
-    """A configuration whose values are legal, one by one; the place of each; and what is wrong with them together:
-    place and sentence.
+    """A configuration in which each single value is legal, the place of each value, and the faults of the values
+    together (place and sentence).
     """
 
     config: Config
@@ -76,13 +76,13 @@ def load(
     overrides. File names in the file are relative to it; those in variables and overrides, to the working directory.
 
     Args:
-        environment: default: os.environ.
-        rehearse: use the simulated counterpart of each device of a real instrument; see `rehearsal`.
-        no_live: given for a run without a live reconstruction, whatever the file states; function that gets a sentence
-            on what the run does not do for this reason.
+        environment: environment variables; default: os.environ. rehearse: True: use the simulated counterpart of each
+            device of a real instrument, see `rehearsal`. no_live: give this function for a run without a live
+            reconstruction, whatever the file states. It gets a sentence on what the run does not do for this reason.
 
     Raises:
-        ConfigError: every fault with file, line, key, what was found and what is allowed. Nothing has been started.
+        ConfigError: the configuration has faults. The message lists each with file, line, key, the value found and the
+            allowed values. Nothing has been started.
     """
     found = read_config(path, overrides, environment, rehearse=rehearse, no_live=no_live)
     _refuse(str(path), found.faults)
@@ -97,10 +97,10 @@ def read_config(
     rehearse: bool = False,
     no_live: Callable[[str], None] | None = None,
 ) -> ReadConfig:
-    """Read a configuration as `load` does, which raises its faults, too.
+    """Read a configuration as `load` does, but return the faults that concern several values together. (`load` raises
+    these, too.)
 
-    Raises:
-        ConfigError: every value that is not legal, with its place.
+    Raises: ConfigError: single values are not legal. The message lists each with its place.
     """
     path = Path(path)
     tree = _read_file(path, "beamline config init")
@@ -118,7 +118,8 @@ def read_config(
 
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
-    """Read and validate a configuration of another package, as `load` reads that of a scan; no variable overrides it.
+    """Read and validate the configuration of another package, as `load` does for a scan. Environment variables do not
+    override it.
 
     Args:
         printed_by: the command that prints an example.
@@ -148,15 +149,16 @@ def _read_file(path: Path, printed_by: str) -> Tree:
 
 
 def takes_text(keys: Sequence[str], of: Mapping[str, Any] | None = None) -> bool:
-    """True if a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
-    another one."""
+    """True if a key of the configuration accepts any text, and nothing else except null. `of`: JSON schema of another
+    configuration."""
     legal = declared_at(schema() if of is None else of, tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
     return "string" in kinds and kinds <= {"string", "null"}
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """The configuration with other values, without its file and the environment. Raises ConfigError as `load`."""
+    """The configuration with other values. The file and the environment are not read again. Raises ConfigError as
+    `load` does."""
     name = "the configuration"
     return _validated(override(read(resolved_yaml(config), name), overrides, {}, takes_text), name)
 
@@ -164,8 +166,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 def each_scan(config: Config) -> tuple[Config, ...]:
     """The configuration of each scan of a series (`scan.energies`, `scan.states`); that of a single scan itself.
 
-    The n-th of N scans begins n / N of an angular step later, or has another random seed, so that all scans together
-    contain more angles.
+    The n-th of N scans begins n / N of an angular step later, or has another random seed. So all scans together contain
+    more angles.
     """
     scan, series = config.scan, config.series
     key = "scan.energy" if scan.states is None else "scan.state"
@@ -222,7 +224,8 @@ def _refuse(path: str, found: Sequence[tuple[str, str]]) -> None:
 
 
 def resolved_yaml(config: Section) -> str:
-    """The whole configuration with every default filled in; the version on line one. `load` reads it back."""
+    """The whole configuration as text, with every default filled in, and the version in the first line. `load` can read
+    this text."""
     body = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
     return f"# splatline {version()}\n{body}"
 
@@ -274,7 +277,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     scene = config.simulation.scene if config.simulation else {}
     if isinstance(scene, dict):
         return scene
-    path = config_folder() / scene  # an absolute path stays as it is
+    path = config_folder() / scene  # an absolute path is not changed
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
@@ -306,16 +309,18 @@ def _field(fields: Fields, exposure: float) -> FieldPlan:
 
 
 def _locate(data: Any, folder: Path) -> None:
-    """Make the file names in plain configuration values independent of the working directory, in place."""
+    """Make the file names in plain configuration values independent of the working directory. The values are changed in
+    place."""
     if (scan := _group(data, "scan", "angles", "path")) is not None:
         scan["path"] = str((folder / scan["path"]).resolve())
     if (of_recon := _group(data, "recon", "reference")) is not None:
         of_recon["reference"] = str((folder / of_recon["reference"]).resolve())
     if (simulation := _group(data, "simulation", "scene")) is not None:
         scene_file, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
-        if scene_file.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
+        # kept as a short name, so that the resolved configuration also works on another computer
+        if scene_file.is_relative_to(shipped):
             simulation["scene"] = scene_file.relative_to(shipped).as_posix()
-        elif scene_file.is_file():  # otherwise it counts as a shipped one
+        elif scene_file.is_file():  # otherwise the name would count as that of a shipped file
             simulation["scene"] = str(scene_file)
     for key in ("file", "labels"):  # file of a volume in a scene inside the configuration
         if (phantom := _group(data, "simulation", "scene", "phantom", key)) is not None:
@@ -330,7 +335,7 @@ def _group(data: Any, *path: str) -> dict[str, Any] | None:
 
 
 def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Key path and message of each fault. shipped: folder of the configurations that come with the package."""
+    """Key path and message of each fault. shipped: folder with the configurations that come with the package."""
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
@@ -366,7 +371,7 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
 
 
 def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Key path and value of each number in plain values; several numbers of one key share its path."""
+    """Key path and value of each number in plain values. If a key has several numbers, they share its path."""
     if isinstance(values, dict | list | tuple):
         for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
             yield from quantities(each, at if name is None else (*at, str(name)))
@@ -378,7 +383,7 @@ _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigg
 
 
 def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Faults of camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
+    """Faults of camera settings: with them, a pulse of a fly scan would not give one frame of the planned exposure."""
     camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
     if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
         return
@@ -404,8 +409,9 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
 
 
 def offset_places(config: Config) -> tuple[float, ...]:
-    """Positions of the sample in mm for offset projections: in steps of 0.9 of the field of view, until a twentieth of
-    it shows air beyond the sample on either side. Raises ValueError with the reason if this is impossible.
+    """Positions of the sample in mm for laterally offset projections. They are 0.9 of the field of view apart, and end
+    when a twentieth of the field of view shows air beyond the sample, on both sides. Raises ValueError with the reason
+    if this is impossible.
     """
     mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
     if not config.scan.offset_views:
@@ -414,7 +420,7 @@ def offset_places(config: Config) -> tuple[float, ...]:
         raise ValueError("set sample.diameter_mm, which determines how far the sample is stepped")
     per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
     if not per_unit:
-        raise ValueError("devices.sample_mover cannot step the sample; set its kind to stage, and its mm_per_deg")
+        raise ValueError("devices.sample_mover cannot step the sample: set its kind to stage, and its mm_per_deg")
     settings, axis = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL), config.optics.axis_col
     cols = camera.timing_of(settings).shape[1]
     field = 1e-3 * config.optics.pixel_size_um * camera.binning * cols

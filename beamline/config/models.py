@@ -1,4 +1,4 @@
-"""Configuration models: every key of a configuration file, with its unit, allowed values and default."""
+"""Configuration models: they declare every key of a configuration file, with its unit, allowed values and default."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ else:
 
 class SampleSection(Section):
     name: str = setting(
-        doc="letters, digits and _ . + - (the name of the run's folder ends with it)",
+        doc="letters, digits and _ . + - (the name of the run's folder ends with this name)",
         pattern=r"^\w([\w.+-]*[\w+-])?$",
         max_length=80,
     )
@@ -45,7 +45,7 @@ Degrees = Annotated[float, Setting(ge=-1e6, le=1e6)]
 
 
 class _Span(Section):
-    """The keys that most schemes share."""
+    """The keys that most schemes of angles share."""
 
     scheme: str
     views: Views
@@ -54,7 +54,7 @@ class _Span(Section):
 
 
 class FixedAngles(_Span):
-    """Equal steps from start_deg over span_deg; without the end itself (180 projections over 180 deg: 0 ... 179)."""
+    """Equal steps from start_deg over span_deg, without the end itself (180 projections over 180 deg: 0 ... 179)."""
 
     scheme: Literal["fixed"]
 
@@ -76,20 +76,21 @@ class RandomAngles(_Span):
 
 
 class InterlacedAngles(_Span):
-    """The fixed angles in several passes, each pass in the gaps of the earlier ones."""
+    """The angles of `fixed`, in several passes. Each pass fills gaps between the angles of earlier passes."""
 
     scheme: Literal["interlaced"]
     passes: Views
 
 
 class GoldenAngles(_Span):
-    """Golden-ratio steps modulo span_deg: well spread after any number of projections; step scans only."""
+    """Golden-ratio steps modulo span_deg. The angles are well spread after any number of projections; step scans
+    only."""
 
     scheme: Literal["golden"]
 
 
 class FileAngles(Section):
-    """Degrees from a text file, one a line, in the order of acquisition; # starts a comment."""
+    """Angles in degrees from a text file, one per line, in the order of acquisition; # starts a comment."""
 
     scheme: Literal["file"]
     path: str = setting(doc="Relative to the configuration file.")
@@ -106,7 +107,7 @@ Column = Annotated[float, Setting(ge=-1e7, le=1e7)]
 
 
 class Fields(Section):
-    """Darks or flats: how many at each time, and their own exposure (null: the exposure of the scan)."""
+    """Darks or flats: the number at each time, and their exposure (null: the exposure of the scan)."""
 
     count: int = setting(10, ge=0, le=1_000_000)
     at: Place = Place.START
@@ -114,18 +115,19 @@ class Fields(Section):
 
 
 class TargetSection(Section):
-    """When a scan that makes decisions ends; the first target that is reached counts; null: no such target."""
+    """Targets that end a scan that makes decisions. The scan ends when the first target is reached; null: no such
+    target."""
 
     quality_db: float | None = setting(
         None,
         (
-            "Accepted loss in dB: the PSNR of the volume may be lower by this much than it would be after the "
-            "whole plan."
+            "Accepted loss in dB: the PSNR of the volume may be lower by this value than it would be after the whole "
+            "plan."
         ),
         gt=0,
         le=100,
     )
-    seconds: Seconds | None = setting(None, "Time limit from the first frame to the last flats and darks.")
+    seconds: Seconds | None = setting(None, "Longest time from the first frame to the last flats and darks.")
     dose: float | None = setting(
         None,
         "Largest dose of the scan (exposures with beam on the sample), as a fraction of the dose of the whole plan.",
@@ -155,7 +157,7 @@ class ScanSection(Section):
     angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds = setting(
-        doc="Time between projections: sets the speed of a fly scan, and the shortest time per frame of a step scan."
+        doc="Time between projections. It sets the speed of a fly scan, and the shortest time per frame of a step scan."
     )
     frames_per_view: int = setting(
         1,
@@ -167,8 +169,8 @@ class ScanSection(Section):
     settle_s: float = setting(0.1, "Settling time after each move of a step scan.", ge=0, le=1e6)
     warm_up_s: float = setting(
         0.0,
-        "How long the scintillator is exposed to the beam before frames are taken, each time the shutter opens. "
-        "A warm scintillator is brighter.",
+        "Time for which the scintillator is exposed to the beam before frames are taken, each time the shutter opens. "
+        "(A warm scintillator is brighter.)",
         ge=0,
         le=1e6,
     )
@@ -183,7 +185,7 @@ class ScanSection(Section):
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "keV of an energy series: one scan at each, one after the other. Each scan begins a fraction of an "
+        "Energies in keV of a series: one scan at each energy, one after the other. Each scan begins a fraction of an "
         "angular step later than the scan before.",
         min_length=2,
         max_length=1000,
@@ -204,12 +206,13 @@ class ScanSection(Section):
         le=100,
     )
     on_watchdog_loss: Literal["warn", "pause"] = setting(
-        "warn", "What a scan does if the watchdog cannot be started, or if it has ended and cannot be replaced."
+        "warn",
+        "What a scan does if the watchdog cannot be started, or if the watchdog has ended and cannot be replaced.",
     )
     decide: Literal["off", "ask", "do"] = setting(
         "off",
-        "What the scan does after each pass of projections. off: continue the plan. ask: what the "
-        "operator decides. do: what improves the volume most per second, until the target is met.",
+        "What the scan does after each pass of projections. off: it continues the plan. ask: it does what the "
+        "operator decides. do: it measures what improves the volume most per second, until the target is reached.",
     )
     target: TargetSection = TargetSection(quality_db=1.0)
     wait_s: float = setting(
@@ -224,7 +227,7 @@ class ScanSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _off_is_a_word(cls, data: Any) -> Any:
-        """YAML reads a bare `off` as false."""
+        """YAML reads `off` without quotes as false."""
         return {**data, "decide": "off"} if isinstance(data, dict) and data.get("decide") is False else data
 
 
@@ -252,8 +255,8 @@ class StorageSection(Section):
     preview_bin: int = setting(4, gt=0, le=10_000)
     flush_every: int = setting(
         16,
-        "If frames wait to be written, at most this number of frames is flushed to the file together; otherwise "
-        "each frame is flushed at once.",
+        "Largest number of frames that are flushed to the file together if frames wait to be written. If no frame "
+        "waits, each frame is flushed at once.",
         gt=0,
         le=1_000_000,
     )
@@ -274,7 +277,7 @@ class ReconSection(Section):
     )
     seconds: Seconds = setting(
         1800.0,
-        "Time limit after the last projection. null: no time limit; the fit takes as many steps as for a "
+        "Time limit for the fit after the last projection. null: no time limit; the fit takes as many steps as for a "
         "finished scan, and needs more time on a busy computer.",
     )
     reference: str | None = setting(
@@ -297,7 +300,7 @@ class Speed(Section):
 
 
 class SimulationSection(Section):
-    """Settings of simulated devices and of rehearsals; a real instrument ignores them."""
+    """Settings of simulated devices and of rehearsals. A real instrument ignores them."""
 
     scene: str | dict[str, Any] = setting(
         "scenes/battery.yaml",
@@ -308,7 +311,7 @@ class SimulationSection(Section):
 
 
 class Config(Section):
-    """A whole configuration file."""
+    """The content of a whole configuration file."""
 
     sample: SampleSection
     scan: ScanSection

@@ -1,7 +1,7 @@
-"""Sections `monitor` and `references` of the configuration: limits, and what alarms and faults do to a scan.
+"""Sections `monitor` and `references` of the configuration: limits, and the effects of alarms and faults on a scan.
 
-The keys of limits are the fields of the checks in the registry, and of `ReferenceLimits`. A check that enters the
-registry can be configured without an edit here.
+The keys of the limits are the fields of the checks in the registry, and of `ReferenceLimits`. So a new check in the
+registry can be configured without a change of this module.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from recon.base.setting import Setting, setting
 
 
 def _no_checks(retake: bool | tuple[str, ...]) -> str:
-    """What is wrong with names of checks."""
+    """The fault of a list of names of checks; "" if all names are known."""
     wrong = () if isinstance(retake, bool) else [name for name in retake if name not in BY_NAME]
     return f"{unknown('check', wrong[0], BY_NAME)}; expected a list of these, true or false" if wrong else ""
 
@@ -28,7 +28,9 @@ class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
     act_after: int = setting(
-        10, "Consecutive frames with an alarm before the check's policy pauses or stops the scan.", ge=1
+        10,
+        "Number of consecutive frames with an alarm after which the policy of the check pauses or stops the scan.",
+        ge=1,
     )
     retake: Annotated[bool | tuple[str, ...], Setting(problem=_no_checks)] = setting(
         False,
@@ -39,7 +41,7 @@ class MonitorBase(Section):
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
-        """The checks whose warnings make the scan repeat a projection."""
+        """The checks whose warnings make the scan take a projection again."""
         return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 
@@ -49,15 +51,15 @@ def _keys(limits: type[Any]) -> dict[str, Any]:
 
 
 def _limits_of(check: Check) -> Any:
-    """The section with the limits of a check, and its default, as `section_of` takes a key."""
+    """The section with the limits of a check, and its default, in the form of a key for `section_of`."""
     section = section_of(f"{type(check).__name__}Limits", Section, _keys(type(check)), f"Flag: {check.meaning}.")
     return section, section()
 
 
 def _policies() -> Any:
-    """The section with the policy of each check, and its default, as `section_of` takes a key."""
+    """The section with the policy of each check, and its default, in the form of a key for `section_of`."""
     keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
-    section = section_of("Policies", Section, keys, "What an alarm of each check does to a scan.")
+    section = section_of("Policies", Section, keys, "The effect of an alarm of each check on a scan.")
     return section, section()
 
 
@@ -74,7 +76,7 @@ def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
 
 
 def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
-    """Policy for the alarms of each check, by the check's name."""
+    """The policy for alarms, by the name of the check."""
     section: Section = monitor.policy  # type: ignore[attr-defined]  # made above, from the registry
     return {name: Policy(policy) for name, policy in section}
 
@@ -84,8 +86,8 @@ class ReferencesBase(Section):
 
     on_fault: Literal["stop", "log"] = setting(
         "stop",
-        "What happens before the first projection if darks or flats have a fault: the scan stops, or the "
-        "fault is logged.",
+        "What the scan does if darks or flats have a fault: it stops before the first projection, or it only logs the "
+        "fault.",
     )
 
 

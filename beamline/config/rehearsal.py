@@ -14,16 +14,17 @@ from beamline.config.stages import StageSection
 from drivers.orca_quest import SENSOR_SHAPE
 
 _MARK = "_rehearsal"
-_ELECTRONS = 5000  # of a sensor pixel in an exposure without a sample: 70 % of its range
-_LONGEST = 60  # characters of a sample's name before the mark at the end of the run folder's name
+_ELECTRONS = 5000  # electrons of a pixel in an exposure without a sample: 70 % of its range
+_LONGEST = 60  # number of characters of the sample's name before the mark at the end of the name of the run's folder
 
 
 def rehearsal(config: Config) -> dict[str, Any]:
-    """The plain values of the same scan with simulated devices; a configuration for simulated devices is unchanged.
+    """The plain values of the same scan with simulated devices. A configuration for simulated devices is returned
+    unchanged.
 
-    All settings of plan, stage and camera stay. The rotation axis is that of the scene, so it is searched for. Unless
-    its section `simulation` states otherwise, the scene is a battery that fits into the field of view, and the clock is
-    virtual, so that it waits for each simulated frame.
+    All settings of plan, stage and camera stay the same. The position of the rotation axis is that of the scene, so the
+    reconstruction must search for it. Unless the section `simulation` of the configuration states otherwise, the scene
+    is a battery that fits into the field of view, and the clock is virtual, so that it waits for each simulated frame.
     """
     data = config.model_dump(mode="json")
     if config.simulated:
@@ -37,7 +38,8 @@ def rehearsal(config: Config) -> dict[str, Any]:
 
 
 def _scene(config: Config) -> dict[str, Any]:
-    """A battery with air around it in the region that the camera reads, in a beam of the brightness that fits."""
+    """A battery, with air around it, in the region that the camera reads. The brightness of the beam suits the
+    exposure."""
     height, width = SENSOR_SHAPE
     row0, col0, rows, cols = getattr(config.devices.camera, "roi", None) or (0, 0, height, width)
     pitch = config.optics.pixel_size_um * 1e-3  # mm
@@ -72,7 +74,8 @@ def _plain(section: Section) -> dict[str, Any]:
 
 
 def _stage(stage: StageSection) -> dict[str, Any]:
-    """The stage at the simulated controller's port, with a separate transcript to compare with the real one."""
+    """The stage at the port of the simulated controller. It has a separate transcript, which can be compared with that
+    of the real stage."""
     other = stage.settings.stand_in
     values = (_stand_in(stage, other) if other else _plain(stage)) | {"port": f"sim://{other or stage.kind}"}
     if values.get("transcript"):
@@ -82,7 +85,8 @@ def _stage(stage: StageSection) -> dict[str, Any]:
 
 
 def _stand_in(stage: StageSection, kind: str) -> dict[str, Any]:
-    """A stage of another kind that turns like this one, with pulses as close together, from the same output."""
+    """A stage of another kind that can be simulated. It has the same speed and the same smallest distance between
+    pulses, and uses the same output."""
     settings, limits = stage.settings, stage.settings.limits()
     same = {"counts_per_turn", "max_speed_deg_s", "low_deg", "high_deg", "active_high", "timeout_s", "transcript"}
     return stage.model_dump(mode="json", include=same) | {
@@ -116,7 +120,8 @@ def _monochromator(real: DeviceSection) -> dict[str, Any]:
 
 
 def _beam_monitor(real: DeviceSection) -> dict[str, Any]:
-    """A simulated monitor that shows a steady intensity, which has no relation to the limits of the real one."""
+    """A simulated beam monitor that shows a constant intensity. The limits of the real monitor do not apply to this
+    intensity."""
     monitor = real.beam_monitor
     if monitor.counterpart is None:
         return _plain(NoBeamMonitor())

@@ -19,7 +19,7 @@ _types: Callable[..., Mapping[str, Any]] = cache(get_type_hints)
 
 
 def port_problem(port: str) -> str:
-    """What is wrong with a port; "" if it may be one. Names of ports, not URLs, have a colon only within a path."""
+    """The fault of a port; "" if it is possible. The name of a port (unlike a URL) has a colon only within a path."""
     wrong = re.match(r"[a-z]\w*:(?!//)|socket://(?!.+:\d+)", port, re.IGNORECASE)
     return f"{port} is not a port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
@@ -29,9 +29,10 @@ Port = Annotated[str, Setting(min_length=1, problem=port_problem)]
 
 
 class Section(BaseModel):
-    """A frozen group of keys. It rejects unknown keys, and `yes` for a number.
+    """A frozen group of keys. It does not accept unknown keys, or `yes` for a number.
 
-    The message of a validator of a group begins with the key that has the fault; the message then names its line.
+    If a validator of a group raises an error, its message must begin with the key that has the fault. The line of this
+    key is then added to the message.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -39,7 +40,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_yaml_traps(cls, data: Any) -> Any:
-        """Raise an error for values that YAML reads differently from what the author probably meant."""
+        """Raise an error for values that YAML probably reads differently from what the author meant."""
         for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
             truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)
             if isinstance(value, bool) and bool not in truths:
@@ -54,7 +55,7 @@ class Section(BaseModel):
 
 
 def declared(settings: type[Any]) -> dict[str, Any]:
-    """Type and default of the key of each field of a driver's settings, for `section_of`."""
+    """Type and default of the key for each field of a driver's settings, for `section_of`."""
     types = _types(settings)
     return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
 
@@ -66,18 +67,18 @@ def read_from(section: Section, settings: type[Any]) -> Any:
 
 
 def _inside(made: Setting, kind: Any, value: Any) -> Any:
-    """A key's value for the driver, in the unit and of the type of the field."""
+    """The value of a key for the driver, converted to the unit and type of the field."""
     cast = next((each for each in (kind, *get_args(kind)) if _is(each, StrEnum, Path)), None)
     return made.inside(value) if cast is None or value is None else cast(value)
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
-    """True if it is a class of one of these kinds, and not a union."""
+    """True if the type is a class of one of these kinds, and not a union."""
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 
 def _declared(made: Setting, kind: Any) -> tuple[Any, Any]:
-    """Type and default of a field's key, as pydantic takes them."""
+    """Type and default of the key of a field, in the form that pydantic needs."""
     members = (
         Literal[tuple(choice.value for choice in each)] if _is(each, StrEnum) else str if _is(each, Path) else each
         for each in (get_args(kind) if get_origin(kind) is UnionType else (kind,))
@@ -87,5 +88,5 @@ def _declared(made: Setting, kind: Any) -> tuple[Any, Any]:
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:
-    """A section with further keys, (type, default) each, as pydantic.create_model takes a field."""
+    """A section with further keys. Each key is given as (type, default), like a field for pydantic.create_model."""
     return create_model(name, __base__=base, __doc__=doc, **keys)

@@ -1,7 +1,7 @@
 """Configuration of the rotation stage: one section per kind of stage, with the keys that its settings declare.
 
-To add a stage, add its folder `drivers/stages/<kind>` with a module `stage` that contains the driver; DRIVERS in the
-folder names the driver.
+To add a stage, add its folder `drivers/stages/<kind>` with a module `stage` that contains the driver. DRIVERS in the
+folder must name the driver.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ STAGES: Registry[StageDriver] = Registry(
     },
     with_settings,
 )
-"""Kind, as a configuration names it -> the driver."""
+"""For each kind of stage, as a configuration names it, the driver."""
 
 _IDENTITY = ("model", "serial", "device", "axis", "channel")
 
 
 def settings_file(description: Mapping[str, object], folder: Path) -> Path:
-    """File for the settings of the stage with this description: named by its serial number, or by its port if it
-    reports none.
+    """File for the settings of the stage with this description. Its name has the serial number of the stage, or the
+    port if the stage reports no serial number.
     """
     which = [str(description[key]) for key in _IDENTITY if key in description]
     if "serial" not in description:
@@ -50,13 +50,14 @@ def settings_file(description: Mapping[str, object], folder: Path) -> Path:
 
 
 class StageSection(Section):
-    """Keys that all stages share. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
+    """Keys that all stages share. Examples of real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/...,
+    socket://host:port."""
 
     kind: str
     port: Port = setting(
         doc=(
-            "Address of the controller. For a simulated controller write sim:// and the kind, if the kind has one; "
-            "the simulated controller uses all other settings given here."
+            "Address of the controller. For a simulated controller write sim:// and the kind, if this kind can be "
+            "simulated. The simulated controller uses all other settings given here."
         )
     )
 
@@ -82,7 +83,7 @@ class StageSection(Section):
 
     @property
     def settings(self) -> StageSettings:
-        """The settings for opening the driver."""
+        """The settings with which the driver is opened."""
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
@@ -108,7 +109,7 @@ def _section(kind: str) -> type[StageSection]:
 
 
 STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind) for kind in STAGES}
-"""Kind -> its section of the configuration."""
+"""For each kind, its section of the configuration."""
 
 if TYPE_CHECKING:
     StageConfig = StageSection

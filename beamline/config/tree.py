@@ -1,7 +1,7 @@
-"""Configuration text: merges YAML, --set and BEAMLINE_* variables into one tree, remembers where each value came
-from, and reports faults.
+"""Configuration text: merges YAML, --set and BEAMLINE_* variables into one tree, records the origin of each value, and
+reports faults.
 
-Faults are pydantic's findings with file and line, the key, its value and the legal values.
+A fault is a finding of pydantic, with file and line, the key, its value and the legal values.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ from recon.base.findings import KeyPath, Schema, faults_of
 ENVIRONMENT_PREFIX = "BEAMLINE_"
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
-"""Errors of PyYAML next to its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
+"""Errors that PyYAML raises in addition to its YAMLError, for example for a 13th month, a number of 5000 digits, or
+`!!bool x`."""
 
 _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
-"""Of a YAML text: characters, values (as often as aliases repeat them), groups within groups, digits of a number."""
+"""Limits for a YAML text: number of characters, of values (counted as often as aliases repeat them), of nested groups,
+and of digits of a number."""
 _TOO_MUCH = (
     f"this is more than settings may have: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
     f"nested groups and numbers of {_DIGITS} digits. Nothing was started."
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
-_BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
+# one after the other; for a thousand of them, PyYAML needs a second
+_BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")
 _TAGGED = "text that begins with ! or = needs quotes"
 _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
 
@@ -42,11 +45,11 @@ RENAMED: Mapping[KeyPath, str] = {
     ("scan", "wish"): "target",
     ("scan", "without_watchdog"): "on_watchdog_loss",
 }
-"""Names of keys in the last version, which are still understood, and their names now."""
+"""Names of keys in the last version, which are still accepted, and their present names."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values; a date is text, as in the name of a sample."""
+    """Loader for plain values. A date is read as text, because it may be the name of a sample."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -56,8 +59,8 @@ _Loader.yaml_implicit_resolvers = {
 
 
 class _FastLoader(getattr(yaml, "CSafeLoader", _Loader)):  # type: ignore[misc]
-    """The same by libyaml, twenty times as fast. It also takes what `_Loader` does not (tabs), and says less of faults:
-    text with either is for `_Loader`.
+    """The same loader from libyaml, which is twenty times as fast. It accepts some text that `_Loader` does not (tabs),
+    and its messages about faults are less detailed. Text with tabs or faults is therefore read with `_Loader`.
     """
 
     yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
@@ -87,7 +90,8 @@ def read(text: str, name: str) -> Tree:
     return Tree(deepcopy(known.data), known.origins)
 
 
-@lru_cache(maxsize=4)  # the rows of a table name the same configuration, and configurations the same scene
+# cached, because the rows of a table name the same configuration, and configurations name the same scene
+@lru_cache(maxsize=4)
 def _read(text: str, name: str) -> Tree:
     data, origins = _parsed(text, name)
     if data is None:
@@ -106,12 +110,12 @@ def _read(text: str, name: str) -> Tree:
 
 
 def _present_name(path: KeyPath) -> KeyPath:
-    """The path with the name that its key has now."""
+    """The path with the present name of its key."""
     return (path[0], RENAMED[path]) if path in RENAMED else path
 
 
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
-    """The values in a YAML text, and the place of each."""
+    """The values in a YAML text, and the place of each value."""
     origins: dict[KeyPath, str] = {}
     with yaml_faults(text, name) as loader:
         try:
@@ -126,8 +130,8 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 
 @contextmanager
 def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
-    """A context for reading YAML, with the loader to read it by: raises ConfigError for its faults, and in advance for
-    text that would take longer than a second.
+    """A context for reading YAML, which gives the loader to use. It raises ConfigError for faults of the text, and also
+    for text that would take longer than a second to read.
     """
     if len(text) > _LONGEST or _BRACKETS.search(text):
         raise ConfigError(f"{name}: {_TOO_MUCH}")
@@ -142,7 +146,7 @@ def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
 
 
 def _fitting_loader(text: str, name: str) -> type[Any]:
-    """The fast loader if the text has no fault. Raises what `yaml_faults` tells."""
+    """The fast loader, if the text has no fault. Otherwise raises the error of `yaml_faults`."""
     if "\t" not in text:
         with suppress(yaml.YAMLError, *YAML_FAULTS):
             return _refuse_too_much(text, name, _FastLoader)
@@ -159,7 +163,8 @@ def _refuse_too_much(text: str, name: str, loader: type[Any]) -> type[Any]:
 
 
 def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
-    """The line of a fault of YAML (0: not known), and what is wrong with it, for somebody who does not know YAML."""
+    """The line of a fault in YAML (0: not known), and a description of the fault for somebody who does not know
+    YAML."""
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
@@ -206,7 +211,7 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
 
 
 def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
-    """Enter the place of each value below a node."""
+    """Record the place of each value below a node."""
     place = f"{name}:{node.start_mark.line + 1}"
     origins.setdefault(path, place)
     if len(origins) > _MOST or (node.tag.endswith((":int", ":float")) and len(node.value) > _DIGITS):
@@ -224,7 +229,7 @@ def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, st
 
 
 Override = str | tuple[str, str]
-"""`section.key=value`, and where it was given if that was not by --set."""
+"""The text `section.key=value`, and the place where it was given (if it was not given with --set)."""
 
 
 def override(
@@ -233,10 +238,10 @@ def override(
     environment: Mapping[str, str],
     is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
 ) -> Tree:
-    """The tree overridden by BEAMLINE_SECTION__KEY variables and then by `section.key=value`.
+    """The tree after it was overridden by BEAMLINE_SECTION__KEY variables, and then by `section.key=value`.
 
-    Values are YAML; values of text keys are used literally unless they are quoted as YAML. A variable without a double
-    underscore is ignored.
+    A value is read as YAML. The value of a text key is used literally, unless it has the quotes of YAML. A variable
+    without a double underscore is ignored.
 
     Args:
         is_text: True if the key of this path takes text.
@@ -278,7 +283,7 @@ REMOVED = {
     "come would add at most 0.5 dB",
     "scan.return_views": "The check `opposite` shows motion of the sample, from projections 180° apart",
 }
-"""Keys of 1.0.0 that were removed, each with what does the same."""
+"""Keys of 1.0.0 that were removed, each with a sentence on its replacement."""
 _ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"
 
 

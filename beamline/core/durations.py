@@ -1,4 +1,4 @@
-"""Durations: remaining time, progress through the rows of a table, and the phases of long work."""
+"""Durations: the remaining time of work, progress through the rows of a table, and the phases of long work."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from drivers.base.clock import Clock, SystemClock
 
 
 def seconds_left(done: float, total: float, spent: float) -> float | None:
-    """Seconds left at the speed so far; None while nothing is done.
+    """Remaining seconds, if the work continues at the present speed; None as long as nothing is done.
 
     Args:
-        done, total: amount of work in any unit in which the work proceeds evenly, such as predicted seconds.
-        spent: time in s for the work that is done.
+        done, total: amount of work that is done, and of all work, in any unit in which the work proceeds evenly, such
+            as predicted seconds.
+        spent: time in s that the finished work took.
     """
     return max(total - done, 0.0) * spent / done if done > 0 and spent > 0 else None
 
@@ -24,8 +25,8 @@ _Row = TypeVar("_Row")
 
 
 def in_turn(stage: str, rows: Sequence[_Row], label: Callable[[_Row], str], sink: Sink, clock: Clock) -> Iterator[_Row]:
-    """The rows of a table that are to be worked on; an event `progress` of this stage before each, with its label, the
-    rate so far and the seconds left."""
+    """Yields the rows of a table that remain to be done. Before each row, an event `progress` of this stage gives its
+    label, the rate so far and the remaining seconds."""
     begin = clock.now()
     for n, row in enumerate(rows):
         spent = clock.now() - begin
@@ -38,14 +39,15 @@ _SAY_EVERY = 0.2  # s between events on the progress of a phase
 
 
 class Phases:
-    """Consecutive phases without gaps, so that their seconds add up to the time since the start.
+    """Consecutive phases of a piece of work. They have no gaps, so that their seconds add up to the time since the
+    start.
 
     Args:
-        sink: gets an event `progress` of the stage "phase" as each begins, and some on its progress.
-        clock: for their times.
+        sink: gets an event `progress` of the stage "phase" when a phase begins, and further events on its progress.
+            clock: gives the times of the events.
 
     Attributes:
-        seconds: of each phase that has ended; the sum for a repeated phase.
+        seconds: duration of each phase that has ended. If a phase is repeated, the sum of its durations.
     """
 
     def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
@@ -54,7 +56,7 @@ class Phases:
         self.seconds: dict[str, float] = {}
 
     def enter(self, name: str, counted: str = "views") -> None:
-        """End the last phase and begin this one; its progress counts up to `counted`."""
+        """End the last phase and begin this one. `counted` names the items that its progress counts."""
         self.end()
         self._name, self._counted, self._reported = name, counted, -math.inf
         self._say(0, 0, None, None)
@@ -68,7 +70,7 @@ class Phases:
             self._say(n, total, n / spent, seconds_left(n, total, spent))
 
     def end(self) -> None:
-        """End the last phase now."""
+        """End the present phase now."""
         now = self._clock.now()
         if self._name:
             self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begun

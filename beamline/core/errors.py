@@ -1,4 +1,5 @@
-"""Errors with exit codes. The class says which part failed and whether data are safe; a defect leaves a traceback."""
+"""Errors with exit codes. The class of an error says which part failed and whether data are safe. A defect of the
+program leaves a traceback."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from drivers.base.errors import DeviceError
 
 
 class BeamlineError(Exception):
-    """An error for the operator: its message says what happened, what was expected, what to do, what is unchanged."""
+    """An error for the operator. Its message says what happened, what was expected, what to do, and what is
+    unchanged."""
 
     exit_code = 1
 
@@ -28,8 +30,8 @@ class ConfigError(BeamlineError):
     """Wrong usage or configuration; nothing was started.
 
     Args:
-        faults: what is wrong, one by one: the place of the value (`my.yaml:12`), and a sentence without its full stop.
-            Empty if the message is complete without them.
+        faults: list of single errors. Each has the place of the value (`my.yaml:12`) and a sentence without its full
+            stop. Empty if the message is complete without the list.
     """
 
     exit_code = 2
@@ -58,19 +60,19 @@ class ReferencesError(ScanStopped):
 
 
 class DataError(BeamlineError):
-    """The data or the disk are at fault: an unreadable file, lost frames, no free space."""
+    """The cause is in the data or on the disk: a file is unreadable, frames are lost, or the disk is full."""
 
     exit_code = 5
 
 
 class QualityError(BeamlineError):
-    """Finished and written, but a quality limit was exceeded."""
+    """The work is finished and its result is written, but a quality limit was exceeded."""
 
     exit_code = 6
 
 
 class AlarmError(BeamlineError):
-    """Finished and written, but the monitor raised alarms: some frames are bad."""
+    """The work is finished and its result is written, but the monitor raised alarms, because some frames are bad."""
 
     exit_code = 7
 
@@ -81,7 +83,7 @@ def refuse_wrong_arguments(function: Callable[..., Any], values: Mapping[str, An
     Args:
         values: by name, such as `locals()` in the function's first line.
     """
-    from recon.base.declared_types import check_arguments  # here, because most commands need none of it
+    from recon.base.declared_types import check_arguments  # imported here, because most commands do not need it
 
     try:
         check_arguments(function, values)
@@ -102,7 +104,8 @@ def exit_code(error: BaseException) -> int:
         return INTERRUPTED
     if out_of_memory(error) or damaged(error):
         return DataError.exit_code
-    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):  # one without a number is a defect
+    # an OSError without an error number is a defect
+    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
         return DataError.exit_code
     return ConfigError.exit_code if installation_problem(error) else BeamlineError.exit_code
 
@@ -147,8 +150,8 @@ def user_message(error: BaseException) -> str:
 
 
 def leave_traceback(error: BaseException, folder: Path) -> Path | None:
-    """A new file with the traceback of a defect: in `folder`, or in the folder for temporary files; None if neither is
-    writable. An error that already has such a file keeps it.
+    """Write the traceback of a defect to a new file, in `folder` or in the folder for temporary files; None if neither
+    folder is writable. If the error already has such a file, this file is kept.
     """
     if (left := getattr(error, "traceback_file", None)) is not None:
         return Path(left)

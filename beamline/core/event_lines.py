@@ -1,4 +1,4 @@
-"""Lines of events from another process or from a log: parsing them into events or plain values."""
+"""Parses lines of events, from another process or from a log, into events or plain values."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from beamline.core.events import KINDS, SPREAD, Event
 from beamline.core.process import json_object
 
 LONGEST = 2**20
-"""Most bytes of a line of a log: a scan with 100,000 missing triggers takes 700 kB to say so."""
+"""Largest size in bytes of a line of a log. The line that lists 100,000 missing triggers has 700 kB."""
 LARGEST_LOG = 2**30
-"""Bytes of a log that are read: those of a week with ten lines a second."""
+"""Largest number of bytes of a log that are read: enough for a week with ten lines per second."""
 
 
 def event_of(values: Mapping[str, Any]) -> Event:
-    """The event in a JSON line of another process. Raises ValueError if no kind of event has these values."""
+    """The event in a JSON line that another process wrote. Raises ValueError if no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
         spread = {item.name: item.metadata[SPREAD][1] for item in fields(each) if SPREAD in item.metadata}
         own = {item.name for item in fields(each) if item.name not in spread}
         rest = {name: value for name, value in given.items() if name not in own}
-        with suppress(TypeError):  # other fields, or the values are not those of the dataclass that is spread
+        # the class has other fields, or the values do not belong to the dataclass whose values are spread
+        with suppress(TypeError):
             taken = {name: made(**rest) for name, made in spread.items()} or rest
             return each(**{name: value for name, value in given.items() if name in own}, **taken)
     raise ValueError(f"no event has the values {dict(values)}")
 
 
 def event_in(line: str | bytes) -> dict[str, Any] | None:
-    """The values of an event in a line of a log; None if the line is no event.
+    """The values of an event in a line of a log; None if the line is not an event.
 
-    Only its kind and its time are checked: other fields may be missing, unknown, or of another type, because another
-    version wrote them.
+    Only kind and time of the event are checked. Other fields may be missing, unknown, or of another type, because
+    another version may have written them.
     """
     with suppress(UnicodeDecodeError):
         text = line.decode() if isinstance(line, bytes) else line

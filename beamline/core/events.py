@@ -1,6 +1,6 @@
 """Events: everything that happens in a run, one class per kind. Sinks (terminal, events.jsonl, log) receive them.
 
-Here are the kinds of a scan and of any command; `recon_events` has those of reconstructions.
+This module has the kinds of events of scans and of all commands; `recon_events` has those of reconstructions.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from beamline.core.flag import Flag
 from beamline.core.run_result import RunResult
 
 KINDS: dict[str, list[type[Event]]] = {}
-"""The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
+"""The classes of each kind of event. Each class is added when it is defined. Classes of one kind differ in their
+fields."""
 SPREAD = "spread"
 """Key of a field's metadata, see `spread`."""
 
 
 def spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **of_field: Any) -> Any:
-    """A field whose values are written into the event's line one by one: those of a mapping, or what `of` makes of an
-    object (its attributes).
+    """A field whose values are written into the event's line one by one. They are the values of a mapping, or those
+    that `of` returns for an object (by default its attributes).
 
     Args:
-        made: of the values in a line of another process.
+        made: function that makes the field from the values in a line of another process.
     """
     return field(metadata={SPREAD: (of, made)}, **of_field)
 
@@ -78,7 +79,7 @@ Sink = Callable[[Event], None]  # Takes events
 
 def json_of(values: object) -> str:
     """One line of JSON. NaN and infinities become null, arrays become lists, dataclasses objects, and paths strings."""
-    from pydantic_core import to_jsonable_python  # imported here because most commands write no JSON
+    from pydantic_core import to_jsonable_python  # imported here, because most commands write no JSON
 
     from recon.base.json_values import plain
 
@@ -86,7 +87,8 @@ def json_of(values: object) -> str:
 
 
 class RunStarted(Event, event="run_started"):
-    """A scan starts; nothing has moved yet. duration: planned, in s; remarks: remarks of the plan, for people."""
+    """A scan starts; nothing has moved yet. duration: planned duration in s. remarks: remarks of the plan, for
+    people."""
 
     folder: Path
     path: Path
@@ -98,7 +100,7 @@ class RunStarted(Event, event="run_started"):
 
 
 class StateEntered(Event, event="state"):
-    """A scan enters a state, or reports something. In a reconstruction, `state` is the topic of the message.
+    """A scan enters a state, or reports a message. In a reconstruction, `state` is the topic of the message.
 
     Attributes:
         message: a sentence for people; may be empty.
@@ -111,7 +113,8 @@ class StateEntered(Event, event="state"):
 
 
 class BlockStarted(Event, event="block_started"):
-    """A block of darks, flats or projections starts. first_row: its first row in the file; exposure, period: in s."""
+    """A block of darks, flats or projections starts. first_row: row of its first frame in the file. exposure, period:
+    in s."""
 
     kind: str
     mode: str
@@ -136,7 +139,8 @@ class BlockDone(Event, event="block_done"):
 
 
 class FrameStored(Event, event="frame"):
-    """A frame was stored in the file; at most ten events per second. mean: mean counts (not given by simulations)."""
+    """A frame was stored in the file. At most ten such events are sent per second. mean: mean counts (not given by
+    simulations)."""
 
     n: int
     of: int
@@ -177,17 +181,19 @@ class Warned(Event, event="warning"):
 
 
 class PassEnded(Event, event="pass_ended"):
-    """A pass of projections is done. The program chooses what to measure next, or asks the operator.
+    """A pass of projections is done. Now the program chooses what to measure next, or asks the operator.
 
     Attributes:
-        number: number of this event, from 1; such an event follows a pass, offset projections or retakes.
+        number: number of this event, from 1. Such an event follows a pass, laterally offset projections, or projections
+            that were taken again.
         n_views: number of projections so far.
         options: what can be measured next, as values of `beamline.plan.choose.PassOption`: choice, frames, seconds,
-            dose (fraction of that of the plan), bytes, and gain, low, high in dB (None: not known).
-        recommended: the choice that the program makes or would make.
-        wait: real time in s for which the operator is asked; 0 if nobody is asked.
+            dose (as a fraction of the dose of the plan), bytes, and the expected improvement in dB with its range
+            (gain, low, high; None: not known).
+        recommended: the choice that the program makes, or would make if it need not ask.
+        wait: real time in s for which the scan waits for the operator's answer; 0 if nobody is asked.
         remark: a sentence that says why no gain is known; empty if gains are known.
-        passes: number of passes that are done, without offset projections and retakes.
+        passes: number of passes that are done. Laterally offset projections, and projections taken again, do not count.
     """
 
     number: int
@@ -200,20 +206,20 @@ class PassEnded(Event, event="pass_ended"):
 
 
 class NextChosen(Event, event="next_chosen"):
-    """The decision what is measured after a pass.
+    """The decision what the scan measures after a pass.
 
     Attributes:
         number: number of the decision, from 1.
         n_views: number of projections so far.
         passes: as in `PassEnded`.
         choice: a `beamline.plan.passes.Choice`.
-        by: who decided: program, operator, or plan (nobody did, so the scan follows its plan).
+        by: who decided: program, operator, or plan (nobody decided, so the scan follows its plan).
         reason: a sentence.
         options: as in `PassEnded`.
-        predicted, gained: improvement in dB by an earlier choice, as predicted then and as measured now; gained_low and
-            gained_high are the ends of its range. None: not known.
-        judged: number of the decision for that earlier choice.
-        dropped: number of frames that are not taken because of this choice.
+        predicted, gained: improvement in dB by an earlier choice: as it was predicted then, and as it is measured now.
+            gained_low and gained_high are the ends of the range of the measured improvement. None: not known. judged:
+            number of the decision for this earlier choice. dropped: number of planned frames that are not taken because
+            of this choice.
     """
 
     number: int
@@ -232,7 +238,7 @@ class NextChosen(Event, event="next_chosen"):
 
 
 class Counted(Event, event="progress"):
-    """n of `of` frames, slices, projections or axes are done; `stage` names the work."""
+    """n of `of` frames, slices, projections or axes are done. `stage` names the work."""
 
     stage: str
     n: int
@@ -242,7 +248,8 @@ class Counted(Event, event="progress"):
 
 
 class PhaseReached(Event, event="progress"):
-    """A phase of the work starts (n is 0), or n of `of` items are done; `counted` names the items. None: not known."""
+    """A phase of the work starts (n is 0), or n of `of` items are done. `counted` names the items. A value that is not
+    known is None."""
 
     stage: str
     counted: str
@@ -265,7 +272,7 @@ class TrialReached(Event, event="progress"):
 
 
 class KernelsCompiled(Event, event="progress"):
-    """Kernels were compiled: their number, and the time in seconds."""
+    """Kernels were compiled. The values are their number and the time in seconds."""
 
     stage: str
     n: int
@@ -279,13 +286,13 @@ class ScanDone(Event, event="scan_done"):
 
 
 class Listed(Event):
-    """An event whose values are printed unchanged. values: a mapping or a dataclass."""
+    """An event whose values are printed as they are. values: a mapping or a dataclass."""
 
     values: Any = spread()
 
 
 class StepsListed(Listed, event="explain"):
-    """The steps that make a frame of a scene, in order, and the effects that the scene does not use."""
+    """The steps in which a frame of a scene is computed, in order, and the effects that the scene does not use."""
 
 
 class DeviceRead(Listed, event="device"):
@@ -305,8 +312,8 @@ class Done(Listed, event="done"):
 
 
 class Failed(Event, event="failed"):
-    """A command has failed. folder: folder of the run; more: further values by name, such as the plan of a queue of
-    which a scan cannot run."""
+    """A command has failed. folder: folder of the run; more: further values by name, such as the plan of a queue that
+    contains a scan that cannot run."""
 
     message: str
     exit_code: int | None = None

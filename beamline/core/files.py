@@ -1,4 +1,4 @@
-"""Files: only regular files are read; a file is written completely or not at all, and replaces none unless asked."""
+"""Reads only regular files. Writes a file completely or not at all, and replaces an existing file only on request."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from typing import BinaryIO, TextIO
 from beamline.core.errors import DataError
 from beamline.core.text import csv_text
 
-PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
-OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
-RUNS = "runs"  # The default folder for the folders of runs
+PART = "part-{}"  # The folder of a later part of a resumed scan, in the folder of the run
+OURS = 0o755  # Mode of a run's folder: only the owner may replace files in it, whatever the umask is
+RUNS = "runs"  # The default folder that contains the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
-JOINED = "joined.h5"  # The file of all parts of a run, next to the first one
+JOINED = "joined.h5"  # The file with all parts of a run, next to the file of the first part
 CONFIG = "config.resolved.yaml"
 TABLE = ".csv"  # Suffix of a table of scans
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 RECORD = "state.json"  # The state of a run, or of a later part of it, in its folder
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
-STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, before "_"
+STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the beginning of the name of a run's folder, before "_"
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
-    """Create a folder `<UTC time>_<sample>` in `runs`; if that exists, a number is appended."""
+    """Create a folder `<UTC time>_<sample>` in `runs`. If this name exists, a number is appended."""
     stem = f"{time.strftime(STAMP, time.gmtime(seconds))}_{sample}"
     runs.mkdir(parents=True, exist_ok=True)
     for number in count(1):
@@ -48,17 +48,19 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
 
 
 def parts_of(run: Path) -> list[Path]:
-    """The folders of a run's parts, in order: its own, and one for each time it was resumed."""
+    """The folders of the parts of a run, in order: the folder of the run itself, and one folder for each time the run
+    was resumed."""
     return [run, *(part for _, part in sorted(_numbered(run).items()))]
 
 
 def run_of(folder: Path) -> Path:
-    """The folder of the run that contains a folder: itself, or the one around a later part."""
+    """The folder of the run to which a folder belongs: the folder itself, or its parent if it is the folder of a later
+    part."""
     return folder.parent if folder in parts_of(folder.parent)[1:] else folder
 
 
 def create_part(run: Path) -> Path:
-    """Create the folder of a new part, after the others."""
+    """Create the folder of a new part, numbered after the existing parts."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)
     folder.mkdir(mode=OURS)
     return folder
@@ -70,15 +72,15 @@ def _numbered(run: Path) -> dict[int, Path]:
 
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems and file systems without this call
-TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
+TEXT = 2**26  # Largest size in bytes of a text file that a user names: the angles of a million projections take 20 MB
 _JUNCTION = 0xA0000003  # st_reparse_tag of a mount point of Windows
-SETTINGS = 2**20  # Most bytes of a text file of settings: YAML of 1 MB takes seconds to read
+SETTINGS = 2**20  # Largest size in bytes of a text file of settings: YAML of 1 MB takes seconds to read
 
 
 def require_regular(path: Path, largest: float = math.inf) -> None:
     """Raise OSError if `path` exists and is not a regular file, or has more bytes than `largest`.
 
-    Opening a pipe may wait for ever, and a device may never end.
+    The reason: opening a pipe may wait for ever, and reading a device may never end.
     """
     try:
         status = path.stat()
@@ -103,16 +105,17 @@ _SUBSTITUTES = {
 
 
 def refuse_substitute(path: Path) -> None:
-    """Raise DataError for a file without the data: empty, packed as a whole, a pointer to them, or a web page."""
+    """Raise DataError for a file that does not contain the data itself: it is empty, compressed as a whole, a pointer
+    to the data, or a web page."""
     with path.open("rb") as file:
         head = file.read(64).lower()
     why = "empty" if not head else next((why for begin, why in _SUBSTITUTES.items() if head.startswith(begin)), "")
-    if why and not path.name.lower().endswith(".nii.gz"):  # a volume, which is read as it is packed
+    if why and not path.name.lower().endswith(".nii.gz"):  # a volume, which can be read in its compressed form
         raise DataError(f"{path} is {why}. Nothing was read.")
 
 
 def kind_of_data(path: Path) -> str | None:
-    """The kind of data in a file, judged by its first bytes, for a sentence; None if unknown."""
+    """The kind of data in a file, judged by its first bytes, as part of a sentence; None if the kind is unknown."""
     try:
         with path.open("rb") as file:
             return _DATA.get(file.read(4))
@@ -130,10 +133,11 @@ def is_link(path: Path) -> bool:
 
 
 def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
-    """The path of a regular file at a relative path below a folder, for a library that opens it by its name.
+    """The path of a regular file at a relative path below a folder. It can be given to a library that opens the file by
+    its name.
 
-    Use it for files that other people wrote: the folder itself may be a link, but nothing below it. Raises OSError as
-    `require_regular` does, and if the file does not exist.
+    Use this function for files that other people wrote: the folder itself may be a link, but nothing below the folder.
+    Raises OSError as `require_regular` does, or if the file does not exist.
     """
     parts, place = PurePosixPath(name).parts, folder
     for part in parts:
@@ -146,7 +150,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
 
 
 def is_below(folder: Path, name: str) -> bool:
-    """True if `require_below` accepts the file: it is neither a link nor a pipe, and belongs to no other user."""
+    """True if `require_below` accepts the file: the file is not a link, is not a pipe, and belongs to this user."""
     try:
         return require_below(folder, name).is_file()
     except OSError:
@@ -154,20 +158,20 @@ def is_below(folder: Path, name: str) -> bool:
 
 
 def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
-    """Open for reading the file that `require_below` finds. A caller reads at most `largest` bytes, as the file may
-    grow."""
+    """Open the file that `require_below` finds for reading. A caller must read at most `largest` bytes, because the
+    file may grow."""
     return require_below(folder, name, largest).open("rb")
 
 
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
-    """The content of the file that `open_below` opens, at most `largest` bytes."""
+    """The content of the file that `open_below` opens, but at most `largest` bytes."""
     with open_below(folder, name, largest) as file:
         return file.read(min(largest, os.fstat(file.fileno()).st_size))
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:
-    """The content of a text file of at most `largest` bytes. Raises OSError as `require_regular`, and for text that is
-    not UTF-8.
+    """The content of a text file of at most `largest` bytes. Raises OSError as `require_regular` does, or if the text
+    is not UTF-8.
 
     A byte-order mark, which some editors write, identifies UTF-16 and is not part of the text.
     """
@@ -191,7 +195,7 @@ def decoded(content: bytes, errors: str = "strict") -> str:
 
 
 def broken_link(path: Path) -> str:
-    """A sentence if `path`, or a folder on the way to it, is a link whose target does not exist; "" if not."""
+    """A sentence if `path`, or a folder that leads to it, is a link whose target does not exist; "" otherwise."""
     for place in (path, *path.parents):
         if place.is_symlink() and not place.exists():
             return f"{place} is a link to {place.readlink()}, which does not exist: is its disk mounted?"
@@ -199,18 +203,20 @@ def broken_link(path: Path) -> str:
 
 
 def no_file(path: Path) -> str:
-    """A sentence on a path that names no regular file."""
+    """A sentence on a path that does not name a regular file."""
     kind = f"is {'a folder' if path.is_dir() else 'a device or a pipe'}, and a file is expected"
     return broken_link(path) or f"{path} {kind if path.exists() else 'does not exist'}."
 
 
-_BESIDE = 44  # bytes that names of temporary files, and of what is written beside an output, add to its name
+# number of bytes by which names of temporary files, and of files next to an output, are longer than the name of the
+# output
+_BESIDE = 44
 
 
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
-    Results never replace anything, not even a broken link, and their folder must exist.
+    A result never replaces anything, not even a broken link, and the folder must exist.
     """
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
     if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
@@ -225,7 +231,7 @@ def refuse_existing(path: Path) -> None:
         )
     if path.exists():
         raise DataError(
-            f"{path} exists, and results are never overwritten. Name another output, or move this one away."
+            f"{path} exists, and results are never overwritten. Name another output, or move the existing file away."
         )
     if not path.parent.is_dir():
         raise DataError(
@@ -234,7 +240,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def refuse_not_utf8(path: Path | str) -> None:
-    """Raise DataError for a path that is not UTF-8, since results must be able to name it."""
+    """Raise DataError for a path that is not UTF-8, because results could not state it."""
     try:
         str(Path(path).absolute()).encode()
     except UnicodeEncodeError as error:
@@ -245,7 +251,7 @@ def refuse_not_utf8(path: Path | str) -> None:
 
 
 def replaceable(path: Path) -> Path:
-    """The file to replace or create for `path`: the target, if that is a link.
+    """The file to replace or create for `path`. If `path` is a link, this is the target of the link.
 
     DataError if the target does not exist.
     """
@@ -275,14 +281,14 @@ def bring_to_disk(path: Path) -> None:
 
 @contextmanager
 def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A context with a temporary name beside `path`, for a file or a folder. At the end of the context the file is
-    flushed to the disk and renamed to `path`; after an error it is removed. Leftovers of a killed program for the same
-    `path` are removed first.
+    """A context that gives a temporary name next to `path`, for a file or a folder. At the end of the context the file
+    is flushed to the disk and renamed to `path`. After an error the file is removed. Files that a killed program left
+    for the same `path` are removed first.
 
     Args:
-        path: the file to write. Without `replace` it must not exist.
-        replace: an existing file is replaced in one step; a reader sees either the old or the new file. A link stays,
-            and its target is replaced.
+        path: the file to write. Without `replace` it must not exist. replace: True: an existing file is replaced in one
+            step, so that a reader sees either the old or the new file. If `path` is a link, its target is replaced and
+            the link stays.
 
     Raises:
         DataError: `path` exists, the disk fails, or the system does not allow replacing the file.
@@ -300,36 +306,37 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             refuse_existing(path)
         try:
             partial.replace(path)
-        except OSError as error:  # Windows replaces no file that another program holds open
+        except OSError as error:  # Windows does not replace a file that another program holds open
             raise DataError(f"{path} could not be replaced ({error}); the existing file was not changed.") from error
     except OSError as error:
         left = "the existing file was not changed" if replace else "no incomplete file was left behind"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:
-        with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
+        # Windows does not remove an open file, and after an error such as a full disk the file is still open
+        with suppress(PermissionError):
             remove(partial)
 
 
 def _here() -> str:
-    """The scope of process numbers: this machine."""
+    """An identifier of this machine, on which process numbers are unique."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def _remove_remaining(path: Path) -> None:
-    """Remove the hidden files that killed programs left beside `path`."""
+    """Remove the hidden files that killed programs left next to `path`."""
     with suppress(OSError):
         for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
             place, _, process = left.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")
             if left.suffix == ".partial" and place == _here() and process.isdecimal():
-                import psutil  # here, because most commands find nothing
+                import psutil  # imported here, because most commands find no such files
 
                 if not psutil.pid_exists(int(process)):
                     remove(left)
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file from memory as `atomic_file` does, and verify it by reading it back. Raises DataError if it
-    differs."""
+    """Write a file from memory as `atomic_file` does, and read the file back to verify it. Raises DataError if its
+    content differs."""
     data = content.encode() if isinstance(content, str) else content
     with atomic_file(path, replace=replace) as partial:
         partial.write_bytes(data)
@@ -339,10 +346,10 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequence[str] = ()) -> None:
-    """Write rows of values by name as a CSV file in place of an earlier one, see `text.csv_text`.
+    """Write rows of values by name as a CSV file, which replaces an earlier one; see `text.csv_text`.
 
     Args:
-        names: of the columns; empty: those of the first row.
+        names: names of the columns; empty: the names in the first row.
     """
     columns = names or list(rows[0])
     text = csv_text([columns, *([row[name] for name in columns] for row in rows)])
@@ -350,7 +357,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequenc
 
 
 def write_together(writes: Iterable[tuple[Path, Callable[[Path], object]]]) -> None:
-    """Write each of these files by its function, in order; all of them, or none."""
+    """Write several files, in order, each with its function. Either all files are written, or none."""
     with ExitStack() as undo:
         for path, write in writes:
             write(path)
@@ -368,7 +375,8 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def new_log(path: Path) -> Iterator[TextIO]:
-    """A new text file. An error when it is closed (full disk) is ignored: it must not replace the run's own error."""
+    """A new text file. An error when the file is closed (full disk) is ignored, because it must not hide the error of
+    the run itself."""
     file = path.open("x", encoding="utf-8")
     try:
         yield file

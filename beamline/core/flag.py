@@ -1,5 +1,5 @@
-"""`Flag`: what a check of the monitor reports about a frame (in the event `flag`). `Finding`: what a rule reports about
-a scan or a file."""
+"""`Flag`: the finding of a check of the monitor about a frame (in the event `flag`). `Finding`: the finding of a rule
+about a scan or a file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Flag:
-    """What a check of the monitor reports about one frame, or about several.
+    """The finding of a check of the monitor about one frame, or about several frames.
 
     Attributes:
         check: name of the check.
@@ -31,12 +31,12 @@ class Flag:
         score: the measured value, in the check's unit.
         limit: the limit that the value exceeds.
         advice: what the finding means and what to do.
-        region: part of the frame that shows it; None: the whole frame, or no particular part.
+        region: part of the frame that shows the fault; None: the whole frame, or no particular part.
         first: first frame that the finding applies to, if it applies to several frames; `frame` is the last one. All
             frames between them are of the same kind. `frame` may be earlier than the frame at which the check noticed
-            the fault, because some checks need later projections, too.
-        from_region: part of the frame `first` that shows the object, which moved in a straight line from there to
-            `region`. None: only `region` in `frame` is known.
+            the fault, because some checks also need later projections.
+        from_region: part of the frame `first` that shows a moving object. From there the object moved in a straight
+            line to `region`. None: only its position `region` in `frame` is known.
     """
 
     check: str
@@ -73,14 +73,14 @@ Severity = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What a rule reports about a scan or a file.
+    """The finding of a rule about a scan or a file.
 
     Attributes:
         severity: "error": the scan cannot be reconstructed, or the file is not valid.
         rule: name of the rule.
         message: what was found and what to do.
         frames: rows of the frames in the file; empty: all frames, or no particular frame.
-        score, limit: the measured value, and the limit that it violates; NaN if nothing was measured.
+        score, limit: the measured value, and the limit that the value violates. NaN: nothing was measured.
     """
 
     severity: Severity

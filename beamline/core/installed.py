@@ -1,4 +1,5 @@
-"""What is installed: the version, the configurations and scenes of the package, and advice for broken installations."""
+"""Facts about the installation: the version, the configurations and scenes of the package, and advice if the
+installation is broken."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from types import FrameType, ModuleType, TracebackType
 
 
 def config_folder() -> Path:
-    """The folder of the configurations that come with the package: installed, or next to the packages of a checkout."""
+    """The folder with the configurations that come with the package. In a checkout it is next to the packages."""
     installed = Path(__file__).parents[1] / "configs"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
 
@@ -22,8 +23,9 @@ def shipped_scenes() -> dict[str, Path]:
 
 
 def version() -> str:
-    """The installed distribution's version; "uninstalled" when run from a bare checkout."""
-    from importlib import metadata  # here: it imports much that a file of the user may hide
+    """The version of the installed distribution; "uninstalled" if the program runs from a checkout that is not
+    installed."""
+    from importlib import metadata  # imported here, because it imports many modules, which a file of the user may hide
 
     try:
         return metadata.version("splatline")
@@ -32,8 +34,9 @@ def version() -> str:
 
 
 OWN_PACKAGES = ("drivers", "recon", "simulators")
-_MARK = b"splatline"  # in the first line of each one's __init__.py
-_LIBRARIES = (  # that ours import; each is a folder, so that a file of that name is another module
+_MARK = b"splatline"  # a word in the first line of the __init__.py of each package
+# libraries that our packages import; each is a folder, so that a file of the same name is another module
+_LIBRARIES = (
     *("PIL", "click", "h5py", "hdf5plugin", "jinja2", "matplotlib", "numba", "numpy", "psutil", "pydantic", "rich"),
     *("scipy", "serial", "skimage", "starlette", "tifffile", "torch", "usb", "uvicorn", "yaml", "zlib_ng"),
 )
@@ -46,7 +49,8 @@ _WITHOUT = {"torch": " Without it, use -m fbp, -m fista-tv or -m auto."}
 
 
 def package_problem(home: str) -> str:
-    """A sentence with advice if Python imports another module by the name of one of this project's packages; "" if not.
+    """A sentence with advice if Python imports another module under the name of one of this project's packages; ""
+    otherwise.
 
     Args:
         home: the folder that holds our packages.
@@ -68,7 +72,7 @@ def package_problem(home: str) -> str:
 
 
 def installation_problem(error: BaseException) -> str:
-    """A sentence with advice on the library whose loading raised `error`; "" if no loading did."""
+    """A sentence with advice if `error` was raised while a library was loaded; "" for other errors."""
     if _ours(name := _library(error)):
         return str(error) if name == "splatline" else ""  # which says all
     cause, origin, package = error.__cause__ or error, _origin(name), _DISTRIBUTIONS.get(name, name)
@@ -86,7 +90,7 @@ def installation_problem(error: BaseException) -> str:
 
 
 def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """`sys.excepthook` that says in one line which library cannot be loaded."""
+    """A `sys.excepthook` that prints in one line which library cannot be loaded."""
     if problem := installation_problem(error):
         sys.stderr.write(f"beamline: {problem}\n")
         sys.exit(2)
@@ -94,7 +98,7 @@ def as_one_line(kind: type[BaseException], error: BaseException, trace: Tracebac
 
 
 def _library(error: BaseException) -> str:
-    """The top-level name of the module whose import raised the error; "" if none did."""
+    """The top-level name of the module whose import raised the error; "" if no import raised it."""
     failed = isinstance(error, ImportError)
     if isinstance(error, ImportError) and error.name:
         return error.name.partition(".")[0]
@@ -115,7 +119,7 @@ def _ours(root: str) -> bool:
 
 
 def of_library(frame: FrameType) -> bool:
-    """Whether code of Python or of an installed package of others runs in a frame."""
+    """Whether the code in a stack frame belongs to Python or to an installed package of others."""
     root = str(frame.f_globals.get("__name__")).partition(".")[0]
     return not _ours(root) and _installed(_origin(root) or frame.f_code.co_filename)
 
@@ -128,7 +132,7 @@ def _installed(file: str) -> bool:
 
 
 def _origin(name: str) -> str | None:
-    """The file that Python loads for a module, or has loaded; None if it has none."""
+    """The file that Python loads for a module, or has loaded; None if the module has no file."""
     if name in sys.modules:
         return getattr(sys.modules[name], "__file__", None)
     with suppress(ImportError):  # of a finder that forbids the library
@@ -141,7 +145,7 @@ _AGAIN = "Install it again: `pip install --force-reinstall --no-deps splatline`"
 
 
 def _way_out(origin: str) -> str:
-    """What to do about a module that is not ours."""
+    """What the user can do about a module that is not ours."""
     if not _installed(origin):
         return "rename that one, or work in another folder"
     return "it belongs to another distribution. Install splatline in a separate environment (python -m venv)"

@@ -1,4 +1,4 @@
-"""This computer: its description, its memory, and the time, memory and disk space that a task needs."""
+"""Facts about this computer: its description and its memory. Also the time, memory and disk space that a task needs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from recon.base.registry import loaded
 
 @dataclass(frozen=True, kw_only=True)
 class Need:
-    """Upper bounds of what a piece of work takes.
+    """Upper bounds for the memory, time and disk space of a piece of work.
 
     Attributes:
-        memory: bytes; None: not known.
-        seconds: None: not known before it is tried.
-        least_seconds: where the data choose what takes least; otherwise `seconds`.
-        output: bytes of the result.
-        scratch: bytes on its disk while it works, next to the result.
+        memory: bytes; None: not known. seconds: duration in s; None: not known before the work is tried. least_seconds:
+            shortest duration, if the data decide how much work is done; otherwise the same as `seconds`. output: bytes
+            of the result. scratch: bytes of temporary files on the disk of the result.
     """
 
     memory: int | None = None
@@ -42,8 +40,8 @@ class Need:
 
     @staticmethod
     def in_turn(needs: Iterable[Need]) -> Need:
-        """The need of pieces of work done one after the other: the largest memory and scratch space, and the sum of
-        known seconds.
+        """The need of several pieces of work that are done one after the other: the largest memory and scratch space,
+        and the sum of the known seconds.
         """
         each = list(needs)
         return Need(
@@ -60,15 +58,17 @@ if sys.platform != "win32":
 
 _CPUINFO, STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
 CGROUPS, OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-# Of a control group: its line in OWN_CGROUP, its tree, the files of its limit and of its use. In memory.stat: the file
-# cache that counts as used and is given up first.
+# Facts about control groups: the line of a group in OWN_CGROUP, its tree, and the files with its limit and its use. The
+# last value is the entry of memory.stat for the file cache, which counts as used but is freed first.
 _CGROUP_2 = (r"0::/(.*)", "", "memory.max", "memory.current", "inactive_file")
 _CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 
 
 def machine() -> dict[str, str | int]:
-    """Processor, cores this process may use, numba's threads, and the versions of computing libraries."""
-    numba, torch = loaded("numba"), loaded("torch")  # not for callers that only ask for memory
+    """Processor, number of cores that this process may use, number of threads of numba, and versions of numerical
+    libraries."""
+    # imported here, because callers that only ask for memory do not need it
+    numba, torch = loaded("numba"), loaded("torch")
     return {
         "processor": processor(),
         "cores": usable_cores(),
@@ -81,7 +81,7 @@ def machine() -> dict[str, str | int]:
 
 
 def machine_line(found: dict[str, str | int] | None = None) -> str:
-    """`machine()` as one line of text, to stand beside measured times."""
+    """`machine()` as one line of text, which can be printed next to measured times."""
     m = found or machine()
     return (
         f"{m['processor']}, {count(int(m['cores']), 'core')}, {count(int(m['threads']), 'thread')}, {m['system']}, "
@@ -90,14 +90,14 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     if sys.platform == "darwin":
-        return psutil.cpu_count() or 1  # macOS binds no process to cores
+        return psutil.cpu_count() or 1  # macOS does not bind processes to cores
     return len(psutil.Process().cpu_affinity())
 
 
 def free_memory() -> int:
-    """Free memory in bytes, without swapping, within the limits of the container and of `memory_limit`."""
+    """Free memory in bytes without swapping. It respects the limits of the container and of `memory_limit`."""
     free = [int(psutil.virtual_memory().available), *_free_in_cgroups(CGROUPS, OWN_CGROUP)]
     if (limit := memory_limit()) is not None:
         free.append(max(limit - int(psutil.Process().memory_info().vms), 0))
@@ -105,7 +105,7 @@ def free_memory() -> int:
 
 
 def memory_limit() -> int | None:
-    """Limit of this process's address space in bytes (ulimit -v); None without a limit, and on Windows."""
+    """Limit of this process's address space in bytes (ulimit -v). None if there is no limit, and on Windows."""
     if sys.platform != "win32":
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         return None if limit == resource.RLIM_INFINITY else limit
@@ -117,7 +117,7 @@ def peak_memory() -> int | None:
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     if STATUS.is_file():
-        # Linux lets a new process inherit ru_maxrss of the one that started it; VmHWM is its own.
+        # on Linux, a new process inherits ru_maxrss of the process that started it; VmHWM is not inherited
         return _entry(STATUS, "VmHWM:") * 1024 or None
     return None
 
@@ -148,9 +148,9 @@ def processor() -> str:
 
 
 def _free_in_cgroups(root: Path, own: Path) -> Iterator[int]:
-    """Memory that each limit above this process leaves (cgroup v1 and v2), which psutil does not know.
+    """Free memory under each limit that applies to this process (cgroup v1 and v2). psutil does not know these limits.
 
-    A container may see its own limit at the root.
+    In a container, its own limit may be at the root.
     """
     lines: list[str] = []
     with suppress(OSError):
@@ -161,13 +161,14 @@ def _free_in_cgroups(root: Path, own: Path) -> Iterator[int]:
         for place in (folder, *folder.parents):
             if not place.is_relative_to(top):
                 break
-            with suppress(OSError, ValueError):  # without a limit it is the word "max", or more than the machine has
+            # without a limit, the value is the word "max", or more than the memory of the machine
+            with suppress(OSError, ValueError):
                 limit, used = (int((place / name).read_text("ascii")) for name in (most, now))
                 yield max(limit - used + _entry(place / "memory.stat", cache), 0)
 
 
 def _entry(stat: Path, wanted: str) -> int:
-    """The number after this name in a file; 0 without such a line."""
+    """The number after this name in a file; 0 if there is no such line."""
     for line in stat.read_text("ascii", "replace").splitlines():
         words = line.split()
         if words[:1] == [wanted]:

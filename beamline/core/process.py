@@ -21,28 +21,30 @@ import psutil
 from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.stop import StopScope
 
-_POLL = 0.2  # real s between two questions whether the process should stop
+_POLL = 0.2  # real time in s between two checks whether the process should stop
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
-"""With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
+"""With this environment, a Python process, and Python processes that it starts, import nothing from the working
+folder."""
 ORPHANED = "this process ends, because the process that had started this one has died; no result was written"
 _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
 
-PYTHON = "BEAMLINE_PYTHON"  # in the environment: the program that runs parts of a scan, where a host runs Python
+# environment variable: the Python program that runs parts of a scan, if another program (a host) embeds Python
+PYTHON = "BEAMLINE_PYTHON"
 
 
 class NoPythonError(ConfigError, OSError):
-    """No program is known that runs Python as this process does."""
+    """No program was found that runs Python with the same packages as this process."""
 
 
 def python() -> str:
-    """The program that runs Python as this process does.
+    """The program that runs Python with the same packages as this process.
 
-    `sys.executable` is the host where Python is embedded in one, or empty. The host would start itself once more.
+    If Python is embedded in a host, `sys.executable` is the host, or is empty. Starting the host would start all of it
+    once more.
 
-    Raises:
-        NoPythonError: none was found.
+    Raises: NoPythonError: no such program was found.
     """
     inside = ("bin/python{}.{}".format(*sys.version_info), "python.exe", "Scripts/python.exe")
     beside = [str(Path(prefix, name)) for prefix in (sys.prefix, sys.base_prefix) for name in inside]
@@ -57,7 +59,7 @@ def python() -> str:
 
 
 class ProcessEnd(Enum):
-    """Why a process ended."""
+    """The reason why a process ended."""
 
     EXITED = auto()
     STOPPED = auto()
@@ -68,17 +70,17 @@ class ProcessEnd(Enum):
 class ChildProcess:
     """A running command. A separate thread passes each line of its stdout to `on_line`.
 
-    Ctrl-C at the terminal does not reach it: the caller decides when it ends. Use it as a context manager, which kills
-    a process that still runs. A Python imports nothing from the working folder, whose recon.py is the user's.
+    Ctrl-C at the terminal does not reach the process: the caller decides when it ends. Use the object as a context
+    manager; its end kills a process that is still running. A Python process imports nothing from the working folder,
+    because a file such as recon.py there may be the user's.
 
     Args:
         command: program and arguments.
-        stderr: an open file for what it writes to stderr.
-        on_line: receives each line.
-        environment: of the process; None: as ours.
-        tether: give it a stdin that stays open while this process lives, so that it notices our end.
-        on_end: is called after its last line, in the same thread.
-        behind: it gets less processor time than others (nice 10; Windows: the class below normal).
+        stderr: open file for the stderr of the process. on_line: function that receives each line. environment:
+            environment of the process; None: that of this process. tether: True: the process gets a stdin that stays
+            open as long as this process lives, so that it notices when this process ends. on_end: function that is
+            called after the last line, in the same thread. behind: True: the process gets less processor time than
+            others (nice 10; Windows: the class below normal).
 
     Raises:
         OSError: the command cannot be started.
@@ -109,12 +111,12 @@ class ChildProcess:
             errors="replace",
             env={**(os.environ if environment is None else environment), **SAFE_PATH},
             start_new_session=True,  # POSIX
-            # Windows; without a window of its own a child ends with the console that is closed.
+            # Windows: a child without its own window would end when the console is closed.
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
             | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
         )
         if behind:
-            with suppress(psutil.Error):  # it has ended, or the system does not allow it
+            with suppress(psutil.Error):  # the process has ended, or the system does not allow it
                 child = psutil.Process(self._process.pid)
                 child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
         name = f"output of process {self._process.pid}"
@@ -145,14 +147,14 @@ class ChildProcess:
         silence: float = math.inf,
         grace: float = 0.0,
     ) -> ProcessEnd:
-        """Wait until the process has ended and all its lines have been passed on.
+        """Wait until the process has ended and all of its lines have been passed on.
 
         Args:
-            stop: polled a few times a second; True ends the process.
-            hurry: polled in the same way while the process ends; True kills it at once.
-            seconds: real s after which it is killed.
-            silence: real s without a line, from now on, after which it is ended.
-            grace: real s between the request to end and the kill; 0 kills at once.
+            stop: function that is called a few times a second; if it returns True, the process is ended. hurry:
+                function that is called in the same way while the process is ending; if it returns True, the process is
+                killed at once. seconds: real time in s after which the process is killed. silence: real time in s
+                without a line, from now on, after which the process is ended. grace: real time in s between the request
+                to end and the kill; 0 kills at once.
         """
         self._silent_since = time.monotonic()
         ending, deadline = ProcessEnd.EXITED, self._silent_since + seconds
@@ -175,18 +177,18 @@ class ChildProcess:
         return ending
 
     def tell(self, text: bytes = b".") -> None:
-        """Write to the stdin of a tethered process; a byte is a sign of life."""
+        """Write to the stdin of a tethered process. Any byte shows the process that this one is alive."""
         assert self._process.stdin is not None
-        with suppress(OSError, ValueError):  # it has ended
+        with suppress(OSError, ValueError):  # the process has ended
             os.write(self._process.stdin.fileno(), text)
 
     def become(self, line: str, on_line: Callable[[str], None], on_end: Callable[[], None]) -> None:
-        """Tell a tethered process a line, and pass its lines and its end to others from now on."""
+        """Send a line to a tethered process. From now on, pass its lines and its end to these functions."""
         self._on_line, self._on_end = on_line, on_end
         self.tell(f"{line}\n".encode())
 
     def end(self, grace: float = 0.0) -> None:
-        """Ask the process to end; kill it if it is still running after `grace` s of real time."""
+        """Ask the process to end. If it is still running after `grace` s of real time, kill it."""
         if self.running:
             self._end(grace, lambda: False)
             self._reader.join(_LAST_LINES)
@@ -206,7 +208,7 @@ class ChildProcess:
     def let_go(self) -> None:
         """Close the stdin of a tethered process, as happens when this process ends."""
         if self._process.stdin is not None:
-            with suppress(OSError):  # a line that the process did not take
+            with suppress(OSError):  # a line that the process has not read
                 self._process.stdin.close()
 
     def _read(self) -> None:
@@ -224,12 +226,11 @@ def run_to_end(
     on_line: Callable[[str], None],
     silence: float = math.inf,
 ) -> tuple[ProcessEnd, int | None, str]:
-    """Run a command with the same imports; an exception kills it.
+    """Run a command with the same imports as this process. If an exception is raised here, the command is killed.
 
     Args:
-        log: file for its stderr.
-        on_line: receives each line of its stdout.
-        silence: real s without a line, after which it is killed.
+        log: file for the stderr of the command. on_line: function that receives each line of its stdout. silence: real
+            time in s without a line, after which the command is killed.
 
     Returns:
         Why it ended, its exit code, and the last line of its stderr.
@@ -246,10 +247,11 @@ def run_to_end(
 
 
 def at_end_of(pipe: int, act: Callable[[], object], on_text: Callable[[bytes], object] = lambda text: None) -> None:
-    """Call `act` in a separate thread when the file descriptor `pipe` reaches its end: the process at its other end is
-    dead. Until then `told` gets what that one writes.
+    """Call `act` in a separate thread when the file descriptor `pipe` reaches its end, because the process at the other
+    end is dead. Until then, `told` gets the text that the other process writes.
 
-    Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
+    The thread uses raw reads. If it waited in a buffered read, it would hold a lock that the interpreter needs when it
+    ends.
     """
 
     def wait() -> None:
@@ -262,13 +264,14 @@ def at_end_of(pipe: int, act: Callable[[], object], on_text: Callable[[bytes], o
 
 
 class EndsWithParent:
-    """A stop scope of a child process with a tether: it interrupts the work when the parent process has died.
+    """A stop scope of a tethered child process. It interrupts the work when the parent process has died.
 
-    Work that does not ask in time is ended where it is, after _LAST_WORK real s.
+    If the work does not ask in time whether to stop, the process ends after _LAST_WORK s of real time, wherever the
+    work is.
 
     Args:
-        scope: asks for an early end otherwise.
-        pipe: the file descriptor that ends with the parent.
+        scope: stop scope for all other reasons to end early. pipe: file descriptor that reaches its end when the parent
+            ends.
     """
 
     def __init__(self, scope: StopScope, pipe: int) -> None:
@@ -293,15 +296,15 @@ class EndsWithParent:
 
 
 def with_our_path() -> dict[str, str]:
-    """The environment for a child process with the same imports."""
+    """The environment for a child process that imports the same modules as this process."""
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    # The path contains the working folder if we were started by `python -m`.
+    # The path contains the working folder if this process was started with `python -m`.
     path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in given)]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
 def last_line(log: Path) -> str:
-    """The last line that a process wrote to a file; "" without one."""
+    """The last line that a process wrote to a file; "" if there is no line."""
     lines = log.read_bytes().decode("utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else ""
 
@@ -310,6 +313,6 @@ def json_object(line: str) -> dict[str, Any] | None:
     """The JSON object in a line of output; None for any other line, such as the output of a library."""
     try:
         value = json.loads(line)
-    except (ValueError, RecursionError):  # RecursionError: nested deeper than Python's stack
+    except (ValueError, RecursionError):  # RecursionError: the JSON is nested deeper than Python's stack
         return None
     return value if isinstance(value, dict) else None

@@ -1,6 +1,7 @@
-"""Quantities: what the voxels of a volume are, with units; and the plausible ranges of values of an instrument.
+"""Quantities: the physical quantity and unit of the voxels of a volume, and the plausible ranges of the settings of an
+instrument.
 
-Every type accepts a value in a mistaken unit, such as eV for keV.
+A check of types cannot notice a value in a wrong unit, such as eV instead of keV.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ class VoxelKind(Enum):
     """The physical quantity of the voxels."""
 
     ATTENUATION = "attenuation"
-    """Linear attenuation coefficient, of views in transmission."""
+    """Linear attenuation coefficient, from projections in transmission."""
     ACTIVITY = "activity"
-    """Counts per length of a line of response, of a sample that emits."""
+    """Counts per length of a line of response, from a sample that emits."""
     SHARE = "volume fraction"
-    """Share of the voxel that a material fills, without a unit."""
+    """Fraction of a voxel that a material fills; it has no unit."""
 
     def unit(self, length: str) -> str:
-        """Unit of a voxel, with lengths in `length`, "mm" or "px"; empty for shares."""
+        """Unit of a voxel, if lengths are in `length`, "mm" or "px"; empty for fractions."""
         return {self.ATTENUATION: f"1/{length}", self.ACTIVITY: f"counts/{length}", self.SHARE: ""}[self]
 
     def label(self, length: str) -> str:
@@ -34,20 +35,22 @@ class VoxelKind(Enum):
 
     @classmethod
     def of_unit(cls, unit: str) -> VoxelKind:
-        """The kind of voxels with this unit; attenuation if no kind has the unit that a file states."""
+        """The kind of voxels with this unit. If no kind has the unit that a file states: attenuation."""
         return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
 
 
-_SAME = 5e-3  # relative difference from pi/2, pi, 2 pi or 4 pi that is rounding: 3.15 and 6.3 are 0.3 % off
-_IMPOSSIBLE = 10.0  # times beyond its range a value that another unit makes plausible is refused; nearer, doubted
+_SAME = 5e-3  # relative difference from pi/2, pi, 2 pi or 4 pi that counts as rounding: 3.15 and 6.3 are off by 0.3 %
+# if a value is outside its range by more than this factor, and plausible in another unit, it is an error; if it is
+# nearer, it is only a warning
+_IMPOSSIBLE = 10.0
 
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """The plausible range of a quantity of an instrument, whatever its sign; 0 is always plausible.
+    """The plausible range of a setting of an instrument. The sign is ignored, and 0 is always plausible.
 
     Attributes:
-        others: units that are mistaken for this one, each with its factor to this one.
+        others: units with which this unit is often confused, each with the factor that converts it to this unit.
     """
 
     low: float
@@ -56,11 +59,11 @@ class PlausibleRange:
     others: Mapping[str, float]
 
     def holds(self, value: float, wider: float = 1.0) -> bool:
-        """Whether the value lies in the range, extended by the factor `wider` at both ends."""
+        """Whether the value is in the range, extended by the factor `wider` at both ends."""
         return value == 0 or self.low / wider <= abs(value) <= self.high * wider
 
     def plausible_as(self, value: float) -> dict[str, float]:
-        """Plausible readings of the value: by each other unit that it may be in, its value in this unit."""
+        """Plausible meanings of the value: for each other unit that it may have, the value converted to this unit."""
         return {other: value * factor for other, factor in self.others.items() if self.holds(value * factor)}
 
 
@@ -78,7 +81,8 @@ RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
         **dict.fromkeys(("exposure_s", "period_s", "settle_s", "timeout_s"), PlausibleRange(1e-6, 600.0, "s", _MS)),
         "warm_up_s": PlausibleRange(0.0, 7200.0, "s", _MS), "cool_s": PlausibleRange(0.0, 7200.0, "s", _MS),
         "trigger_delay_s": PlausibleRange(0.0, 0.5, "s", _MS),
-        "pulse_width_s": PlausibleRange(1e-8, 10.0, "s", _MS),  # as long as an exposure, of a level that exposes
+        # the same range as for exposures, if the level of a trigger sets the exposure
+        "pulse_width_s": PlausibleRange(1e-8, 10.0, "s", _MS),
         "firmware_pulse_s": PlausibleRange(1e-8, 0.02, "s", _MS), "shortest_s": PlausibleRange(1e-8, 0.1, "s", _MS),
         "s": PlausibleRange(0.0, 3600.0, "s", _MS),
         "seconds": PlausibleRange(0.0, 2e5, "s", _MS),
@@ -92,22 +96,23 @@ RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
         "baudrate": PlausibleRange(110, 4e6, "baud", {}),
     }
 )  # fmt: skip
-"""By the name of a setting or its last words, as its unit: from pixels of zone plates to those of scanners of patients,
-from carbon's edge to tubes of 600 kV, the longest hutches, the longest exposures that a ring lasts, stages of ten turns
-a second, hundreds of turns, and motors and encoders of up to 27 bits."""
+"""Ranges by the name of a setting, or by the last words of its name, such as its unit. They include pixels of zone
+plates and of medical scanners, energies from the carbon edge to tubes of 600 kV, the longest hutches, the longest
+exposures at a storage ring, stages of ten turns per second, hundreds of turns, and motors and encoders of up to 27
+bits."""
 
 
 @cache
 def range_of(name: str) -> PlausibleRange | None:
-    """The range of a setting by its name, such as `scan.exposure_s`; None if it has no unit that is known."""
+    """The range of a setting by its name, such as `scan.exposure_s`; None if its unit is not known."""
     words = name.rpartition(".")[2].split("_")
     ends = ("_".join(words[at:]) for at in range(1 if "per" in words else len(words)))
     return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
 def doubt(name: str, value: float | None) -> str:
-    """A sentence on an implausible value, with the unit that may be meant; empty for a plausible value, and without a
-    range."""
+    """A sentence on an implausible value, with the unit that may be meant. Empty if the value is plausible, or if the
+    setting has no range."""
     known = range_of(name)
     if value is None or known is None or known.holds(value):
         return ""
@@ -120,13 +125,14 @@ def doubt(name: str, value: float | None) -> str:
 
 
 def is_impossible(name: str, value: float) -> bool:
-    """Whether the value is far beyond its range, and plausible in a unit that is mistaken for its own."""
+    """Whether the value is far outside its range, and plausible in a unit that is often confused with its own."""
     known = range_of(name)
     return known is not None and not known.holds(value, _IMPOSSIBLE) and bool(known.plausible_as(value))
 
 
 def doubt_span(span_deg: float) -> str:
-    """A sentence on a span that looks like radians (of a quarter of a turn to two turns); empty for others."""
+    """A sentence on a range of angles that looks like radians (a quarter of a turn to two turns); empty for other
+    ranges."""
     for turn in (math.pi / 2, math.pi, 2 * math.pi, 4 * math.pi):
         if abs(abs(span_deg) / turn - 1) < _SAME:
             return (
@@ -138,7 +144,8 @@ def doubt_span(span_deg: float) -> str:
 
 
 def cone_facts(cone: tuple[float, float], pixel_mm: float, cols: int) -> dict[str, float]:
-    """What distances (mm, from the source to the axis and to the detector) of a cone beam come to."""
+    """The consequences of the distances (mm) of a cone beam, from the source to the axis and to the detector:
+    magnification, voxel size and fan angle."""
     return {
         "magnification": cone[1] / cone[0],
         "voxel_mm": pixel_mm * cone[0] / cone[1],

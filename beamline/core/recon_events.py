@@ -17,8 +17,8 @@ class SnapshotWritten(Event, event="snapshot"):
 
     Attributes:
         unlearnt: relative residual of new projections before the fit has used them.
-        method: the method of this volume, which predicts held-out projections better than the other one.
-        errors: error of each method in the held-out projections, on the scale of the volume.
+        method: the method of this volume. It predicts held-out projections better than the other method. errors: error
+            of each method in the held-out projections, relative to the volume.
     """
 
     path: Path
@@ -31,7 +31,7 @@ class SnapshotWritten(Event, event="snapshot"):
 
 
 class SlicesDrawn(Event, event="slices"):
-    """A picture with FBP slices of the projections so far. degrees: how much of the 180° the projections cover."""
+    """A picture with FBP slices of the projections so far. degrees: angle, of the 180°, that the projections cover."""
 
     picture: Path
     n_views: int
@@ -45,8 +45,8 @@ class LawMeasured(Event, event="error_law"):
         number: number of the pass, from 1.
         n_views: number of projections that the live reconstruction used.
         exponent, exponent_error, noise, offset: as in `ErrorLaw`.
-        gained: improvement of the volume by this pass in dB, measured with held-out projections; None: not known.
-        reason: why no error model could be measured; the numbers of the model are then NaN.
+        gained: improvement in dB of the volume by this pass, measured with held-out projections; None: not known.
+            reason: why no error model could be measured. The numbers of the model are then NaN.
     """
 
     number: int
@@ -62,7 +62,7 @@ class LawMeasured(Event, event="error_law"):
 class FitReached(Event, event="progress"):
     """Progress of a fit or of iterations: the fields of `recon.base.method.Progress`, a rate and the remaining time.
 
-    waiting: number of projections in the file of a growing scan that no step has used yet.
+    waiting: for a running scan, number of projections in its file that no step has used yet.
 
     Numbers from another process are None if they are not finite.
     """
@@ -83,7 +83,8 @@ class FitReached(Event, event="progress"):
 
 
 class ReconStarted(Event, event="recon_started"):
-    """Line integrals are ready, and the method starts. again: a live fit restarts because its axis has changed.
+    """The line integrals are ready, and the method starts. again: True if a live fit starts again because its axis has
+    changed.
 
     more: further values of a finished scan, by name; `axis_confident` is None if the user gave the axis.
     """
@@ -97,11 +98,12 @@ class ReconStarted(Event, event="recon_started"):
 
 
 class ReconDone(Listed, event="recon_done"):
-    """The live reconstruction has written its volume. The values are those of its event `done`, see `VolumeDone`."""
+    """The live reconstruction has written its volume. The values are those of the event `done` of the reconstruction,
+    see `VolumeDone`."""
 
 
 class VolumeDone(Event, event="done"):
-    """A reconstruction of this process has ended successfully; the event of another process is read as `Done`.
+    """A reconstruction of this process has ended successfully. (The event of another process is read as `Done`.)
 
     record: the record of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """

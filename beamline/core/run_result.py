@@ -13,20 +13,17 @@ class RunResult:
     """A scan that has ended; `beamline.api` calls it ScanResult.
 
     Attributes:
-        path: the scan file; for a resumed run, the file that joins its parts. Its folder contains everything else.
-        n_frames: rows of the file.
-        missing: planned rows without a frame. If there are any, the scan raises an error; the event `scan_done` lists
-            them.
-        flags: frames that the monitor flagged: their number by check, then by level.
-        alarmed_frames: frames with an alarm, without those that were taken again.
-        alarmed_views: projections among the frames with an alarm.
-        retaken: projections that were taken again, because they had an alarm or gave no frame.
-        reference_faults: faults of darks and flats, one or more sentences for each group.
+        path: the scan file. For a resumed run, the file with all parts. Its folder contains all other files of the run.
+        n_frames: number of frames in the file. missing: planned frames that are not in the file. If frames are missing,
+            the scan raises an error; the event `scan_done` lists the missing frames.
+        flags: number of frames that the monitor flagged, by check and level. alarmed_frames: number of frames with an
+            alarm, without those that were taken again. alarmed_views: number of projections among the frames with an
+            alarm. retaken: number of projections that were taken again, because they had an alarm or their frame was
+            missing. reference_faults: faults of darks and flats, one or more sentences for each group.
         seconds: real time of the whole run.
         bytes: size of the file that was written.
-        recon: data of the `done` event of the live reconstruction; None if there was none, or if it failed.
-        status: `complete`, `stopped` or `failed`.
-        sample: its name.
+        recon: data of the event `done` of the live reconstruction; None if there was no live reconstruction, or if it
+            failed. status: `complete`, `stopped` or `failed`. sample: name of the sample.
     """
 
     path: Path
@@ -50,17 +47,17 @@ class RunResult:
 
     @property
     def frames(self) -> int:
-        """Number of frames; the name of `n_frames` in scripts."""
+        """Number of frames. Scripts use this name instead of `n_frames`."""
         return self.n_frames
 
     @property
     def alarms(self) -> int:
-        """Frames with an alarm; the name of `alarmed_frames` in scripts."""
+        """Number of frames with an alarm. Scripts use this name instead of `alarmed_frames`."""
         return self.alarmed_frames
 
     @property
     def volume(self) -> Path | None:
-        """File of the reconstruction; None if there was none or it failed."""
+        """File of the reconstruction; None if there was no reconstruction, or if it failed."""
         return None if self.recon is None else Path(str(self.recon["output"]))
 
     @property
@@ -69,9 +66,9 @@ class RunResult:
         return self.status == "complete" and not (self.missing or self.alarmed_frames or self.reference_faults)
 
     def file_values(self) -> dict[str, Any]:
-        """Values of the event `scan_done`, by name, when the file is closed."""
+        """Values of the event `scan_done` by name. The event is sent when the file is closed."""
         return {name: value for name, value in vars(self).items() if name != "sample"}
 
     def run_values(self) -> dict[str, Any]:
-        """Values of the event `done`, by name, of a run that has ended successfully."""
+        """Values, by name, of the event `done` of a run that has ended successfully."""
         return {name: value for name, value in vars(self).items() if name not in ("sample", "status")}

@@ -1,4 +1,5 @@
-"""Sinks, which take events: JSON lines, sentences for people, several sinks as one, warnings, a thread of its own."""
+"""Sinks, which receive events: they write JSON lines or sentences for people, combine several sinks, collect warnings,
+or pass events on in a separate thread."""
 
 from __future__ import annotations
 
@@ -90,29 +91,33 @@ def _of_reconstruction(event: Event) -> str | None:
 
 
 def lines(event: Event) -> list[str]:
-    """The event as lines for people: a table if a pass has ended, otherwise its sentence; [] if it has none."""
+    """The event as lines for people: a table if a pass has ended, otherwise the sentence of the event; [] if it has no
+    sentence."""
     if isinstance(event, PassEnded):
         return [*_table_of_options(event)]
     text = sentence(event)
     return [] if text is None else [one_line(text, SENTENCE)]
 
 
-_OVER = 32  # frames after which a finding has ended; an ongoing one is reported at least every 8 projections
-_HELD = 60.0  # s after its first event, an ongoing finding is reported with its frames so far
+# a finding has ended if it is absent for this many frames; a finding that continues is reported at least every 8
+# projections
+_OVER = 32
+_HELD = 60.0  # a finding that continues is reported, with its frames so far, this many s after its first event
 
 
 class Narration:
-    """Events for people; repeated findings on further frames are joined into one.
+    """Passes on events for people, and joins repeated findings on further frames into one event.
 
-    The joined event comes when the finding has ended, `_HELD` s after its first event, or before a block or a command
-    ends.
+    The joined event is passed on when the finding has ended, `_HELD` s after its first event, or before a block or a
+    command ends.
     """
 
     def __init__(self) -> None:
-        self._open: dict[str, FrameFlagged] = {}  # by check: an ongoing finding with all its frames so far
+        # for each check: a finding that continues, with all of its frames so far
+        self._open: dict[str, FrameFlagged] = {}
 
     def __call__(self, event: Event) -> Iterator[Event]:
-        """The events to report now."""
+        """The events that must be passed on now."""
         if isinstance(event, FrameFlagged) and event.flag.first is not None and event.flag.level != Level.ALARM:
             flag, known = event.flag, self._open.get(event.flag.check, event)
             if flag.frames.start > known.flag.frame + 1 or event.time - known.time >= _HELD:
@@ -133,7 +138,7 @@ class Narration:
 
 
 class UserLog:
-    """A sink that writes each event's lines with its UTC time."""
+    """A sink that writes the lines of each event, with its UTC time."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._narrated = stream, Narration()
@@ -156,7 +161,7 @@ def _trial(trial: TrialDone) -> str:
 
 
 def _table_of_options(ended: PassEnded) -> Iterator[str]:
-    """Lines of at most 80 characters: a table of what can be measured next, and how the operator answers."""
+    """Lines of at most 80 characters: a table of the options for the next measurement, and how the operator answers."""
     number = ended.passes or ended.number  # `number` in files of earlier versions
     yield f"Pass {number} is done, {count(ended.n_views, 'projection')} so far. What can be measured next:"
     yield f"  {'choice':<7}{'gain, dB':<22}{'dB/min':>8}{'s':>9}{'dose':>9}{'data':>10}"
@@ -198,11 +203,13 @@ def _missing(block: BlockDone) -> str | None:
     return f"Of {block.n} {block.kind} frames: {', '.join(parts)}" if parts else None
 
 
-Warn = Callable[[str], None]  # Takes a sentence about something that is wrong, although the work continues
+# Function that takes a sentence about something that is wrong, although the work continues
+Warn = Callable[[str], None]
 
 
 class Note(str):
-    """A sentence about what was done, if nothing is wrong. It becomes an event `state`, not a warning."""
+    """A sentence that reports what was done although nothing is wrong. It becomes an event `state` and not a
+    warning."""
 
 
 def event_of_sentence(text: str, now: float) -> Event:
@@ -232,7 +239,8 @@ def fan_out(*sinks: Sink) -> Sink:
 
 
 def while_it_works(sink: Sink, others: Sink) -> Sink:
-    """Pass events to a sink until it raises (a full disk, a closed pipe); then warn `others` once."""
+    """Pass events to a sink until the sink raises an error (a full disk, a closed pipe). Then warn the sinks `others`
+    once."""
     works = True
 
     def send(event: Event) -> None:
@@ -241,7 +249,9 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
             return
         try:
             sink(event)
-        except BaseException as error:  # from any code; SystemExit would end the announcer without a message
+        except (
+            BaseException
+        ) as error:  # the sink may be any code; SystemExit from it would end the announcer without a message
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
             works = False
@@ -274,8 +284,8 @@ _PATIENCE = 10.0  # s
 class Announcer:
     """Passes events to sinks in a separate thread. Leaving the context waits until all events have been passed on.
 
-    It waits at most `_PATIENCE` s, so that the program can end even if nobody reads the terminal or pipe. A sink that
-    raises (closed pipe, full disk) gets no further events; the other sinks get a warning.
+    The context waits at most `_PATIENCE` s, so that the program can end even if nobody reads the terminal or pipe. A
+    sink that raises an error (closed pipe, full disk) gets no further events, and the other sinks get a warning.
     """
 
     def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:

@@ -1,7 +1,8 @@
-"""Requests to end work early: StopRequest of a scan, stop scope of a reconstruction, and the signals that ask for it.
+"""Requests to end work early: the StopRequest of a scan, the stop scope of a reconstruction, and the signals that make
+the requests.
 
-The first signal asks for a stop with the data so far, the second ends at once. In Python only the main thread can catch
-signals. In other threads, the owner of the request must request the stop.
+The first signal requests a stop that keeps the data so far; the second signal ends the work at once. In Python only the
+main thread can catch signals. If the work runs in another thread, the owner of the request must request the stop.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ _ENDING = [
     for name in ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
     if hasattr(signal, name)
 ]
-"""Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
+"""Signals that ask a process to end, as far as the system has them. They come from a person, a closed terminal, or a
+batch system."""
 
 
 def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
-    """A context in which the first Ctrl-C requests a stop, the second an abort.
+    """A context in which the first Ctrl-C requests a stop, and the second Ctrl-C an abort.
 
     SIGTERM, a closed terminal (SIGHUP), a closed console of Windows (SIGBREAK) and the signals of batch systems request
     a stop. Ctrl-Z does not suspend the process, because the shutter would stay open, and the watchdog would conclude
@@ -59,11 +61,13 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
 
 
 class StopOnSignal:
-    """A stop scope: the first Ctrl-C, SIGTERM or SIGHUP requests a stop with a partial result, the second interrupts.
+    """A stop scope: the first Ctrl-C, SIGTERM or SIGHUP requests a stop with a partial result; the second one
+    interrupts the work.
 
     Args:
         reply: sentence that is printed after the first signal.
-        ready: True if there is a partial result, or will be soon. Otherwise the first signal interrupts the work.
+        ready: function that returns True if there is a partial result, or will be soon. If it returns False, the first
+            signal interrupts the work.
     """
 
     def __init__(
@@ -86,17 +90,19 @@ class StopOnSignal:
 
 
 def terminated_like_interrupted() -> AbstractContextManager[None]:
-    """A context in which SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C, so that no partial file
-    remains.
+    """A context in which SIGTERM and SIGHUP (closed terminal) interrupt the work in the same way as Ctrl-C, so that no
+    partial file remains.
     """
     return _caught(dict.fromkeys(_ENDING, signal.default_int_handler))
 
 
 @contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
-    """A context in which signals have these handlers, if it runs in the main thread. Its end restores the old handlers.
+    """A context in which signals have these handlers, if it runs in the main thread. The end of the context restores
+    the old handlers.
 
-    Signals that are ignored stay ignored: SIGHUP under `nohup`, SIGINT if a script started this in the background.
+    Signals that are ignored stay ignored: SIGHUP under `nohup`, and SIGINT if a script started this process in the
+    background.
     """
     with ExitStack() as restore:
         if threading.current_thread() is threading.main_thread():
@@ -118,7 +124,7 @@ def to_stderr(text: str) -> None:
 
 StopScope = Callable[[], AbstractContextManager[Callable[[], bool]]]
 """Opens a context for work that can end early with a partial result. The context gives a function that returns True
-once a stop was requested."""
+after a stop was requested."""
 
 
 @contextmanager
@@ -134,7 +140,7 @@ class ScanAborted(ScanStopped):
 
 
 class Cause(Enum):
-    """Cause of a pause, which lasts as long as the cause."""
+    """Cause of a pause. The pause lasts as long as its cause."""
 
     BEAM = "beam"
     SPACE = "space on the disk"
@@ -151,7 +157,7 @@ class PauseRequest:
 
     @property
     def reason(self) -> str:
-        """Why the scan should wait, and how the wait ends; "" if it should not wait."""
+        """The reason why the scan should wait, and how the wait ends; "" if the scan should not wait."""
         return self._by_operator or next(iter([*self._held_by.values()]), "")
 
     @property
@@ -166,34 +172,35 @@ class PauseRequest:
         )
 
     def resume(self) -> None:
-        """End the pause by the operator. A pause because of missing beam or a slow disk continues."""
+        """End a pause that the operator requested. A pause because of missing beam or a slow disk continues."""
         self._by_operator = ""
 
     def no_beam(self, reason: str, since: float) -> None:
-        """Report that the beam is missing, optionally since a given time (s since the Unix epoch)."""
+        """Record that the beam is missing, optionally since a given time (s since the Unix epoch)."""
         with self._lock:
             self._unlit_since = min(self._unlit_since, since)
         self.hold(Cause.BEAM, reason)
 
     def hold(self, by: Cause, reason: str) -> None:
-        """Pause until the same cause is released."""
+        """Pause until this cause is released."""
         self._held_by[by] = reason
 
     def release(self, by: Cause) -> None:
         self._held_by.pop(by, None)
 
     def take_unlit_since(self) -> float:
-        """The time since which frames may lack beam, returned once; inf if no frame does."""
+        """The time since which frames may be without beam; inf if no frame is. Each such time is returned only once."""
         with self._lock:
             since, self._unlit_since = self._unlit_since, math.inf
         return since
 
 
 class StopRequest:
-    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). It cannot be undone.
+    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). A request cannot be
+    undone.
 
-    Any thread or signal handler can set it. Signal handlers set the flags. One handler may interrupt another, and would
-    wait for ever for a lock that the other one holds. Therefore each flag is set by a single assignment, without a
+    Any thread or signal handler can make the request. A signal handler may interrupt another handler, and would then
+    wait for ever for a lock that the other handler holds. Therefore each flag is set by a single assignment, without a
     lock.
 
     Args:
@@ -203,7 +210,7 @@ class StopRequest:
         stopping: True if a stop or an abort was requested.
         aborting: True if an abort was requested.
         reason: reason of the first stop, or of the last abort.
-        by_person: True if a person or the operating system asked, not only the scan itself.
+        by_person: True if a person or the operating system made the request; False if only the scan itself made it.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -216,10 +223,11 @@ class StopRequest:
             raise ScanAborted(f"Aborted: {self.reason}.")
 
     def stop(self, reason: str = "the operator asked for it", *, by_itself: bool = False) -> None:
-        """End cleanly: pending frames and the remaining darks and flats are still acquired, and the stage returns.
+        """Request a clean end: the scan still acquires pending frames and the remaining darks and flats, and the stage
+        returns.
 
         Args:
-            by_itself: True if the scan itself asks to stop, because of what its frames show.
+            by_itself: True if the scan itself requests the stop, because its frames show that no more are needed.
         """
         self.by_person = self.by_person or not by_itself
         self.reason = self.reason or reason
@@ -227,7 +235,7 @@ class StopRequest:
         self.stopping = True
 
     def abort(self, reason: str = "the operator aborted it") -> None:
-        """End at once: the stage stops, the shutter closes, and no further frame is acquired."""
+        """Request an end at once: the stage stops, the shutter closes, and no further frame is acquired."""
         self.reason, self.by_person = reason, True
         self._requested_at = self._requested_at or self._now()
         self.aborting = True

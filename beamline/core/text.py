@@ -31,7 +31,8 @@ def memory_size(text: str) -> int:
 
 
 def rounded(value: float, *, up: bool = False) -> float:
-    """A positive value rounded down (or up) to three digits, so that an advised limit holds; other values unchanged."""
+    """A positive value rounded down (or up) to three digits, so that a recommended limit is safe. Other values are
+    returned unchanged."""
     if not 0 < value < math.inf:
         return value
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
@@ -40,16 +41,17 @@ def rounded(value: float, *, up: bool = False) -> float:
 
 def printable(text: str) -> str:
     """The text for a terminal: control characters become `\\x1b` or `\\t`, except line ends, so that none acts."""
-    if text.isprintable():  # also where it has 50 MB
+    if text.isprintable():  # cut first, because the text may have 50 MB
         return text
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
-SENTENCE = 10_000  # characters of the longest one that is shown in one line
+SENTENCE = 10_000  # number of characters of the longest text that is shown in one line
 
 
 def one_line(text: str, most: int = 200) -> str:
-    """A foreign text as one line for a log or a terminal: shortened, without control characters."""
+    """A text from outside the program as one line for a log or a terminal: shortened, and without control
+    characters."""
     line = printable(" ".join(text[: 4 * most].split()))
     return line if len(line) <= most else line[: most - 3] + "..."
 
@@ -58,11 +60,12 @@ _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d) *(\..*)?$", re.IGNORECASE)
 
 
 def safe_name(text: str, most: int = 120) -> str:
-    """A name for a file or folder by a foreign text: one that stays in its folder, and that no file system, shell,
-    terminal or spreadsheet takes for anything else. A safe name is returned as it is.
+    """A safe name for a file or folder, made from a text from outside the program. It cannot lead out of its folder,
+    and has no special meaning for any file system, shell, terminal or spreadsheet. If the text is a safe name, it is
+    returned unchanged.
 
     Args:
-        most: bytes; what is beyond is cut off.
+        most: largest number of bytes; the rest is cut off.
     """
     shown = "".join(c if c.isprintable() else "_" for c in text)
     legal = _DEVICE.sub(r"_\g<0>", re.sub(r'[<>:"/\\|?*$`;]', "_", shown).lstrip(" .-=+@~"))
@@ -75,7 +78,8 @@ def count(n: int, noun: str) -> str:
 
 
 def spans(indices: Sequence[int], limit: int = 12) -> str:
-    """Ascending indices as readable text: `3, 7-9, 12`; more than `limit` groups end in `... (n in all)`."""
+    """Ascending indices as readable text: `3, 7-9, 12`. If there are more than `limit` groups, the text ends in `... (n
+    in all)`."""
     groups: list[tuple[int, int]] = []
     for i in indices:
         if groups and i == groups[-1][1] + 1:
@@ -87,7 +91,8 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
 
 
 def with_points(numbers: Sequence[str]) -> list[str]:
-    """The numbers of a file as text with decimal points, if all of them have decimal commas.
+    """The numbers of a file, as text, with decimal commas replaced by decimal points, if all numbers have decimal
+    commas.
 
     Raises:
         ValueError: the commas may group thousands, or separate numbers.
@@ -130,7 +135,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Rows of cells as CSV, one line per row, without control characters; text that a spreadsheet would compute begins
     with `'`."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\r\n").writerows(  # which quotes cells with either of these
+    csv.writer(out, lineterminator="\r\n").writerows(  # the csv module quotes cells with one of these
         [f"'{text}" if _FORMULA.match(text) else text for text in map(_cell, row)] for row in rows
     )
     return out.getvalue().replace("\r\n", "\n")

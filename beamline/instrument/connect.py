@@ -1,7 +1,7 @@
 """Connects all devices of an instrument, as the configuration states them.
 
-Each kind of device is connected by a separate module. If the instrument is simulated, the module `simulated` makes all
-devices; it is the only module that imports a simulator.
+A separate module connects each kind of device. If the instrument is simulated, the module `simulated` makes all
+devices. It is the only module that imports a simulator.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def ask_operator(request: str) -> None:
             "operator", "there is no terminal to ask the operator", request=request, advice=advice, state=_STATE
         )
     try:
-        # A read from a terminal continues after a signal, so that a stop takes effect only when it returns.
+        # After a signal, a read from a terminal continues, so that a stop takes effect only when the read returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
         click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
     except click.Abort as error:  # the end of input
@@ -77,7 +77,8 @@ def ask_operator(request: str) -> None:
 
 
 def enter_pressed() -> bool:
-    """Whether Enter was pressed at the terminal since the last call; False without a terminal. Does not wait."""
+    """Whether Enter was pressed at the terminal since the last call; False if there is no terminal. The function does
+    not wait."""
     pressed = False
     if not sys.stdin.isatty():
         return False
@@ -100,14 +101,13 @@ class Closable(Protocol):
 
 
 Connected = TypeVar("Connected", bound=Closable)
-TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
+TELL_EVERY = 30.0  # s between messages while the sensor is cooling down
 
 
 def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> CooledCamera:
-    """Connect the configured camera. `memory` is used for its frames.
+    """Connect the configured camera. `memory` is the memory for its frames.
 
-    Raises:
-        DeviceError: no library, no camera, or it does not count its frames.
+    Raises: DeviceError: the library or the camera is missing, or the camera does not count its frames.
     """
     camera: CooledCamera = import_module(f"drivers.{config.kind}.camera").configured(config, clock, memory)
     return camera
@@ -117,11 +117,10 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
     """Wait until the sensor is cold, and report its temperature to the operator.
 
     Args:
-        seconds: at most.
-        check_stop: function that is called once a second; an exception from it ends the wait.
+        seconds: longest wait in s. check_stop: function that is called once a second; an exception from it ends the
+            wait.
 
-    Raises:
-        DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
+    Raises: DeviceError: the sensor does not get cold, or its cooler is off or reports a fault.
     """
     click.echo(f"Waiting until the sensor is cold, at most {seconds:g} s; Ctrl-C ends the wait.", err=True)
     reported = -math.inf
@@ -137,10 +136,9 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
 
 
 def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
-    """Connect the configured beam monitor; a simulated one shows a constant intensity.
+    """Connect the configured beam monitor. A simulated beam monitor shows a constant intensity.
 
-    Raises:
-        DeviceError: its port does not open.
+    Raises: DeviceError: its port cannot be opened.
     """
     if not config.simulated or config.counterpart is None:
         return config.connect(clock, None)
@@ -151,15 +149,15 @@ def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
 
 @dataclass(frozen=True)
 class ConnectedDevices:
-    """Connected devices and their surroundings; leaving a `with` block closes them.
+    """Connected devices, with everything that a run needs for them. Leaving a `with` block closes the devices.
 
     Attributes:
-        clock: for every wait of the run.
-        simulated: facts of the simulator; None at a real instrument.
-        close: frees ports and camera; a second call does nothing.
-        beam_monitor: None if none is configured.
+        clock: clock for every wait of the run. simulated: facts from the simulator; None for a real instrument. close:
+            function that frees ports and camera; a second call does nothing. beam_monitor: the beam monitor; None if
+            none is configured.
         frame_memory: memory for the frames of the camera; None for a simulated camera.
-        watch_moves: sets a function that is called repeatedly while a device moves; an exception from it ends the move.
+        watch_moves: function that sets another function, which is called repeatedly while a device moves; an exception
+            from the latter ends the move.
     """
 
     devices: Devices
@@ -193,7 +191,7 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer; those opened before it are closed again.
+        DeviceError: a device does not answer. The devices that were opened before it are closed again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:
@@ -226,8 +224,8 @@ def connect(
 
 
 def clock_after(config: Config, time: float) -> Clock | None:
-    """The simulated clock of this process, started at `time` (s since the Unix epoch), because each process has its own
-    clock; None: the clock is not simulated.
+    """The simulated clock of this process, started at `time` (s since the Unix epoch). Each process has its own clock.
+    None: the clock is not simulated.
     """
     if config.simulation is None:
         return None
@@ -250,15 +248,16 @@ def stage_alone(config: Config) -> Iterator[RotationStage]:
 
 
 def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:
-    """The limits and timing of the devices from the configuration and the data sheet alone: for dry runs.
+    """The limits and timing of the devices, from the configuration and the data sheets alone. Dry runs use them.
 
-    A simulated scene is read, too, so that its faults are reported now.
+    A simulated scene is also read, so that its faults are reported now.
 
     Returns:
-        the stage's limits, the camera's timing with the projections' exposure, and the stage's radians to whole counts.
+        the limits of the stage, the timing of the camera for the exposure of the projections, and the conversion of the
+        stage from radians to whole counts.
 
     Raises:
-        ConfigError: settings that a device would refuse, or a scene that is wrong.
+        ConfigError: a device would not accept the settings, or the scene is wrong.
     """
     limits = config.devices.stage.settings.limits()
     if config.simulation is not None:
@@ -274,7 +273,7 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
 
 
 def _held(device: Connected, opened: ExitStack) -> Connected:
-    """The device, which is closed at the end."""
+    """The device; it is closed at the end of the context."""
     opened.callback(device.close)
     return device
 

@@ -1,6 +1,6 @@
 """Simulated instrument: simulated devices, behind the real drivers where these exist.
 
-It is imported where it is needed, so that an instrument loads no simulator.
+This module is imported only if it is needed, so that a real instrument loads no simulator.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from simulators.wires.wire import Build, Controller, register
 
 
 def _fitting(name: str, build: type[Build]) -> type[Build]:
-    """The class, if a controller can be built of it."""
+    """The class, if it can build a simulated controller."""
     _ = build.matching
     return build
 
@@ -64,37 +64,41 @@ WIRES: Registry[type[Build]] = Registry(
     },
     _fitting,
 )
-"""Kind -> how its simulated controller is built."""
+"""For each kind, the class that builds its simulated controller."""
 
 
-IN_PLACE = 0.1  # deg or mm: how far a motor may be from its place while the sample is seen there
+# deg or mm: largest distance of a motor from its position at which the sample still counts as being there
+IN_PLACE = 0.1
 
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """The true values of a simulated scene, which an instrument cannot know."""
+    """The true values of a simulated scene, which a real instrument cannot know."""
 
     # truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
     # camera's rows
     truth: Callable[[Grid], Volume]
     # cone: mm from the source to the rotation axis and to the detector; None for a parallel beam
     cone: tuple[float, float] | None
-    # labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
+    # labels: function that returns the anomalies of an earlier frame, given the time of its exposure (s since the Unix
+    # epoch)
     labels: Callable[[float], Sequence[AnomalyLabel]]
-    # rehearse: makes a frame with the camera's present settings; ConfigError if the scene cannot be exposed so
+    # rehearse: function that makes a frame with the present settings of the camera; ConfigError if the scene cannot be
+    # exposed with them
     rehearse: Callable[[], None]
 
 
 def simulated_devices(
     config: Config, simulation: SimulationSection, clock: Clock, opened: ExitStack
 ) -> tuple[Devices, SimulatedScene]:
-    """Every device of the configuration, connected, and the true values of the simulated scene.
+    """Connect every device of the configuration. Returns the devices and the true values of the simulated scene.
 
     Args:
-        opened: takes what closes them.
+        opened: collects the functions that close the devices.
 
     Raises:
-        ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
+        ConfigError: the scene is wrong, or the simulated controller does not have a function that the configuration
+            uses.
     """
     scene = scene_of(config)
     line = TriggerLine(clock)
@@ -104,7 +108,7 @@ def simulated_devices(
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
     beam_is_on = shutter.is_open
-    if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
+    if isinstance(wanted, StageOutputShutter):  # the driver is at one end of the cable, the blade at the other end
         shutter = OutputShutter(
             stage.digital_output(wanted.output), clock, open_high=wanted.open_high, settle=wanted.settle_s
         )
@@ -121,7 +125,7 @@ def simulated_devices(
     if isinstance(wheel := config.devices.filter, MotorFilter):
         changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
         opened.callback(turned.close)
-    elif not isinstance(wheel, NoFilter):  # its light is that of the scene
+    elif not isinstance(wheel, NoFilter):  # its intensity is that of the scene
         changer = ManualFilter(lambda request: None)
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
@@ -142,16 +146,16 @@ def _is_at_level(controller: Controller, shutter: StageOutputShutter) -> bool:
 
 
 def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | None:
-    """How far the sample is from its place, in mm across the beam; None: out of the beam."""
+    """Distance of the sample from its position, in mm across the beam; None: the sample is out of the beam."""
     place, mm = math.degrees(axis.angle_at(clock.now())), mover.mm_per_deg
     is_out = abs(place - mover.out_deg) < IN_PLACE if mm else abs(place - mover.in_deg) >= IN_PLACE
     return None if is_out else (mm or 0.0) * (place - mover.in_deg)
 
 
 def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
-    """A simulated controller that turns `axis`, and its port. Two in one process must not share one.
+    """A simulated controller that turns `axis`, and its port. Two controllers in one process must not share a port.
 
-    ConfigError: it lacks what the section of the device asks for.
+    ConfigError: the controller does not have a function that the section of the device uses.
     """
     try:
         controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
@@ -164,13 +168,14 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     """The simulated scene.
 
     Args:
-        energy: keV to which a monochromator sets its beam; None: as the scene says.
+        energy: energy in keV that a monochromator sets; None: the energy of the scene.
 
     Raises:
-        ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
+        ConfigError: the scene is wrong, or its beam does not have a single energy. DataError: a volume that the scene
+            names cannot be read.
     """
     stated_scene = config.simulation.scene if config.simulation else {}
-    # Paths in a scene that stands in the configuration itself are full ones by now.
+    # Paths in a scene that is part of the configuration are absolute here.
     folder = config_folder() if isinstance(stated_scene, dict) else (config_folder() / stated_scene).parent
     mapping = scene_mapping(config)
     if energy is not None and isinstance(beam := mapping.get("beam"), dict):
@@ -196,7 +201,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
 
 @dataclass(frozen=True)
 class _StatedScene:
-    """The plain values of a scene; those with the same text are the same."""
+    """The plain values of a scene. Scenes with the same text are the same object."""
 
     text: str
     mapping: Mapping[str, Any] = field(compare=False)
@@ -204,12 +209,13 @@ class _StatedScene:
 
 @lru_cache(maxsize=2)
 def _kept_scene(stated: _StatedScene, folder: Path) -> Scene:
-    """A scene without files, which is built once for all scans of a queue that state it."""
+    """A scene without files. It is built only once for all scans of a queue that use it."""
     return load_scene(stated.mapping, volumes_beside(folder))
 
 
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:
-    """Raises ConfigError for a cone's scan that its file could not describe, and that could not be reconstructed."""
+    """Raise ConfigError for a cone-beam scan that its file could not describe, so that it could not be
+    reconstructed."""
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
     row0, _, rows, _ = camera.roi or (0, 0, height, width)
     if 2 * row0 + rows != height:
@@ -228,7 +234,7 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
 
 
 def axis_col_of(config: Config, scene: Scene) -> float:
-    """Column of the frame that shows the scene's rotation axis."""
+    """Column of the frame in which the rotation axis of the scene appears."""
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
     _, col0, _, _ = camera.roi or (0, 0, height, width)
     return ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
@@ -248,15 +254,16 @@ def _rehearse(camera: SimulatedOrcaQuest) -> None:
 
 
 def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
-    """The simulation's clock: real, virtual or faster. The last two start at `not_before` (s since the Unix epoch) or
-    later."""
+    """The clock of the simulation: real, virtual or accelerated. A virtual or accelerated clock starts at `not_before`
+    (s since the Unix epoch) or later."""
     if isinstance(kind, Speed):
         return ScaledClock(SystemClock(), kind.speed, not_before)
     return VirtualClock(max(VIRTUAL_START, not_before)) if kind == "virtual" else SystemClock()
 
 
 def _truth(camera: SimulatedOrcaQuest, grid: Grid) -> Volume:
-    # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
+    # z = 0 of the scene is the middle of the sensor; z = 0 of a reconstruction is the middle of the rows that were
+    # read.
     detector = camera.detector
     up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
     z, y, x = grid.centre

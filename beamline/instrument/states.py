@@ -1,4 +1,4 @@
-"""States: identity and status of each device of a configuration before a scan. Nothing moves."""
+"""States: reads identity and status of each device of a configuration before a scan. Nothing moves."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class DeviceState:
 def device_states(config: Config, clock: Clock, usb: Any = None) -> Iterator[DeviceState]:
     """Connect the devices one after the other, read the identity and status of each, and disconnect all of them.
 
-    Nothing moves, and the function waits for nothing, such as a cold sensor. If a device does not answer, the others
-    are still read. Devices that the operator moves by hand are left out.
+    Nothing moves, and the function does not wait, for example until the sensor is cold. If a device does not answer,
+    the others are still read. Devices that the operator moves by hand are left out.
 
     Args:
         usb: a pyusb backend; None: the installed libusb.
@@ -61,7 +61,7 @@ def device_states(config: Config, clock: Clock, usb: Any = None) -> Iterator[Dev
 
 
 def _link(camera: DcamOrca, usb: Any) -> DeviceState:
-    """The camera on USB, by its descriptors: a slow link would lose frames."""
+    """The camera on USB, from its USB descriptors, which also show a slow link that would lose frames."""
     session = import_module(f"drivers.{camera.kind}.session")
     found = session.preflight(product=camera.usb_product, serial=camera.usb_serial, backend=usb)
     usable = found.verdict not in (session.Verdict.SLOW, session.Verdict.ABSENT)
@@ -69,7 +69,8 @@ def _link(camera: DcamOrca, usb: Any) -> DeviceState:
 
 
 def _devices(config: Config, clock: Clock, opened: ExitStack) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Each device's name, and what connects it; None: there is none, or an operator moves it."""
+    """For each device, its name and the function that connects it. None: there is no such device, or the operator moves
+    it."""
     wanted = config.devices
     if config.simulation is not None:
         instrument = opened.enter_context(connect(config))
@@ -115,7 +116,7 @@ SHOWN = frozenset({
     "usb", "model", "identity", "cameraid", "serial", "firmware", "cameraversion", "cooler", "found_at_opening",
     "position_deg", "moves", "open", "place", "energy_kev", "value", "unit", "answers",
 })  # fmt: skip
-"""The values that people read; programs get all of them."""
+"""The values that are shown to people. Programs get all values."""
 _READ: Mapping[str, Callable[[Any], dict[str, Any]]] = {
     "stage": lambda stage: {
         **stage.describe(), "position_deg": round(math.degrees(stage.position()), 6), "moves": stage.moving(),

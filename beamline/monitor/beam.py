@@ -1,9 +1,10 @@
-"""Check `beam`: slow changes of the beam intensity relative to the flats, and sudden ones.
+"""Check `beam`: slow and sudden changes of the beam intensity, relative to the flats.
 
-The slow change is measured in air, at the brightest part of a projection. The drift is reported when it starts, and as
+A slow change (drift) is measured in air, in the brightest part of a projection. It is reported when it starts, and as
 info each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change),
-which needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like
-a loss of beam. A change therefore counts only if the intensity of the whole projection changed with it.
+which needs no air. If dense particles rotate quickly, the measured changes have errors of one sign, and the sum of
+these errors would look like a loss of beam. Therefore a change counts only if the intensity of the whole projection has
+changed, too.
 """
 
 from __future__ import annotations
@@ -21,40 +22,42 @@ from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brigh
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
 
-LASTS = 5  # views that a drift must last
-GROWN = 2.0  # times the reported drift, at which it is reported again
+LASTS = 5  # number of projections for which a drift must last
+GROWN = 2.0  # factor on the reported drift at which it is reported again
 REMEDY = (
     "`beamline recon` corrects this if there is air next to the sample (--air auto). Flats before and after the "
     "projections (scan.flats.at: both) also correct it."
 )
 TAKEN_OFF = "`beamline recon` corrects this if there is air next to the sample (--air auto)."
-GONE = 0.5  # share of the limit below which a drift has gone
+GONE = 0.5  # a drift has ended if it is below this share of the limit
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual intensity
-CONFIRMED = 0.5  # share of a change that the whole view's intensity must show: the rest may be the sample's turning
-SIGMAS = 6.0  # standard deviations of the changes that a dip must have
+# share of a change that the intensity of the whole projection must show; the rest may come from the rotation of the
+# sample
+CONFIRMED = 0.5
+SIGMAS = 6.0  # smallest size of a dip, in standard deviations of the changes
 
 
 @dataclass(frozen=True)
 class BeamState:
-    drifting: int = 0  # views in a row that would change the report
-    flagged_drift: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
-    covered: bool = False  # the missing air was reported
+    drifting: int = 0  # number of successive projections that would change the report
+    flagged_drift: float = 0.0  # the drift that was flagged last; 0: no drift was flagged, or it has ended
+    covered: bool = False  # True if the missing air was reported
     level: float = 0.0  # logarithm of the intensity over that of the first view, from its confirmed changes
     usual: float = 0.0  # the normal level
-    dipping: int = 0  # views in a row with a dip
-    whole: float = math.nan  # logarithm of the intensity of the whole view before; NaN before any
-    # changes: of the intensity from projection to projection, each counted as at most half of `alarm`. A single dip
-    # therefore does not count as scatter, and the limit is at most 3.8 times `alarm`
+    dipping: int = 0  # number of successive projections with a dip
+    whole: float = math.nan  # logarithm of the intensity of the whole previous projection; NaN if there is none
+    # changes: usual changes of the intensity from projection to projection. Each change counts as at most half of
+    # `alarm`, so that a single dip does not count as scatter. The limit is therefore at most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
 
 
 @dataclass(frozen=True)
 class BeamCheck(Logged):
-    """Score: lost fraction of the intensity (negative: gained).
+    """Score: fraction of the intensity that was lost (negative: gained).
 
-    The defaults: 2 % of intensity are 0.02 of line integral in every ray, if it is not corrected with the air next to
-    the sample. A sudden change of 10 % cannot be the drift of a ring.
+    Reasons for the defaults: if it is not corrected with the air next to the sample, a change of the intensity by 2 %
+    changes the line integral of every ray by 0.02. A sudden change of 10 % cannot be the drift of a storage ring.
     """
 
     name: ClassVar[str] = "beam"
@@ -90,7 +93,8 @@ class BeamCheck(Logged):
     def _dip(
         self, state: BeamState, row: int, change: SampleChange | None, whole: float
     ) -> tuple[BeamState, Flag | None]:
-        """A dip or a flash of more than `dip` is flagged in every view, until it is over or has become normal."""
+        """A dip or a flash of more than `dip` is flagged in every projection, until it has ended or has become the
+        normal intensity."""
         moved, state = whole - state.whole, replace(state, whole=whole)
         if change is None:
             return state, None
@@ -127,15 +131,16 @@ class BeamCheck(Logged):
             return CheckResult(replace(state, drifting=state.drifting + 1))
         if gone:
             return CheckResult(replace(state, drifting=0, flagged_drift=0.0))
-        level = Level.INFO if state.flagged_drift else Level.WARN  # a view is no worse for a drift that continues
+        # a drift that continues does not make the projection worse
+        level = Level.INFO if state.flagged_drift else Level.WARN
         advice = f"Usually nothing to do: air is {_size(score)} than in the flats. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
         return CheckResult(replace(state, drifting=0, flagged_drift=score), flag)
 
 
 def in_air(context: ScanContext) -> float:
-    """Line integral of the brightest part of a projection (loss of beam since the flats). NaN if it may be sample,
-    because it is above COVERED and unlike the air so far."""
+    """Line integral of the brightest part of a projection, which is the loss of beam since the flats. NaN if this part
+    may show the sample, because its line integral is above COVERED and unlike that of the air so far."""
     if context.view is None or context.grid is None or not context.grid.flats:
         return math.nan
     brightest = brightest_place(context.view, context.grid)
@@ -143,7 +148,7 @@ def in_air(context: ScanContext) -> float:
 
 
 def _of_integrals(flag: Flag) -> Flag:
-    """The flag for a file without counts and flats, in which the intensity is not known."""
+    """The flag for a file without counts and flats, for which the intensity is not known."""
     off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
         advice = (
@@ -163,6 +168,6 @@ def _size(score: float) -> str:
 
 
 def _whole(view: CellView, grid: CellGrid) -> float:
-    """Logarithm of the mean transmission of the cells with beam; NaN without such cells."""
+    """Logarithm of the mean transmission of the cells with beam; NaN if there are no such cells."""
     lit = grid.lit > 0
     return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan

@@ -1,7 +1,7 @@
 """Check: the interface of the checks of the monitor, with their input (ScanContext) and their result (CheckResult).
 
-A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It checks one
-frame after another. What it has to remember is an immutable state, so that a scan can be replayed.
+A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. A check looks at
+one frame after another. What it must remember between frames is an immutable state, so that a scan can be replayed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class Policy(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ScanContext:
-    """Input of the checks: the scan, the references so far, and quantities of the frame that several checks need.
+    """Input of the checks: facts about the scan, the darks and flats so far, and quantities of the frame that several
+    checks need.
 
     Attributes:
         saturation: counts from which a pixel is saturated.
@@ -47,14 +48,16 @@ class ScanContext:
         stored: projections that are in an earlier file of the scan.
         cone: True for a cone beam, False for a parallel beam.
         axis_col: rotation axis that the scan states, in pixel columns; None if it states none.
-        integrals: True if the frames were line integrals; they are checked like counts of a beam without flats.
-        dark, flat: float32 [preview row, preview col], mean of the latest group of darks and of flats; None before any.
+        integrals: True if the frames were line integrals. They are checked in the same way as counts of a beam without
+            flats.
+        dark, flat: float32 [preview row, preview col], mean of the latest group of darks and of flats; None if there
+            are none yet.
         flat_exposure: exposure of these flats in s; it may differ from that of the projections.
         grid: the cells of the projections; None before the first projection.
         spots: bright pixels of projections and flats that are not in the previous frame.
         follows: True if the previous projection is the neighbour in angle, so that checks may compare with it. False
-            for repeated projections, at a new pass, and after projections of another file, where such checks start
-            again. True for the first projection, and if `step` is not known.
+            for repeated projections, at the start of a pass, and after projections of another file; checks that compare
+            projections then start again. True for the first projection, and if `step` is not known.
         light_left: intensity relative to the last good projection, see
             beamline.monitor.view.remaining_intensity; 1 if the frame is not a projection.
         view: the frame on the grid; None if it is not a projection, has no beam, or is not the first one at its angle.
@@ -101,7 +104,7 @@ def again_by(check: str) -> str:
 
 
 def intensity(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
-    """Counts above the dark [preview row, preview col]; raw counts if there was no dark yet."""
+    """Counts above the dark [preview row, preview col]. If there was no dark yet, raw counts."""
     return preview if context.dark is None else preview - context.dark
 
 
@@ -114,13 +117,14 @@ def at_edges(context: ScanContext) -> tuple[float, float]:
 
 
 def exposure_ratio(context: ScanContext, exposure: float) -> float:
-    """Intensity without a sample for this exposure (s), relative to the flats, whose exposure may differ."""
+    """Intensity without a sample for this exposure (s), relative to the intensity of the flats. (The exposure of the
+    flats may differ.)"""
     return exposure / context.flat_exposure
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult(Generic[State]):
-    """Result of checking one frame: the new state of the check, and its flag (None: nothing to report)."""
+    """Result of a check for one frame: the new state of the check, and its flag (None: nothing to report)."""
 
     state: State
     flag: Flag | None = None
@@ -158,4 +162,4 @@ class Check(Protocol):
         """The state before the first frame."""
 
     def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[Any]:
-        """Check the next frame. Costs at most O(pixels of the preview)."""
+        """Check the next frame. The effort is at most O(pixels of the preview)."""

@@ -1,4 +1,4 @@
-"""The registry of the monitor's checks, and the bits by which a file records which checks flagged a frame.
+"""The registry of the monitor's checks, and the bits with which a file records the checks that flagged a frame.
 
 To add a check, add its file in this folder and a line in REGISTRY, or in CHECKS of a folder of checks. Its keys in the
 configuration, its bits and its legend in a scan file, and its name in `beamline info` then follow automatically.
@@ -14,12 +14,12 @@ from operator import attrgetter
 from beamline.monitor.check import Check, Flag, Level
 from recon.base.registry import Registry, in_folders
 
-ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
-BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one first
-ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # a frame with any of these bits has an alarm
+ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: the flag was an alarm
+BITS = (*range(16), *range(32, 48))  # bits that a check may have, the next free one first
+ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # if a frame has one of these bits, it has an alarm
 
 
-REGISTRY = {  # class of a check: its module in this folder
+REGISTRY = {  # for the class of a check, its module in this folder
     "BeamCheck": "beam",
     "SaturationCheck": "frames",
     "StuckCheck": "frames",
@@ -66,13 +66,14 @@ _OURS = _distinct(
 )
 BY_NAME = _all(_OURS)
 CHECKS: tuple[Check, ...] = tuple(BY_NAME.values())
-"""All checks with their default limits, in the order of their bits, in which they look at a frame."""
+"""All checks with their default limits, in the order of their bits. In this order they check a frame."""
 
 _BITS = {check.name: check.bit for check in CHECKS}
 
 
 def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
-    """Frames of a file by check and level; one with a warning and an alarm of a check counts by its alarm."""
+    """Number of frames of a file by check and level. If a check gave a frame a warning and an alarm, the alarm
+    counts."""
     frames: dict[tuple[str, Level], set[int]] = {}
     for flag in flags:
         frames.setdefault((flag.check, flag.level), set()).update(flag.frames)
@@ -83,7 +84,7 @@ def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
 
 
 def bitmask(flags: Iterable[Flag]) -> int:
-    """The flags of a frame as 64 bits; see ALARM_SHIFT. An INFO has no bit: nothing is wrong with the frame."""
+    """The flags of a frame as 64 bits; see ALARM_SHIFT. An INFO has no bit, because nothing is wrong with the frame."""
     bits = 0
     for flag in flags:
         if flag.level is Level.INFO:

@@ -1,11 +1,11 @@
 """Statistics of a frame (`FrameDigest`) for the monitor, the operator and the file, computed in one pass.
 
-Counts (uint16) are read once, line by line. Each line is in the processor's cache while its range, sums and histogram
-are computed. The sums are integers, so mean and variance are exact. Other types are read twice, because the histogram
-needs the range first.
+Counts (uint16) are read once, line by line. Range, sums and histogram of a line are computed while the line is in the
+processor's cache. The sums are integers, so mean and variance are exact. Pixels of other types are read twice, because
+the histogram needs the range first.
 
-A pixel is invalid if it is not finite, if it has the no-data value, or if it is beyond what any detector counts
-(LARGEST). Invalid pixels are counted and otherwise ignored: no mean and no block of the preview contains their values.
+A pixel is invalid if it is not finite, if it has the no-data value, or if it is above what any detector counts
+(LARGEST). Invalid pixels are counted and otherwise ignored: no mean and no block of the preview includes their values.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that are enough for a check; a large preview is subsampled to about this number
 LARGEST = 1e15  # largest absolute value of a valid pixel: float32 holds the sum of the squares over a frame
 SMALL, LARGE = 4, 8  # sides in pixels of the blocks that the checks use; large blocks if at least ENOUGH of them remain
-ENTROPY_PIXELS = 2**20  # pixels, about; for larger frames of counts, every k-th row is enough for the entropy
+# approximate number of pixels; for larger frames of counts, every k-th row is enough for the entropy
+ENTROPY_PIXELS = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +42,8 @@ class FrameDigest:
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
             (0 for a constant frame, at most 8). For counts in frames of more than 2**20 pixels, only every k-th row
             is used.
-        checksum: CRC-32 (IEEE 802.3) of the pixels in memory order. Two equal checksums show that a frame was
-        delivered twice.
+        checksum: CRC-32 (IEEE 802.3) of the pixels in memory order. If two frames have equal checksums, the camera
+            delivered the same frame twice.
         preview: float32 [ceil(row / bin), ceil(col / bin)], mean of the valid pixels of each block (NaN if it has
             none). Blocks at the lower and right edge are smaller if bin does not divide the shape.
         peaks: float32, largest valid pixel of each of these blocks (NaN if it has none).
@@ -78,7 +79,7 @@ def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
 
 
 def subsampled(preview: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Every k-th block along both axes, so that a large frame takes no more time than a small one."""
+    """Every k-th block along both axes, so that a large frame does not need more time than a small frame."""
     step_rows, step_cols = (max(1, n // ENOUGH) for n in preview.shape)
     return preview[::step_rows, ::step_cols]
 
@@ -91,7 +92,7 @@ def digest(
     Args:
         saturation: the value from which a pixel counts as saturated (65535 for a full 16-bit range).
         preview_bin: pixels per side of a preview block.
-        no_data: a value that marks pixels without a measurement.
+        no_data: the value of pixels without data.
 
     Raises ValueError for an array that is not two-dimensional, empty or complex, or for a bin below 1.
     """
@@ -127,7 +128,8 @@ def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: in
 
 
 def block_means(image: NDArray[Any], side: int) -> NDArray[np.float32]:
-    """The preview of a digest, computed without the compiled kernel: for a few frames, loading numba would take longer.
+    """The preview of a digest, computed without the compiled kernel. It is meant for a few frames, for which loading
+    numba would take longer.
 
     For counts it is bit-identical to the preview of the kernel. For floats it is not, because they are summed in
     another order.
@@ -147,7 +149,7 @@ def block_means(image: NDArray[Any], side: int) -> NDArray[np.float32]:
 
 def is_valid(image: NDArray[Any]) -> NDArray[np.bool_]:
     """Pixels that are finite and not beyond LARGEST."""
-    return np.asarray(np.abs(image) <= np.float64(LARGEST))  # float16 holds no such number
+    return np.asarray(np.abs(image) <= np.float64(LARGEST))  # float16 cannot represent such a number
 
 
 def checksum_of(image: NDArray[Any]) -> int:
@@ -174,7 +176,7 @@ def _of_greys(
     every = max(1, image.size // ENTROPY_PIXELS)
     least, high, total, squares, saturated, histograms = _count_greys(image, full, every, preview_bin, preview, peaks)
     low, histogram = int(least.min()), histograms.sum(0, np.int64)
-    # integers of any length: no square overflows
+    # integers of any length, so that no square overflows
     size, total, squares = image.size, int(total), int(squares)
     greys = np.flatnonzero(histogram)
     bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
@@ -230,13 +232,15 @@ def _folded(sums, tops, side):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _count_greys(image, full, every, preview_bin, preview, peaks):
-    """(minima of columns, maximum, sum, sum of squares, pixels from `full` on, two histograms of every k-th row).
+    """Returns (minima of columns, maximum, sum, sum of squares, number of pixels at or above `full`, two histograms of
+    every k-th row).
 
     Fills preview and peaks. Each short loop handles one line, so that the compiler turns all of them except the
     histogram's into vector instructions. A check for a division by zero would prevent this.
     """
     rows, cols = image.shape
-    # Two histograms take turns: neighbours are often equal, and an increment must not wait for the one before it.
+    # Two histograms are used in turn, because neighbouring pixels are often equal, and an increment must not wait for
+    # the previous one.
     histogram = np.zeros((2, 65536), np.uint32)
     across = preview.shape[1]
     sums, tops = np.zeros(across * preview_bin, np.uint32), np.zeros(across * preview_bin, np.uint16)  # whole blocks

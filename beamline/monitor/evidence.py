@@ -15,12 +15,12 @@ from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, Mask
 from recon.base.noise import deviation_between_frames, deviation_between_neighbours
 
-LEAST_NOISE = 0.5  # counts: what rounding hides
+LEAST_NOISE = 0.5  # counts: differences below this may be hidden by rounding
 BRIGHT = 90.0  # percentile of a frame's blocks that represents its intensity
 DRIFT = 0.02  # fraction of the intensity by which a beam may drift within a scan (as in the check `beam`)
 UNLIT = 0.05  # share of the bright part's intensity: a place with less counts as dark
-LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
-ZINGER = 12.0  # times the median change: more is not noise
+LEAST_BLOCKS = 200  # number of differences of neighbouring blocks from which the noise is known to 15 %
+ZINGER = 12.0  # factor on the median change; a larger change is not noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class FrameStatistics:
         saturated: fraction of the pixels at or above the saturation value.
         blocks: float32, means of blocks of pixels; if the preview is large, only a part of it.
         block: side of a block in pixels.
-        rounding: noise that rounding to the type of the pixels may hide; 0 for real numbers.
+        rounding: largest noise that rounding to the type of the pixels may hide; 0 for real numbers.
         invalid: fraction of the pixels that are not finite.
         cells: float32, means of larger blocks that cover the frame; None: not needed.
     """
@@ -50,7 +50,7 @@ class FrameStatistics:
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> FrameStatistics:
-        """The statistics of a frame of a running scan, from its digest."""
+        """The statistics of a frame of a running scan, taken from its digest."""
         return cls(row, kind, exposure, digest.saturated_fraction, np.array(subsampled(digest.preview)), block)
 
     @property
@@ -89,8 +89,8 @@ Group = Sequence[FrameStatistics]
 
 
 class BadFrames(NamedTuple):
-    """Frames of a group that cannot be used: the score, the violated limit, and a sentence with both and with advice.
-    If no frames are named, the sentence concerns the whole group.
+    """A finding about frames of a group that cannot be used: the score, the violated limit, and a sentence with both
+    and with advice. If no frames are named, the finding concerns the whole group.
     """
 
     frames: Group
@@ -131,12 +131,12 @@ class Evidence:
         return max(self.of_kind(FrameKind.FLAT), key=self.intensity_of, default=())
 
     def intensity_of(self, group: Group) -> float:
-        """Counts of the bright part above the darks, per second if the exposure is known."""
+        """Counts above the darks in the bright part of the frame; per second, if the exposure is known."""
         dark = level(self.darkest) if self.darkest else 0.0
         return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
 
     def with_frame(self, frame: FrameStatistics, begins: bool) -> Evidence:
-        """This evidence with the next frame of the scan. A dark or a flat may start a new group."""
+        """The evidence with the next frame of the scan added. A dark or a flat may start a new group."""
         if frame.kind is FrameKind.PROJECTION:
             return replace(self, views=(*self.views, frame))
         begins = begins or not self.groups or self.groups[-1][0].kind is not frame.kind
@@ -144,24 +144,25 @@ class Evidence:
         return replace(self, groups=(*before, (*last, frame)))
 
     def without(self, rows: set[int]) -> Evidence:
-        """This evidence without some frames, and without groups that become empty."""
+        """The evidence without some frames, and without groups that become empty."""
         groups = (tuple(frame for frame in group if frame.row not in rows) for group in self.groups)
         views = tuple(view for view in self.views if view.row not in rows)
         return Evidence(tuple(group for group in groups if group), views)
 
     @cached_property
     def base(self) -> F32 | float:
-        """Counts without beam, the mean of all darks; 0 without darks."""
+        """Counts without beam: the mean of all darks; 0 if there are no darks."""
         darks = [frame.places for frame in self.frames(FrameKind.DARK)]
         return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
 
     def intensity(self, frame: FrameStatistics) -> F32:
-        """Counts of a frame above the darks, at its places."""
+        """Counts of a frame above the darks, at each place."""
         return np.asarray(np.nan_to_num(frame.places - self.base), np.float32)
 
     @cached_property
     def lit_views(self) -> list[FrameStatistics]:
-        """The projections that are brighter than with a closed shutter, and have more than one value."""
+        """The projections that are brighter than with a closed shutter, and whose pixels do not all have the same
+        value."""
         intensity = [float(np.percentile(self.intensity(view), BRIGHT)) for view in self.views]
         least = UNLIT * max(intensity, default=0.0)
         return [
@@ -170,7 +171,8 @@ class Evidence:
 
 
 def level(group: Group) -> float:
-    """Counts in the bright part of a frame, because the beam may be narrower than the detector."""
+    """Counts in the bright part of a frame. (Only this part is used, because the beam may be narrower than the
+    detector.)"""
     return float(np.median([np.nanpercentile(frame.blocks, BRIGHT) for frame in group]))
 
 
@@ -185,7 +187,8 @@ def pixel_noise(group: Group) -> float:
 
 
 def place_noise(values: NDArray[np.floating]) -> float:
-    """Noise of a place, from differences to its neighbours in the row, because sample and beam change more slowly."""
+    """Noise of a place, from the differences to its neighbours in the row. Sample and beam change more slowly from
+    place to place."""
     return deviation_between_neighbours(values, 2)
 
 
@@ -195,11 +198,12 @@ def lit_places(intensity: F32) -> Mask:
 
 
 def photons(flats: Group, darks: Group) -> float | None:
-    """Median number of photons in a pixel of the flats with beam: squared intensity divided by the variance it adds.
+    """Median number of photons in a pixel of the flats with beam: the squared intensity, divided by the variance that
+    the beam adds.
 
-    Photon transfer (Janesick 2007), with changes between frames of the difference of neighbouring blocks, so that a
-    flickering or moving beam does not count as noise. None if there are too few frames or blocks, or if the flats have
-    no photon noise.
+    The method is photon transfer (Janesick 2007). The variance comes from changes, between frames, of the difference of
+    neighbouring blocks, so that a flickering or moving beam does not count as noise. None if there are too few frames
+    or blocks, or if the flats have no photon noise.
     """
     intensity = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
     lit = intensity > UNLIT * float(np.nanpercentile(intensity, BRIGHT))
@@ -223,8 +227,8 @@ def full_scale(largest: float) -> float:
 def lights_in_turn(levels: NDArray[np.floating]) -> int:
     """Number of intensity levels between which consecutive frames [frame] alternate, 2 or 3; 0: they do not alternate.
 
-    They alternate if the change between frames of the same level is at most a third of the difference between levels.
-    In a drift it is larger.
+    Frames alternate if the change between frames of the same level is at most a third of the difference between levels.
+    In a drift, the change is larger.
     """
     for n in range(2, min(3, levels.size // 2) + 1):
         between = float(np.ptp([np.median(levels[first::n]) for first in range(n)]))

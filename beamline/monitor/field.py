@@ -25,9 +25,9 @@ from recon.base.noise import deviation_between_neighbours
 from recon.base.reach import LEAST
 from recon.base.setting import setting
 
-LASTS = 5  # projections in a row with sample at an edge
-NO_BEAM = 3.0  # times the noise; a flat whose bright part is below this has no beam (noise alone gives 1.3)
-NAMED = 4  # most shadows that the advice names
+LASTS = 5  # number of successive projections with sample at an edge
+NO_BEAM = 3.0  # factor on the noise; a flat whose bright part is below it has no beam (noise alone gives 1.3)
+NAMED = 4  # largest number of shadows that the advice names
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FieldState:
         unlit: True if flats without beam were reported.
         inside: True if the whole sample was in the field of view in some projection.
         cut: number of consecutive projections with sample at the edges.
-        reported: True if this was reported.
+        reported: True if the sample at the edges was reported.
     """
 
     unlit: bool = False
@@ -52,8 +52,9 @@ class FieldOfViewCheck(Logged):
     """Score: fraction of the frame without beam (flat), or line integral at the edge of the field of view (info, once a
     scan).
 
-    The defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample, and more than
-    phase fringes and scattered radiation leave there. Slits usually shadow a line or two at the edges of the frame.
+    Reasons for the defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample, and
+    more than phase fringes and scattered radiation cause there. Slits usually shadow one or two lines at the edges of
+    the frame.
     """
 
     name: ClassVar[str] = "field"
@@ -132,7 +133,7 @@ def beyond_the_field(cut: Mapping[str, float]) -> str:
 
 
 def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
-    """First pixel, and the one after the last, of each unbroken run of marked lines of the preview."""
+    """First pixel, and the pixel after the last one, of each unbroken run of marked lines of the preview."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
     return [(round(first * step), round(after * step)) for first, after in edges.reshape(-1, 2).tolist()]
 
@@ -144,7 +145,8 @@ EMPTY = 1e-3  # mean line integral below which the field of view is empty
 
 @dataclass(frozen=True)
 class MassState:
-    """`masses`: of the first projections; `usual`: their median, None before; `running`: outliers in a row."""
+    """`masses`: total absorption of the first projections. `usual`: its median; None as long as there are too few.
+    `running`: number of successive outliers."""
 
     masses: tuple[float, ...] = ()
     usual: float | None = None
@@ -207,9 +209,9 @@ def _calibrate(state: MassState, mass: float) -> MassState:
     return replace(state, masses=masses, usual=usual, scatter=scatter)
 
 
-DEAD = 0.2  # a pixel is dead below this fraction of the intensity in the darkest preview block around it
-NAMED_PIXELS = 5  # most pixels that the advice names
-HOLES = 1e-4  # fraction of the pixels that may have no valid value; a column of 4096 is more
+DEAD = 0.2  # a pixel is dead if it is below this fraction of the intensity in the darkest preview block around it
+NAMED_PIXELS = 5  # largest number of pixels that the advice names
+HOLES = 1e-4  # fraction of the pixels that may have no valid value; one column of 4096 is more
 HALF = 0.5  # fraction of the pixels; if more are missing, a projection is lost
 
 PixelPlaces = NDArray[np.int64]
@@ -217,9 +219,10 @@ PixelPlaces = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class PixelsState:
-    """`dead`: places row * columns + column that were dark in all flats of the latest group, None before any.
+    """`dead`: positions row * columns + column of pixels that were dark in all flats of the latest group; None before
+    the first flat.
 
-    `holes`: largest fraction of pixels without a number in a dark or flat: a mask of the detector.
+    `holes`: largest fraction of pixels that are not a number in a dark or flat, because the detector masks them.
     """
 
     dead: PixelPlaces | None = None
@@ -230,13 +233,13 @@ class PixelsState:
 
 @dataclass(frozen=True)
 class PixelsCheck(Logged):
-    """Score: fraction of dead pixels, which in all flats of the first group have less than a fifth of the intensity
-    around them. It is reported at the first projection, as info if they are few. Of a projection, the score is also
-    the fraction of pixels that have no valid value (NaN, infinite, beyond LARGEST) although they have one in darks
-    and flats; of any frame, it is 1 if no pixel has a valid value.
+    """Score, one of three fractions. (1) Dead pixels: they have less than a fifth of the intensity around them in all
+    flats of the first group. They are reported at the first projection, as info if they are few. (2) In a projection:
+    pixels that have no valid value (NaN, infinite, above LARGEST) although they have one in darks and flats. (3) In any
+    frame: 1 if no pixel has a valid value.
 
-    The default: a thousandth of the pixels is one pixel in every column of a detector of 1000 rows, each of which makes
-    a ring in a slice.
+    Reason for the default: a thousandth of the pixels is one pixel in every column of a detector with 1000 rows, and
+    each makes a ring in a slice.
     """
 
     name: ClassVar[str] = "pixels"
@@ -252,7 +255,7 @@ class PixelsCheck(Logged):
         self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext
     ) -> CheckResult[PixelsState]:
         holes = digest.invalid_fraction
-        if holes == 1:  # no mask, whatever the frame shows
+        if holes == 1:  # not a mask, whatever the frame shows
             return CheckResult(state, self._without_number(frame.index, holes))
         if frame.kind is not FrameKind.PROJECTION:
             state = replace(state, holes=max(state.holes, holes))
@@ -297,7 +300,7 @@ def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlace
     above = intensity(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above
-    around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow is not dead
+    around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow does not count as dead
     limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
     counts, cols = frame.counts, frame.counts.shape[1]
     places = [

@@ -1,7 +1,7 @@
 """Checks of single frames: `saturation`, `stuck` (repeated images), `timing`, `dark` (drift of darks), `lost` (beam).
 
-Noise never repeats exactly, so two frames with the same checksum are the same frame, delivered twice. Only the alarms
-of `lost` end a scan by default.
+Noise never repeats exactly, so two frames with the same checksum are the same frame, delivered twice. By default, only
+alarms of `lost` stop a scan.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beamline.monitor.digest import FrameDigest, subsampled
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
 
-FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
+FEW_PIXELS = 2  # fewer saturated pixels may be hot pixels that the darks did not show
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SaturationState:
 
 @dataclass(frozen=True)
 class SaturationCheck(Logged):
-    """Score: fraction of saturated pixels beyond those that are saturated in the darks."""
+    """Score: fraction of saturated pixels, minus the fraction that is also saturated in the darks."""
 
     name: ClassVar[str] = "saturation"
     bit: ClassVar[int] = 1
@@ -77,7 +77,7 @@ class StuckState:
 
 @dataclass(frozen=True)
 class StuckCheck(Logged):
-    """No limits: one repetition is one too many. Score: repetitions in a row."""
+    """Score: number of successive repetitions. There are no limits, because a single repetition is an alarm."""
 
     name: ClassVar[str] = "stuck"
     bit: ClassVar[int] = 2
@@ -89,7 +89,8 @@ class StuckCheck(Logged):
     def look(
         self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext
     ) -> CheckResult[StuckState]:
-        """Compare checksums. Without noise, references of one kind are equal, and so are the frames of a view."""
+        """Compare checksums. In a simulation without noise, darks or flats are equal, and so are the frames of a
+        projection."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
         alike = digest.checksum == state.checksum
         as_before = frame.kind is not FrameKind.PROJECTION or frame.angle == state.angle
@@ -119,9 +120,9 @@ class TimingState:
 
 @dataclass(frozen=True)
 class TimingCheck(Logged):
-    """Score: delay of the frame in periods (negative: early).
+    """Score: delay of the frame in units of the period (negative: early).
 
-    If triggers before the frame gave no frame, this is only an INFO, because the frame after the gap is good.
+    If earlier triggers gave no frame, the flag is only an INFO, because the frame after the gap is good.
     """
 
     name: ClassVar[str] = "timing"
@@ -137,7 +138,7 @@ class TimingCheck(Logged):
         self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext
     ) -> CheckResult[TimingState]:
         steps = frame.trigger - state.trigger
-        # A view that is repeated alone replaces a frame or fills a gap; the stage stands for it.
+        # A projection that is taken again replaces a frame or fills a gap. The stage is at rest for it.
         alone = frame.replaces >= 0 or (steps < 1 and any(frame.trigger in gap for gap in state.gaps))
         if frame.kind is not FrameKind.PROJECTION or context.period is None or alone:
             return CheckResult(state)
@@ -151,7 +152,8 @@ class TimingCheck(Logged):
             )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
-            return CheckResult(after)  # armed again, for another pass, or the same one again, or after a pause
+            # the camera was armed again: for another pass, for the same pass again, or after a pause
+            return CheckResult(after)
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
             return CheckResult(after)
@@ -163,19 +165,21 @@ class TimingCheck(Logged):
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 
 
-TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
+# one of this many preview blocks is left out at either end, because of zingers, which have nothing to do with the
+# camera
+TRIM = 10
 
 
 @dataclass(frozen=True, eq=False)
 class DarkState:
-    """Preview blocks of the first dark, None before any."""
+    """Preview blocks of the first dark; None before the first dark."""
 
     blocks: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
 class DarkCheck(Logged):
-    """Score: drift in counts. Beam in darks is a finding of `beamline.monitor.references`.
+    """Score: drift in counts. (`beamline.monitor.references` finds darks that were exposed to the beam.)
 
     The drift is a trimmed mean over the blocks of the preview, because one zinger changes the mean of a small frame by
     tens of counts.
@@ -215,15 +219,16 @@ def _trimmed_mean(values: NDArray[np.float32]) -> float:
 
 @dataclass(frozen=True)
 class LostState:
-    """No state: the monitor itself keeps the last good view."""
+    """This check has no state, because the monitor itself keeps the last good projection."""
 
 
 @dataclass(frozen=True)
 class LostCheck:
-    """Score: lost fraction of the intensity in nine tenths of the frame, relative to the last projection with beam.
+    """Score: fraction of the intensity that was lost in nine tenths of the frame, relative to the last projection with
+    beam.
 
-    The default: neither drift nor the decay of the ring current between two top-ups takes half of the intensity. A
-    rotating sample does not darken all places at once.
+    Reason for the default: neither drift nor the decay of the ring current between two top-ups removes half of the
+    intensity. A rotating sample does not darken all places at once.
     """
 
     name: ClassVar[str] = "lost"

@@ -1,10 +1,10 @@
 """Check `motion`: finds jumps, slips and shaking of the sample, beyond its steady rotation.
 
-Shaking is random displacement from projection to projection, by vibration or runout of the stage. If a projection is
-displaced by x, its own change relative to the projections before is x, and the change of the next one is -4/3 x,
-because there the displaced projection is the previous one and a third of the velocity. Consecutive changes therefore
-have a covariance of -4/3 of the variance of x. Errors of the model of the rotating sample change slowly, so their
-covariance is positive. This distinguishes the two, whatever the sample.
+Shaking is random displacement from projection to projection, caused by vibration or runout of the stage. If a
+projection is displaced by x, its own change relative to earlier projections is x. The change of the next projection is
+-4/3 x, because the displaced projection is then the previous one and also makes a third of the velocity. Therefore
+consecutive changes have a covariance of -4/3 of the variance of x. Errors of the model of the rotating sample change
+slowly, so their covariance is positive. The sign of the covariance distinguishes the two for every sample.
 """
 
 from __future__ import annotations
@@ -19,14 +19,18 @@ from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
 from recon.base.setting import setting
 
-PAIRS = 32  # changes that follow one another, before anything is reported
+PAIRS = 32  # number of consecutive changes that are needed before anything is reported
 SHAKE_MEMORY = 0.02  # weight of the newest pair
-CLIPPED = 4.0  # mean absolute deviations that count of a change: a jump is no vibration, and noise keeps its variance
-OWN = 4 / 3  # of the variance of x: minus the covariance of changes that follow one another
-FROM_NOISE = math.sqrt(1 + OWN**2 + 1 / 9)  # sigma of a change over that of a view's own displacement
-SHAKE_SIGMAS = 6.0  # standard deviations of the estimate: a false alarm in 10**9 estimates
-SHAKE_CONFIRMED = 0.5  # share of the changes' variance that their covariance must show
-SPREAD = 2.6  # standard deviation of the estimate for noise alone, over the variance by noise, times sqrt(pairs)
+# largest number of mean absolute deviations with which a change counts: a jump must not count as vibration, and noise
+# must keep its variance
+CLIPPED = 4.0
+OWN = 4 / 3  # minus the covariance of consecutive changes, in units of the variance of x
+# standard deviation of a change, divided by that of the displacement of a projection
+FROM_NOISE = math.sqrt(1 + OWN**2 + 1 / 9)
+SHAKE_SIGMAS = 6.0  # number of standard deviations of the estimate: one false alarm in 10**9 estimates
+SHAKE_CONFIRMED = 0.5  # share of the variance of the changes that their covariance must have
+# standard deviation of the estimate for noise alone, divided by the variance of the noise, times sqrt(number of pairs)
+SPREAD = 2.6
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Axis:
     def size(self, pairs: int) -> float:
         """Size of the shaking: standard deviation in pixels without the noise; 0 if noise alone can explain it.
 
-        The squares give it more precisely than the products, if the products confirm it.
+        The squares give the size more precisely than the products, but count only if the products confirm it.
         """
         variance, n = -self.product / OWN, min(pairs, round(2 / SHAKE_MEMORY))
         if pairs < PAIRS or variance < self.noise * (1 + SHAKE_SIGMAS * SPREAD / math.sqrt(n)):
@@ -67,14 +71,14 @@ class Axis:
 
 @dataclass(frozen=True)
 class Shake:
-    """Shake across and down, over the views so far."""
+    """Shaking across and down, measured from the projections so far."""
 
     across: Axis = field(default_factory=Axis)
     down: Axis = field(default_factory=Axis)
     pairs: int = 0
 
     def with_change(self, change: SampleChange | None) -> Shake:
-        """The state after the next view; None, or a gap of views, begins a new chain of changes."""
+        """The state after the next projection. None, or a gap between projections, begins a new chain of changes."""
         if change is None or not 0.5 < change.steps < 1.5 or not math.isfinite(change.across + change.down):
             return Shake(replace(self.across, last=math.nan), replace(self.down, last=math.nan), self.pairs)
         figures = (change.across, change.sigma[0]), (change.down, change.sigma[1])
@@ -91,9 +95,12 @@ class Shake:
 
 
 SIGMAS = 8.0
-LEAST_SHAKE = 0.02  # of a cell; on a large frame, whose cells have many pixels, a smaller shake is not reported
-GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times the reported one, above which it is again
-CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
+LEAST_SHAKE = 0.02  # share of a cell; smaller shaking is not reported on a large frame, whose cells have many pixels
+# share of the limit below which shaking has ended; factor on the reported shaking above which it is reported again
+GONE, GROWN = 0.5, 2.0
+# share of a result; if a smaller part differs from row to row, only this part counts, because a moving shadow is as
+# high as the frame
+CONFIRMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ class MotionState:
         across, down: usual shifts in pixels.
         turn: usual excess rotation in steps.
         quiet: number of projections in which a jump still has an effect.
-        told: size in pixels of the shaking that was flagged last; 0 if none was, or if it has ended.
+        told: size in pixels of the shaking that was flagged last; 0 if no shaking was flagged, or if it has ended.
     """
 
     across: FrameScatter = field(default_factory=FrameScatter)
@@ -118,11 +125,11 @@ class MotionState:
 class MotionCheck(Logged):
     """Score: displacement of the sample in pixels, beyond its rotation; in steps of the stage if it is a slip.
 
-    Only the view of the jump is flagged: later views are as good as earlier ones, but show another position.
-    The defaults: half a pixel is what reconstructions from views at two positions begin to show (a doubled edge is as
-    wide as the resolution). A flat face that comes into the beam's direction looks like a slip of up to two steps. A
-    shake is a warning, once, and again when it has doubled: a quarter of a pixel takes a quarter of the contrast of the
-    finest detail, of two pixels.
+    Only the projection of the jump is flagged, because later projections are as good as earlier ones and only show
+    another position. Reasons for the defaults: if projections show two positions half a pixel apart, double edges
+    become visible in a reconstruction, because they are then as wide as the resolution. A flat face that rotates into
+    the beam direction looks like a slip of up to two steps. Shaking gives one warning, and another when it has doubled:
+    a quarter of a pixel removes a quarter of the contrast of the finest detail (two pixels).
     """
 
     name: ClassVar[str] = "motion"

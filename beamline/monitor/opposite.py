@@ -1,9 +1,9 @@
 """Check `opposite`: compares a projection with the opposite one, or with a repetition, to find motion and change.
 
 Parallel rays measure the same from both sides: p(angle + 180°, u) = p(angle, -u), where u is the distance from the
-axis. The check keeps a projection every few degrees. It compares it with the projection 180° later, mirrored, or 360°
-later. The best fit gives the rotation axis, and the shift of the sample in between. The remaining difference is stated
-as the shift of the whole sample that would cause the same difference.
+axis. The check keeps a projection every few degrees. It compares this projection with the mirrored projection 180°
+later, or with the projection 360° later. The best fit gives the rotation axis, and the shift of the sample between the
+two. The remaining difference is stated as the shift of the whole sample that would cause it.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
 from recon.base.setting import setting
 
-EVERY = math.radians(5)  # radians between kept views
-MOST = 36  # of them: half a turn
-BESIDE = 1.01  # steps from the angle sought to a view, at most; a hundredth is rounding
-REACH = 2.0  # cells that the rim may move within these: the kept view continues by its velocity
-LATER = 8  # views after the kept one at least
+EVERY = math.radians(5)  # radians between kept projections
+MOST = 36  # number of them in 180°
+BESIDE = 1.01  # largest distance, in steps, of a projection from the wanted angle; a hundredth is rounding
+# largest motion of the rim, in cells, within this distance; the kept projection is extrapolated with its velocity
+REACH = 2.0
+LATER = 8  # smallest number of projections after the kept one
 LEAST_SHIFT, LEAST_REMAINDER, LEAST_AXIS = 0.05, 0.5, 0.25
-"""Of a cell: the limits on large frames, where a cell is many pixels wide. With them one clean scan (the 44th, by its
-remainder) and no measured one is reported in tests/beamline/findings.json."""
+"""Limits as shares of a cell, for large frames, in which a cell is many pixels wide. With these limits, one clean
+simulated scan (the 44th, because of its remainder) and no measured scan is reported in tests/beamline/findings.json."""
 SIGMAS = 8.0  # standard deviations of the noise that a shift must have
 SHAKEN = 5.0  # standard deviations of the places of single views, where the sample shakes
-FEWEST = 16  # columns that can be laid on others
-TURNS = 6  # rounds of the fit
-SEARCH = 0.4  # of the field: how far the axis may be from its middle, twice
-NOISY = 2.0  # times the noise that a remainder must have
+FEWEST = 16  # smallest number of columns that both projections must share
+TURNS = 6  # number of rounds of the fit
+SEARCH = 0.4  # twice the largest distance of the axis from the middle, as a share of the field of view
+NOISY = 2.0  # smallest remainder, as a multiple of the noise
 SMOOTH = 1.0  # cells: standard deviation by which both are smoothed, so that fractions of a cell shift sharp edges well
-SMOOTHER = 1 / (4 * math.pi * SMOOTH**2)  # variance of the noise after that over before
+SMOOTHER = 1 / (4 * math.pi * SMOOTH**2)  # variance of the noise after this smoothing, divided by that before
 LEAST_OVERLAP = 0.3  # of the columns
 
 Reals = NDArray[np.float64]
@@ -48,21 +49,22 @@ class Kept:
     """A projection that is kept until the projection 180° later arrives."""
 
     view: CellView
-    after: CellView | None = None  # the next one, later the nearest in angle so far, which gives the velocity
-    # turned, again: it was compared with the view from the other side, and with a repetition
+    # the next projection, and later the nearest in angle so far, which gives the velocity
+    after: CellView | None = None
+    # turned, again: True if it was compared with the opposite projection, or with a repetition
     turned: bool = False
     again: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFit:
-    """The fit of one projection to another, in pixels: shift across and down, its standard deviation `sigma` by noise,
-    and the remainder as an equivalent shift.
+    """The fit of one projection to another, in pixels: shift across and down, its standard deviation `sigma` because of
+    noise, and the remainder as an equivalent shift.
 
     Attributes:
         places: sum of squares of the weights that the positions of single projections have in the shift.
-        unsure: possible error of extrapolating the kept projection without any motion; 0 if it is within the limit
-            of a change.
+        unsure: possible error of extrapolating the kept projection if nothing moved; 0 if this error is within the
+            limit of a change.
     """
 
     across: float
@@ -75,7 +77,7 @@ class ViewFit:
 
 @dataclass(frozen=True, eq=False)
 class OppositeState:
-    """Kept views, the axis (in columns of pixels) by the first pair, and whether the check is off."""
+    """Kept projections, the axis (in columns of pixels) from the first pair, and whether the check is off."""
 
     kept: tuple[Kept, ...] = ()
     axis: float | None = None
@@ -84,12 +86,12 @@ class OppositeState:
 
 @dataclass(frozen=True)
 class OppositeCheck(Logged):
-    """Score: motion of the sample in pixels, or the motion of the whole sample that would change the projection as
-    much.
+    """Score: motion of the sample in pixels; or, for a change of the sample, the motion of the whole sample that would
+    change the projection as much.
 
-    The defaults: half a pixel, as for `motion`, because it doubles edges by as much as the resolution; or a twentieth
-    of a cell if that is more, because shifts are not known better. Flat faces and coarse steps leave a remainder of 0.3
-    cells.
+    Reasons for the defaults: as for `motion`, half a pixel makes double edges as wide as the resolution. If a twentieth
+    of a cell is larger, this is the limit, because shifts are not known more precisely. Flat faces and coarse steps
+    leave a remainder of 0.3 cells.
     """
 
     name: ClassVar[str] = "opposite"
@@ -131,9 +133,9 @@ class OppositeCheck(Logged):
     def _compared(
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState] | None:
-        """Compare a projection with a kept one. None if they are neither opposite nor at the same angle, or if the step
-        that gives the velocity is so large that only a larger motion would show; the pair then waits for nearer
-        projections."""
+        """Compare a projection with a kept projection. Returns None in two cases: the projections are neither opposite
+        nor at the same angle; or the step that gives the velocity is so large that only a large motion would be
+        visible. In the second case the pair waits for projections that are nearer in angle."""
         one, grid = state.kept[at], context.grid
         assert one.after is not None and grid is not None
         turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
@@ -160,11 +162,11 @@ class OppositeCheck(Logged):
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
         """Largest likely error in px of a kept projection extrapolated by some steps, see `ViewFit.unsure`.
 
-        A large step shows other material, most of all if the sample is wider than the field of view. If the two
-        projections of the step differ by less than the smoothing, the error of the line through them comes from the
-        second derivative, which is at most √1.5 / SMOOTH of the first one in a picture smoothed like this. If they
-        differ by more, or if the sample moved between them by more than the rim turns, the velocity is not known and
-        the result is infinite.
+        After a large step, other material is visible, most of all if the sample is wider than the field of view. If the
+        two projections of the step differ by less than the smoothing, the error of linear extrapolation comes from the
+        second derivative, which in a picture with this smoothing is at most √1.5 / SMOOTH times the first derivative.
+        If the projections differ by more, or if the sample moved between them by more than the rim rotates, the
+        velocity is not known, and the result is infinite.
         """
         if min(abs(steps), abs(steps - 1)) < BESIDE - 1:
             return 0.0
@@ -205,7 +207,7 @@ class OppositeCheck(Logged):
     def _moved(self, fit: ViewFit, row: int, other: str, context: ScanContext) -> Flag | None:
         assert context.grid is not None
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
-        # The first pair, which gave the axis, had projections off the sample's path, too.
+        # The projections of the first pair, which gave the axis, were also displaced.
         shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
         moves = self.warn, LEAST_SHIFT * cell, SIGMAS * fit.sigma, shaken
         limits = max(fit.unsure, *moves), max(fit.unsure, self.changed, LEAST_REMAINDER * cell)
@@ -229,7 +231,8 @@ class OppositeCheck(Logged):
 
 
 def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
-    """The kept views after one more view, which gives the last of them its velocity, or is kept itself."""
+    """The kept projections after one more projection. It either gives the last kept projection its velocity, or is kept
+    itself."""
     kept = tuple(one for one in kept if one.view.index != replaces)  # the replaced view had an alarm
     if kept and kept[-1].after is None:
         return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]
@@ -238,18 +241,20 @@ def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows
 
 
 def _with_nearer(one: Kept, view: CellView) -> Kept:
-    """The kept view with this one in place of the view after it, if there is one and this is nearer in angle."""
+    """The kept projection, with the given one as the projection that gives its velocity, if the given one is nearer in
+    angle than the present one."""
     before, away = (0.0 if each is None else abs(_folded(each.angle - one.view.angle)) for each in (one.after, view))
     return replace(one, after=view) if (BESIDE - 1) * before < away < before else one
 
 
 def _folded(angle: float) -> float:
-    """Between -pi and pi."""
+    """The same angle between -pi and pi."""
     return math.remainder(angle, 2 * math.pi)
 
 
 def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
-    """Best fit of the kept projection to a projection some steps later; None if that one has too little structure.
+    """Best fit of the kept projection to a projection some steps later; None if the later projection has too little
+    structure.
 
     Least squares for intensity, shift across and shift down, starting from the best whole number of cells.
     """
@@ -293,14 +298,16 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
     own = noise * (1 + (1 - steps) ** 2 + steps**2)
     remainder = math.sqrt(max(squares - own, 0.0) / structure) if squares > NOISY * own else 0.0
     sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][determined].min()))
-    # Both views begin at `first`: mirrored about the frame's middle their columns are elsewhere.
+    # Both projections begin at `first`: after mirroring about the middle of the frame, their columns are at other
+    # positions.
     off = first + last - grid.shape[1] if mirrored else 0
     places = 1 + (1 - steps) ** 2 + steps**2
     return ViewFit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
 
 
 def _nearest(before: Reals, now: Reals) -> int:
-    """Cells across by which `before` fits `now` best: least mean square of what is left in the columns they share."""
+    """Shift in cells across with which `before` agrees best with `now`: the mean square of the difference in the shared
+    columns is smallest."""
     cols = now.shape[1]
     reach = int(SEARCH * cols)
     strips = np.add.reduceat(np.stack([before, now]), np.arange(0, len(now), max(1, len(now) // 16)), axis=1)

@@ -1,8 +1,8 @@
 """Rules for darks and flats: saturated, without beam, uneven, never written, with beam in darks, or with the sample.
 
-Bad darks and flats spoil a volume as surely as bad projections. The same rules check them before the first projection
-is taken, in `validate`, and before a reconstruction. They compare each frame with its group, with the other groups and
-with the projections. To add a rule, write a predicate and a row in RULES.
+Bad darks and flats spoil a volume as surely as bad projections. The same rules check darks and flats in three places:
+before the first projection is taken, in `validate`, and before a reconstruction. The rules compare each frame with its
+group, with the other groups and with the projections. To add a rule, write a predicate and a row in RULES.
 """
 
 from __future__ import annotations
@@ -38,36 +38,40 @@ from drivers.base.frame import FrameKind
 from recon.base.arrays import MEDIAN
 from recon.base.setting import setting
 
-READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
-FEW = 20.0  # times the noise of the darks: the variance of flats with less intensity is mostly noise of the darks
-CHANGE_SIGMAS = 8.0  # standard deviations: a larger change between two flats is not noise
+READOUT = 3.0  # counts: noise of a pixel in a clean dark, from the readout alone
+# factor on the noise of the darks; if flats have less intensity, their variance is mostly noise of the darks
+FEW = 20.0
+CHANGE_SIGMAS = 8.0  # standard deviations; a larger change between two flats is not noise
 WORST = 0.01  # share of the places of a flat that may be zingers
-ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
+ZINGERS = 4  # number of places or pixels of a frame that zingers may hit, however small the frame is
 LIT = 0.02  # fraction of the intensity of the flats above which a dark counts as exposed to the beam
-LIT_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
-INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
+LIT_SIGMAS = 3.0  # in units of the noise of a place: the mean of a few places may be wrong by this
+# fraction of pixels that are not finite, beyond those of the best frame of the group, because dead pixels are in all
+# frames
+INVALID = 1e-3
 
 
 @dataclass(frozen=True)
 class ReferenceLimits:
     """Limits for darks and flats, with reasons.
 
-    saturated: as for an alarm of the check `saturation`. A cosmic ray hits a pixel or two; one pixel in a thousand is
-    too long an exposure.
+    saturated: the same as for an alarm of the check `saturation`. A cosmic ray hits one or two pixels; if one pixel in
+    a thousand is saturated, the exposure is too long.
 
     light_over_noise: a flat at the level of the darks has no beam. Three times the noise of a pixel is the smallest
     difference that can be detected.
 
-    light_gone: no drift, top-up or decay of the ring current takes half of the intensity. Flats are compared with the
-    brightest flats, and with the projections, which no sample makes brighter.
+    light_gone: no drift, top-up or decay of the ring current removes half of the intensity. Flats are compared with the
+    brightest flats, and with the projections, because no sample makes projections brighter.
 
-    uneven: flats are averaged, and projections are divided by the mean. 0.1 of intensity is 0.1 of line integral.
+    uneven: flats are averaged, and projections are divided by the mean. An error of the intensity by 0.1 is an error of
+    the line integral by 0.1.
 
     unlit: a beam may be narrower than the detector, but most of the detector must get beam.
 
-    light_in_darks: darks that were exposed have part of the level of the flats and, because of photon noise, part of
-    their variance. An offset raises only the level, readout noise only the variance. A fifth of both cannot come from
-    these.
+    light_in_darks: darks that were exposed have a part of the level of the flats and, because of photon noise, a part
+    of their variance. An offset raises only the level, and readout noise only the variance. So a fifth of the level
+    together with a fifth of the variance cannot come from offset or readout noise.
     """
 
     saturated: float = setting(1e-3, "fraction of the pixels of a flat that may be saturated", ge=0, lt=1)
@@ -84,10 +88,11 @@ DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
 
 
 def reference_findings(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
-    """Findings about darks and flats: errors if all of a kind are bad, warnings if good frames remain.
+    """Findings about darks and flats. They are errors if all darks, or all flats, are bad, and warnings if good frames
+    remain.
 
-    A rule does not see the frames that earlier rules found. If these were all frames of a kind, later rules are not
-    applied. Rules that compare flats with the sample need `cells`.
+    A rule does not look at frames that earlier rules have found. If earlier rules have found all frames of a kind,
+    later rules are not applied. Rules that compare flats with the sample need `cells`.
     """
     judged: list[Finding] = []
     for name, kind, rule in RULES:
@@ -113,7 +118,8 @@ def _in_words(name: str, kind: FrameKind, odd: list[BadFrames], severity: Severi
 
 
 def _with_holes(kind: FrameKind) -> Rule:
-    """Frames with numbers that are not finite, unlike the best of their group; or without any number."""
+    """Rule: frames with values that are not finite, although the best frame of their group has fewer; or without any
+    valid value."""
 
     def with_holes(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
         for group in evidence.of_kind(kind):
@@ -129,7 +135,7 @@ def _with_holes(kind: FrameKind) -> Rule:
 
 
 def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks of zeros, unlike most others."""
+    """Rule: darks in which all pixels are 0, although most other darks are not."""
     frames = evidence.frames(DARK)
     zero = [frame for frame in frames if not np.any(frame.blocks)]
     if zero and 2 * sum(not frame.constant for frame in frames) > len(frames):
@@ -137,7 +143,7 @@ def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
 
 
 def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks that are brighter than the darkest one of the same exposure, because beam only adds counts."""
+    """Rule: darks that are brighter than the darkest dark of the same exposure. (Beam only adds counts.)"""
     darks = evidence.frames(DARK)
     flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
     for exposure in {frame.rounded_exposure for frame in darks}:
@@ -156,10 +162,10 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
 
 
 def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with many saturated pixels, or with the same value in all pixels.
+    """Rule: flats with many saturated pixels, or with the same value in all pixels.
 
-    Flats that were written instead of exposed are allowed: a single value that means full intensity, such as 65535 with
-    darks of 0.
+    Flats that a program wrote instead of taking them are allowed: all pixels have a single value that means full
+    intensity, such as 65535 with darks of 0.
     """
     darks = evidence.frames(DARK)
     hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
@@ -183,7 +189,7 @@ def saturation_limit(pixels: int, limits: ReferenceLimits) -> float:
 
 
 def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats at the level of the darks."""
+    """Rule: flats that are at the level of the darks."""
     if not (darks := evidence.darkest):
         return
     noise, limit = max(pixel_noise(darks), darks[0].rounding), limits.light_over_noise
@@ -198,7 +204,7 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
 
 
 def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with much less intensity than the brightest group."""
+    """Rule: flats with much less intensity than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
         gone = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
@@ -211,7 +217,7 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
 
 
 def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats that are darker than projections, if both exposures are known, because a sample can only absorb."""
+    """Rule: flats that are darker than projections, if both exposures are known. (A sample can only absorb.)"""
     views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
     limit = 1 - limits.light_gone
     for group in evidence.of_kind(FLAT) if views else ():
@@ -225,8 +231,8 @@ def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[
 
 
 def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats whose intensity differs from most of their group, as a whole or locally. If half of them differ, all
-    flats."""
+    """Rule: flats whose intensity differs from that of most flats of their group, as a whole or locally. If half of the
+    flats differ, the finding is about all flats of the group."""
     base, limit = offset(evidence.darkest), limits.uneven
     for group in evidence.of_kind(FLAT):
         intensity = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
@@ -257,7 +263,7 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
 
 
 def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats in which most of the frame gets no beam."""
+    """Rule: flats in which most of the frame gets no beam."""
     for group in evidence.of_kind(FLAT):
         intensity = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
         score, limit = float((intensity < UNLIT * np.nanpercentile(intensity, BRIGHT)).mean()), limits.unlit
@@ -269,12 +275,12 @@ def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
 
 
 def _beam_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks with the level and the noise of an exposed frame."""
+    """Rule: darks with the level and the noise of an exposed frame."""
     flats = evidence.brightest
     for darks in evidence.of_kind(DARK) if flats else ():
         share = level(darks) / level(flats) if level(flats) > 0 else np.inf
         noise, of_flats = pixel_noise(darks), pixel_noise(flats)
-        known = of_flats > 0  # otherwise the frames have no noise, as only simulated ones
+        known = of_flats > 0  # otherwise the frames have no noise, which happens only in simulations
         variance = (noise / of_flats) ** 2 if known else share
         limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
@@ -307,4 +313,4 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("views_alike", FLAT, views_show_nothing),
     ("views_brighter", FLAT, views_brighter),
 )
-"""Each rule: its name, the kind of frames that it judges, and what yields those that it finds; in their order."""
+"""The rules, in their order: name, kind of frames that the rule checks, and the function that yields its findings."""

@@ -18,19 +18,25 @@ from recon.base.arrays import F32, F64, Mask
 
 SIGMAS = 8.0  # standard deviations of a place
 WORST = 99.0  # percentile of the places that counts, so that zingers do not
-LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
-CLIPPED = 0.2  # percent of the places at either end that a spread does not see: a zinger or two of a thousand cells
-BRIGHTER = 0.5  # flats hold the sample where places outshine them by this share of what the views take elsewhere
+# a flat resembles a projection if it differs from the projection by less than this share of its difference from other
+# flats
+LIKER = 0.5
+# percent of the places that are ignored at either end of a distribution: one or two zingers in a thousand cells
+CLIPPED = 0.2
+# flats show the sample if projections are brighter than flats at some places, by this share of the absorption elsewhere
+BRIGHTER = 0.5
 LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little: it is 1.09 of it or
 # more where flats are clean (60 simulated scans, 53 with other faults), and 0.01 with the sample in all flats
 AIR = 0.1  # line integral at the edges of the field from which they are no air
 EDGE = 16  # one column in so many, at each edge, is taken for air
-FEWEST, SHALLOW = 8, 10.0  # lit views at least, and percent of them that may be taken for the emptiest at a place
-OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of normal noise are further below, and are no matter
+# smallest number of projections with beam; percent of them that may count as having the least sample at a place
+FEWEST, SHALLOW = 8, 10.0
+OF_SHALLOW = 1.2816  # standard deviations; SHALLOW percent of normal noise are lower than this, and are not material
 
 
 def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[BadFrames]]:
-    """Rule: flats that resemble a view more than other flats, each within its group, or by whole groups."""
+    """Rule: flats that resemble a projection more than other flats. Flats are compared within their group, or as whole
+    groups."""
     return partial(_like_views, single=single)
 
 
@@ -42,7 +48,7 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
         [evidence.intensity(view) for view in views],
         [[evidence.intensity(flat) for flat in each] for each in groups],
     )
-    if single:  # of two flats each is the other one's only witness
+    if single:  # if there are only two flats, each can be compared only with the other one
         compared = [
             ([group[i]], own[i], [np.median(rest, axis=0)])
             for group, own in zip(groups, intensity, strict=True)
@@ -60,13 +66,13 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
                 f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {beside}, but only "
                 f"by {like:.2g} from the projection in frame {views[nearest].row}."
             )))  # fmt: skip
-    if len(odd) < len(compared):  # else a drift of the beam: each is like the views next to it
+    if len(odd) < len(compared):  # otherwise the beam drifts, and each flat is similar to the projections next to it
         yield from odd
 
 
 def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tuple[float, float, int] | None:
-    """How much a flat differs from the most similar other flat and from the most similar view, and the number of that
-    view; None if the flat does not show the sample."""
+    """The difference of a flat from the most similar other flat and from the most similar projection, and the number of
+    this projection. None if the flat does not show the sample."""
     lit = lit_places(np.maximum.reduce([image, *others]))
     off = _beyond_noise(min((log_ratio(image, other, lit) for other in others), key=_spread))
     like = [_beyond_noise(log_ratio(image, view, lit)) for view in views] if off > 0 else [np.inf]
@@ -75,15 +81,15 @@ def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tu
 
 
 class ViewsAboveFlats(NamedTuple):
-    """How much brighter projections are than each group of flats [group], at places with the least sample, as line
-    integrals.
+    """How much brighter projections are than each group of flats [group], as line integrals, at places with the least
+    sample.
 
     Attributes:
         brightest: at the places at which projections are brightest; 0 for an open beam.
         at_edges: at the left or right edge of the field of view, whichever is less.
         mismatch: largest local difference between each group and the group with the smallest `brightest`, apart
             from a factor.
-        limit: value that noise does not reach.
+        limit: value that noise alone does not reach.
     """
 
     brightest: F64
@@ -114,10 +120,11 @@ def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
 
 
 def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Groups of flats that are locally darker than projections although other flats are not: an object was in the beam.
+    """Rule: groups of flats that are locally darker than projections, although other flats are not, because an object
+    was in the beam.
 
-    If two groups differ in shape, the projections show which of them is the open beam, because a sample can only
-    absorb.
+    If two groups of flats differ in shape, the projections show which of them is the open beam, because a sample can
+    only absorb.
     """
     groups = evidence.of_kind(FrameKind.FLAT)
     if len(groups) < 2 or (above := _views_above_flats(evidence)) is None:
@@ -146,13 +153,13 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """All flats show the sample, also if it was at another angle than in any projection, or displaced.
+    """Rule: all flats show the sample. It may have been displaced, or at an angle that no projection has.
 
-    Two signs: (1) If the sample is in flats and projections, both absorb the same in total. Divided by the flats, the
-    projections then have no net absorption: they are brighter at some places by as much as they are darker at others.
-    (2) The rotating part of the sample absorbs more than the projections show relative to the flats. It is measured by
-    the differences between projections, with its smallest absorption set to zero, because these do not depend on the
-    flats. Air is assumed at the edges of rows.
+    There are two signs. (1) If the sample is in flats and projections, both have the same total absorption. The
+    projections, divided by the flats, then have no net absorption: they are brighter at some places by as much as they
+    are darker at others. (2) The rotating part of the sample absorbs more than the projections show relative to the
+    flats. The rotating part is measured from the differences between projections, which do not depend on the flats; its
+    smallest absorption is set to zero. Air is assumed at the edges of rows.
     """
     if (depth := _depth_over_air(evidence)) is None:
         return
@@ -179,7 +186,7 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """A finding if projections differ from flats and from one another only by noise."""
+    """Rule: projections differ from flats and from each other only by noise."""
     if (depth := _depth_over_air(evidence)) is None:
         return
     mean = depth.mean(axis=0)
@@ -196,7 +203,7 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 def _depth_over_air(evidence: Evidence) -> F64 | None:
     """Line integrals [view, row, col] of places, minus the straight line between the edges of each row.
 
-    Only of projections that have air at the edges. None if there are too few of them, or too few places.
+    Only projections with air at the edges are used. None if there are too few such projections, or too few places.
     """
     intensity = np.mean([evidence.intensity(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
     lit = lit_places(intensity)
@@ -234,7 +241,7 @@ def _spread(values: F32) -> float:
 
 
 def _beyond_noise(values: F32) -> float:
-    """Standard deviation of the values without the noise; 0 if all of it may be noise."""
+    """Standard deviation of the values without the part from noise; 0 if all of it may be noise."""
     spread, noise = _spread(values), place_noise(values)
     chance = 1 + SIGMAS * (2 / max(values.size, 1)) ** 0.5
     return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0

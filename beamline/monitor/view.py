@@ -1,14 +1,13 @@
 """A projection as the checks use it (`CellView`): line integrals on a coarse grid of square cells.
 
-It is computed once a frame, for all checks. The grid has 128 to 255 columns; the size of a cell in pixels follows from
-this number. A check therefore takes no more time for 2304 x 4096 pixels than for 128 x 512. Limits in cells mean the
-same fraction of the field of view for large and small frames.
+It is computed once per frame, for all checks. The grid has 128 to 255 columns, which determines the size of a cell in
+pixels. Therefore a check needs no more time for 2304 x 4096 pixels than for 128 x 512 pixels, and a limit in cells is
+the same fraction of the field of view for large and small frames.
 
-Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel
-of a
-preview block counts as a spot if it is much brighter than the means of all blocks around it, by more than noise
-explains. It must also be brighter than the same place in the previous frame, because hot pixels and bright gaps in the
-sample stay.
+Spots (zingers) are bright pixels of a single frame that a stray X-ray photon or a muon has hit. The largest pixel of a
+preview block counts as a spot under two conditions: it is brighter than the means of all blocks around it by more than
+noise explains; and it is brighter than the same place in the previous frame. (Hot pixels and bright gaps in the sample
+stay from frame to frame.)
 """
 
 from __future__ import annotations
@@ -27,31 +26,33 @@ from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
 
 COLS = 128  # least number of columns of cells, if the preview has as many blocks
-DARKEST = 1e-3  # transmission below which the logarithm would only show noise
+DARKEST = 1e-3  # transmission below which the logarithm would show only noise
 UNLIT = 0.05  # fraction of the bright part of the flats; a cell with less intensity counts as a cell without beam
 HOT = 0.1  # a cell is not used if its dark is higher than others by this fraction of the bright part of the flats
 EDGE = 2  # cells at each edge that show whether the sample ends within the field of view
 SEEN = 0.02  # least transmission of a place at which the beam is visible
 PLACES = (4, 16)  # parts of the field of view, vertical and horizontal; the brightest one counts as air
-COVERED = 0.1  # line integral at the brightest place; above it there is no air, or the beam got weaker earlier
+# line integral at the brightest place; if it is larger, there is no air, or the beam became weaker earlier
+COVERED = 0.1
 AIR = 0.05  # line integral up to which the edges are air, so that one projection is enough to measure a beam loss
 DRIFT_STEP = 0.02  # log intensity by which the beam may drift between two projections that show air
-EVEN, EVEN_NOISE = 0.2, 0.01  # allowed difference of edges and brightest place: fraction of the beam loss; noise
-BRIGHT = 90.0  # percentile of the cells of the flats that represents the bright part
+# allowed difference between the edges and the brightest place: as a fraction of the beam loss; in units of the noise
+EVEN, EVEN_NOISE = 0.2, 0.01
+BRIGHT = 90.0  # percentile of the cells of the flats that stands for the bright part
 
 CellValues = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class CellGrid:
-    """The cells of a frame, and their intensity without a sample."""
+    """The cells of a frame, and the intensity of each cell without a sample."""
 
     cell: int  # side of a cell in pixels
     blocks: int  # side of a cell in preview blocks
     dark: CellValues  # counts [row, col] of the cells without beam; 0 if there was no dark yet
     full: CellValues  # counts above the dark with beam and without sample, at the exposure of the flats
     lit: CellValues  # float32 [row, col], 1 if a cell gets enough beam, otherwise 0
-    flats: bool  # False without flats: `full` is then 1, and line integrals are relative
+    flats: bool  # False if there are no flats: `full` is then 1, and line integrals are relative
     # row_dark, col_dark: mean dark counts of each preview row and column
     row_dark: CellValues
     col_dark: CellValues
@@ -64,7 +65,7 @@ class CellGrid:
         return self.full.shape
 
     def region(self, row: float, col: float, height: float, width: float) -> PixelBox:
-        """Box in pixels of the cells around a position, within the grid."""
+        """Box in pixels that contains the cells around a position, within the grid."""
         rows, cols = self.shape
         top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
         below, right = min(rows, math.ceil(row + 0.5 + height / 2)), min(cols, math.ceil(col + 0.5 + width / 2))
@@ -85,7 +86,7 @@ class CellView:
     rows: CellValues
     cols: CellValues
     edges: tuple[float, float]  # line integrals at the left and right edge of the cells with beam, medians over rows
-    brighter: float = 0.0  # change of the log intensity since the previous projection; 0 if not known
+    brighter: float = 0.0  # change of the logarithm of the intensity since the previous projection; 0 if not known
 
 
 def grid_of(
@@ -159,8 +160,8 @@ def brightest_place(view: CellView, grid: CellGrid) -> float:
 def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
     """Logarithm of the loss of beam intensity since the flats, measured in air; NaN if no air was seen yet.
 
-    A weaker beam is weaker by the same factor everywhere: both edges and the brightest part are then equally dark, and
-    hardly darker than in the previous projection. A sample that enters the beam does not look like this.
+    If the beam becomes weaker, both edges and the brightest part become darker by the same factor, and hardly darker
+    than in the previous projection. If a sample enters the beam, this is not so.
 
     Args:
         before: the result for the previous projection.
@@ -182,7 +183,8 @@ def sums_of_places(image: CellValues, down: int, across: int) -> CellValues:
 
 
 def cell_noise(depth: CellValues, weight: CellValues) -> float:
-    """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
+    """Standard deviation of a cell of weight 1, from third differences along the columns, which edges of the sample
+    change little."""
     third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
     return median_deviation(third) / math.sqrt(20.0)
 
@@ -190,7 +192,7 @@ def cell_noise(depth: CellValues, weight: CellValues) -> float:
 def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, CellValues, CellValues]:
     """Means of the cells, and of each preview row and column."""
     rows, cols = (n // blocks for n in preview.shape)
-    # Faster than sums over a short axis.
+    # This is faster than sums over a short axis.
     lines = reduce(np.add, (preview[k : rows * blocks : blocks] for k in range(blocks)))
     cells = reduce(np.add, (lines[:, k : cols * blocks : blocks] for k in range(blocks))) / np.float32(blocks * blocks)
     return cells, preview.mean(axis=1), preview.mean(axis=0)
@@ -198,13 +200,13 @@ def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, Cell
 
 # factor on the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
 NOISES = 4.0
-RELATIVE = 0.25  # least excess of a spot, as a fraction of the intensity around it; weaker spots hardly show
+RELATIVE = 0.25  # smallest excess of a spot, as a fraction of the intensity around it; weaker spots are hardly visible
 SAMPLES = 4096  # number of blocks from which the usual excess is computed
 MOST = 4096  # largest number of spots whose positions are kept
 
 
 class Spots(NamedTuple):
-    """The spots of a frame: their number, and how many saturated pixels they hold."""
+    """The spots of a frame: their number, and the number of saturated pixels in them."""
 
     n: int = 0
     saturated: int = 0
@@ -216,7 +218,7 @@ NO_SPOTS = Spots()
 def spots_of(
     frame: Frame, digest: FrameDigest, before: FrameDigest | None, dark: NDArray[np.float32] | None, saturation: float
 ) -> Spots:
-    """The spots of a view or a flat, given the frame before it and the preview of the darks."""
+    """The spots of a projection or a flat, found with the previous frame and the preview of the darks."""
     if before is None or frame.kind is FrameKind.DARK or digest.preview.shape != before.preview.shape:
         return NO_SPOTS
     every = max(1, digest.preview.size // SAMPLES)
@@ -241,7 +243,7 @@ def _isolated(digest: FrameDigest, before: NDArray[np.float32], dark: float, noi
     far = np.flatnonzero(rise * rise > noises**2 * np.maximum(digest.preview - dark, 1))
     rows, cols = np.divmod(far, rise.shape[1])
     (beside, was), peaks = (_around(image, rows, cols) for image in (digest.preview, before)), digest.peaks[rows, cols]
-    around = np.delete(beside, 4, axis=1).max(axis=1)  # without the block itself
+    around = np.delete(beside, 4, axis=1).max(axis=1)  # the block itself is left out
     intensity = np.maximum(around - dark, 1)
     bright = peaks - around > np.maximum(noises * np.sqrt(intensity), RELATIVE * intensity)
     new = was.max(axis=1) - around < 0.5 * (peaks - around)

@@ -30,15 +30,19 @@ from beamline.monitor.view import (
 )
 from drivers.base.frame import Frame, FrameKind
 
-AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
-FORGET = 0.99  # a view: matter at the edge a quarter of a turn ago may come back
+# line integral at the edges up to which the whole sample counts as inside the field of view, as for the check `field`
+AIR = 0.1
+FORGET = 0.99  # weight per projection, because material that was at the edge 90° ago may come back
 NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a view to its neighbour
 SAME, SAME_ANGLE = 0.1, math.radians(0.02)  # planned steps, or rad where they are not known, within a view
-ONE_WAY = 0.75  # of the steps, which golden angles have not: 0.62
-EVERY, MOST = math.radians(5), 72  # between the views that are kept for others near them that come later; number
-DARK = 0.5  # least intensity left of a view; with less it is skipped, see the check `lost`
+ONE_WAY = 0.75  # share of the steps that must have one direction; golden angles have 0.62
+# angle between projections that are kept for later projections near them; number of kept projections
+EVERY, MOST = math.radians(5), 72
+DARK = 0.5  # smallest remaining intensity of a projection; a projection with less is skipped, see the check `lost`
 
-FLOODED = 0.1  # of the pixels more saturated than in the last good view: nine tenths of the places show the intensity
+# share of the pixels, beyond that of the last good projection, that may be saturated, because nine tenths of the places
+# measure the intensity
+FLOODED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +51,12 @@ class Monitor:
 
     Attributes:
         context: the scan, and the mean references of the latest groups.
-        checks: with their limits.
-        states: of the checks, in their order.
-        kind, counted: of the latest group of frames: their kind, and how many there are.
-        before: digest of the frame before; None before any.
-        recent: the last projections with beam, oldest first, each a neighbour of the one before in angle.
-        kept: a projection with beam every few degrees.
-        cut: usual line integral at the worse edge of the field, over the views so far.
-        shake: of the sample, over the views so far.
-        saturated: fraction of the pixels of the last good view; 1 before any.
+        checks: the checks with their limits. states: states of the checks, in their order. kind, counted: kind and
+            number of the frames of the latest group. before: digest of the previous frame; None before the first frame.
+            recent: the last projections with beam, oldest first; each is a neighbour in angle of the one before. kept:
+            a projection with beam every few degrees. cut: usual line integral at the worse edge of the field of view,
+            over the projections so far. shake: shaking of the sample, over the projections so far. saturated: fraction
+            of saturated pixels in the last good projection; 1 before the first projection.
     """
 
     context: ScanContext
@@ -72,8 +73,8 @@ class Monitor:
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
-    """Median step between these angles, in the order of their projections. NaN if they are not in one direction (golden
-    or random angles), because a projection is then not followed by its neighbour."""
+    """Median step between these angles, in the order of their projections. NaN if the steps are not in one direction
+    (golden or random angles), because then the next projection is not the neighbour in angle."""
     steps = np.diff(np.where(np.isfinite(angles), angles, np.nan))
     steps = steps[np.isfinite(steps) & (steps != 0)]
     share = float((steps > 0).mean()) if steps.size else 0.5
@@ -86,7 +87,7 @@ def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
 
 
 class CheckError(Exception):
-    """A check raised an exception, which is the cause of this error. `name`: name of the check."""
+    """A check raised an exception, which is the cause of this error. `name` is the name of the check."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the check {name} failed")
@@ -102,16 +103,17 @@ def without(monitor: Monitor, name: str) -> Monitor:
 def look(
     monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
 ) -> tuple[Monitor, tuple[Flag, ...]]:
-    """Check the next frame. Returns the monitor after it, and the flags. O(blocks of the preview).
+    """Check the next frame. Returns the monitor after this frame, and the flags. The effort is O(blocks of the
+    preview).
 
     Args:
-        begin: called with the name of each check before the check runs.
+        begin: function called with the name of each check before the check runs.
 
     Raises:
         CheckError: a check raised any exception, or did not return a `CheckResult`. The given monitor is unchanged:
             continue with the monitor `without` that check.
     """
-    if blank := digest.invalid_fraction == 1:  # only the check of pixels has something to say
+    if blank := digest.invalid_fraction == 1:  # only the check `pixels` can report anything
         monitor = replace(monitor, context=replace(monitor.context, view=None, change=None, spots=NO_SPOTS))
     else:
         digest = _without_holes(digest)
@@ -124,7 +126,7 @@ def look(
         begin(check.name)
         try:
             looks.append(_valid(check.look(state, frame, digest, monitor.context), check.name, frame.index))
-        except BaseException as error:  # a plug-in may call sys.exit
+        except BaseException as error:  # caught, because a plug-in may call sys.exit
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
             raise CheckError(check.name) from error
@@ -137,7 +139,7 @@ def look(
 def look_past_failures(
     monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
 ) -> tuple[Monitor, tuple[Flag, ...], tuple[str, ...]]:
-    """Look as `look` does, but switch a check that fails off; returns a sentence on each of these, too."""
+    """The same as `look`, but a check that fails is switched off. Also returns a sentence on each such check."""
     failures: list[str] = []
     while True:
         try:
@@ -153,7 +155,7 @@ def look_past_failures(
 
 
 def _without_holes(digest: FrameDigest) -> FrameDigest:
-    """The digest with the frame's median in blocks without a valid pixel."""
+    """The digest, in which blocks without a valid pixel have the median of the frame."""
     holes = np.isnan(digest.preview)
     if not holes.any():
         return digest
@@ -162,7 +164,7 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
 
 
 def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
-    """The result of a check, once it is known to be usable. Raises TypeError or ValueError for any other."""
+    """The result of a check, after a test that it can be used. Raises TypeError or ValueError if it cannot."""
     if not isinstance(answer, CheckResult) or type(answer.flag) not in (Flag, type(None)):
         raise TypeError(f"it returned {answer!r:.80}; expected a CheckResult with a Flag or None")
     if (flag := answer.flag) is None:
@@ -177,7 +179,7 @@ def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
     )
     if not typed or any(len(box) != 4 for box in boxes if box is not None):
         raise TypeError(f"a field of its flag has the wrong type: {flag!r:.300}")
-    if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= at:  # `_from` cuts what reaches too far back
+    if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= at:  # `_from` removes rows that are too early
         raise ValueError(
             f"its flag names the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected {name!r} and rows up "
             f"to {at}"
@@ -186,7 +188,7 @@ def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
 
 
 def _from(flag: Flag, row: int) -> Flag:
-    """The flag, without rows before this one."""
+    """The flag without rows before this row."""
     return flag if flag.first is None else replace(flag, first=max(flag.first, row))
 
 
@@ -206,16 +208,16 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     recent, last = monitor.recent, monitor.recent[-1] if monitor.recent else None
     steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step
     if last is not None and context.frames_per_view > 1 and _of_one_view(view.angle - last.angle, context.step):
-        # It shows what the first frame of its view showed.
+        # The frame shows the same as the first frame of its projection.
         return replace(monitor, context=replace(context, grid=grid, light_left=remaining_intensity(view, last, grid)))
     follows = math.isnan(steps) or NEAREST < steps < FARTHEST
-    if not follows:  # the view for comparison must be its neighbour in angle
+    if not follows:  # the projection to compare with must be the neighbour in angle
         recent, last = (), _nearest(view.angle, monitor.kept)
         context = replace(context, spots=spots._replace(n=0))
     left = remaining_intensity(view, last, grid)
     context = replace(context, grid=grid, light_left=left, follows=follows)
     if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
-        return replace(monitor, context=context)  # no measure for the views after it
+        return replace(monitor, context=context)  # not used as a measure for later projections
     return _with_good_view(replace(monitor, context=context, saturated=digest.saturated_fraction), view, recent, grid)
 
 
@@ -237,7 +239,7 @@ def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ..
 
 
 def _of_one_view(apart: float, step: float) -> bool:
-    """Radians between two frames up to which they belong to one view."""
+    """Largest difference in radians between two frames that belong to one projection."""
     return abs(math.remainder(apart, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
 
 

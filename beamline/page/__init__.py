@@ -1,1 +1,1 @@
-"""The web page on which a scan is watched: a separate process that reads the scan file and the log of events."""
+"""The web page that shows a scan. A separate process serves it, and reads the scan file and the log of events."""

@@ -1,4 +1,4 @@
-"""The newest run of a folder, for control systems: its values, each with a time and an alarm state."""
+"""The newest run of a folder for control systems: its values, each with a time and an alarm state."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.run_record import DIED
 
 Event = Mapping[str, Any]
-PERIOD = 0.5  # s between two looks at the run
-LONGEST = 1000  # characters of a text
+PERIOD = 0.5  # s between two readings of the run
+LONGEST = 1000  # largest number of characters of a text
 
 
 def published(name: str, about: str, default: Any, unit: str = "") -> Any:
-    """A field that control systems see under this name, with its meaning and unit as metadata."""
+    """A field that control systems get under this name, with its meaning and unit as metadata."""
     return field(default=default, metadata={"name": name, "about": about, "unit": unit})
 
 
@@ -67,7 +67,7 @@ class RunValues:
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
     pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
-    options: tuple[str, ...] = published("Options", "what can be measured after it: next, again, wide ...", ())
+    options: tuple[str, ...] = published("Options", "what can be measured after this pass: next, again, wide ...", ())
     option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
     option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")
     option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
@@ -89,8 +89,8 @@ class RunValues:
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
-    """The choice that an operator's word names. Raises ConfigError if it is not possible now."""
-    if word in values.options and word in [*Choice]:  # a log of another version may have others
+    """The choice that the operator's word stands for. Raises ConfigError if this choice is not possible now."""
+    if word in values.options and word in [*Choice]:  # the log of another version may have other choices
         return Choice(word)
     offer = f"possible: {', '.join(values.options)}" if values.options else "no pass has ended yet"
     raise ConfigError(f"{one_line(word)!r} cannot be chosen now; {offer}. Nothing was changed.")
@@ -107,7 +107,7 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a value was measured, s since the Unix epoch, and its alarm."""
+    """The time of a value in s since the Unix epoch, and its alarm."""
 
     time: float
     severity: Severity = Severity.NO_ALARM
@@ -116,11 +116,11 @@ class Stamp:
 
 @dataclass(frozen=True)
 class StampedValues:
-    """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
+    """Values of a run, each with a stamp from the event, or from the frame, that set the value last.
 
     Attributes:
         began: time stamp of values that were never set, in s since the Unix epoch.
-        unread: why the file can no longer be read, so that its values are old; "" if it can.
+        unread: why the file can no longer be read, so that its values are old; "" if the file can be read.
     """
 
     values: RunValues
@@ -129,7 +129,7 @@ class StampedValues:
     unread: str = ""
 
     def stamp(self, name: str) -> Stamp:
-        """The stamp of a value: INVALID if the value is unknown, or from a file that cannot be read."""
+        """The stamp of a value. It is INVALID if the value is unknown, or comes from a file that cannot be read."""
         value, stamp = getattr(self.values, name), self.stamps.get(name, Stamp(self.began))
         if value == -1 or value != value:
             return replace(stamp, severity=Severity.INVALID, message="not known")
@@ -138,11 +138,12 @@ class StampedValues:
         return stamp
 
     def after(self, lines: Iterable[str]) -> StampedValues:
-        """The values after these further lines of the log."""
+        """The values after further lines of the log."""
         values, stamps = self.values, dict(self.stamps)
         for line in lines:
             event = event_in(line) or {}
-            with suppress(LookupError, TypeError, ValueError, ArithmeticError):  # a field lacks or has another type
+            # a field is missing, or has another type
+            with suppress(LookupError, TypeError, ValueError, ArithmeticError):
                 at, taken, severity = float(event["time"]), event_values(values, event), _severity(event)
                 texts = {name: one_line(value, LONGEST) for name, value in taken.items() if isinstance(value, str)}
                 values = replace(values, **{**taken, **texts})
@@ -152,11 +153,11 @@ class StampedValues:
         return replace(self, values=values, stamps=stamps)
 
     def with_file(self, seen: Mapping[str, Any], angle: float, now: float) -> StampedValues:
-        """The same values with those of the file at the time `now`.
+        """The values, updated with those of the file at the time `now`.
 
         Args:
             seen: see `page.run_files.Reader.state`.
-            angle: of the newest frame, degrees.
+            angle: angle of the newest frame in degrees.
         """
         before, stored, status = self.values, int(seen["frames"]), str(seen["status"])
         frame = Stamp(now if seen["newest"] is None else float(seen["newest"]))
@@ -165,7 +166,8 @@ class StampedValues:
         taken["percent"] = 100.0 * stored / max(before.planned, stored) if before.planned > 0 else before.percent
         taken["skipped"] = seen.get("skipped_lines", 0)
         stamps = {**self.stamps, **dict.fromkeys(_OF_FILE, frame), "free": Stamp(now), "age": Stamp(now)}
-        ended = status == DIED or seen.get("over") or (not before.run and status != "running")  # as no log may say
+        # because no log may state it
+        ended = status == DIED or seen.get("over") or (not before.run and status != "running")
         if ended and status != before.state:
             why = one_line(seen["next"], LONGEST)
             taken |= {"state": status, "message": why, "wait": 0.0}
@@ -175,7 +177,7 @@ class StampedValues:
 
 _OF_FILE = ("stored", "percent", "angle", "free", "age")
 _ALARMED = ("state", "message", "last_flag", "warnings", "alarms")
-"""Values whose severity is that of the event that set them."""
+"""The values whose severity is that of the event that set them."""
 _OF_STATE: Mapping[str, Severity] = {
     State.FAILED: Severity.MAJOR, DIED: Severity.MAJOR, State.ABORTED: Severity.MAJOR,
     State.STOPPED: Severity.MINOR, State.PAUSED: Severity.MINOR, State.ASKING: Severity.MINOR,
@@ -184,7 +186,7 @@ _OF_LEVEL = {"alarm": Severity.MAJOR, "warn": Severity.MINOR}
 
 
 def _severity(event: Event) -> Severity:
-    """The severity of an event, by its state, level or kind."""
+    """The severity of an event, which depends on its state, level or kind."""
     kind = event["event"]
     if kind == "state":
         return _OF_STATE.get(event["state"], Severity.NO_ALARM)
@@ -194,7 +196,7 @@ def _severity(event: Event) -> Severity:
 
 
 class FollowedRun:
-    """The newest run of a folder, and each one that begins later. Calls may come from any thread.
+    """The newest run of a folder. If a newer run begins, the object follows that run. Calls may come from any thread.
 
     Args:
         now: a clock, s since the Unix epoch.
@@ -226,7 +228,7 @@ class FollowedRun:
     def look(self) -> StampedValues:
         """The current values."""
         with self._lock:
-            with suppress(ConfigError, DataError):  # no run so far
+            with suppress(ConfigError, DataError):  # there is no run so far
                 self.stamped = self._read()
             return self.stamped
 
@@ -249,16 +251,16 @@ class FollowedRun:
 
 
 def _newest_angle(recording: Recording) -> float:
-    """Degrees."""
+    """The angle in degrees."""
     angles = recording.columns(max(recording.progress().frames - 1, 0))["angle"]
     return math.nan if not angles or angles[-1] is None else float(angles[-1])
 
 
 def event_values(before: RunValues, event: Event) -> dict[str, Any]:
-    """The values that an event sets, by name; {} if it sets none. Unknown numbers are NaN.
+    """The values that an event sets, by name; {} if the event sets none. Unknown numbers are NaN.
 
     Raises:
-        LookupError, TypeError, ValueError, ArithmeticError: the event lacks a field, or one has another type.
+        LookupError, TypeError, ValueError, ArithmeticError: a field of the event is missing, or has another type.
     """
     values = _BY_KIND.get(str(event.get("event")))
     return {} if values is None else values(before, event)

@@ -1,4 +1,5 @@
-"""Recording: the page's data from a scan file, also a growing one. All calls must come from one thread (HDF5)."""
+"""Recording: the data of the page, from a scan file that may still be growing. All calls must come from one thread
+(HDF5)."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from beamline.storage.writers import layout
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Whole frames in a scan file, its status (`running`, `complete`, `stopped` or `failed`), and the time of the
-    newest frame, s since the Unix epoch; None without one."""
+    """Number of complete frames in a scan file, its status (`running`, `complete`, `stopped` or `failed`), and the time
+    of the newest frame in s since the Unix epoch (None if there is no frame)."""
 
     frames: int
     status: str
@@ -31,9 +32,7 @@ class ScanProgress:
 class Recording:
     """A scan file of this program, opened for reading while it may still be written.
 
-    Raises:
-        NotReadyError: the file is just being made.
-        DataError: the file is not a scan of this program.
+    Raises: NotReadyError: the file is being created. DataError: the file is not a scan of this program.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,7 +105,7 @@ class Recording:
     def picture(
         self, frame: int, region: TileRegion, *, corrected: bool
     ) -> tuple[NDArray[np.float32], TileRegion, int]:
-        """Part of a frame, binned to a tile: counts, or transmission.
+        """Part of a frame, binned to a tile, as counts or as transmission.
 
         Returns:
             Values, the region that they show, and their binning. Without darks and flats, `corrected` gives counts.
@@ -162,7 +161,7 @@ class Recording:
         return [_json_number(value) for value in values] if values.dtype.kind == "f" else values.tolist()
 
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Means of the first darks and flats, at most eight each; None until there are some of both."""
+        """Means of the first darks and flats, at most eight of each; None until there are darks and flats."""
         if self._dark_and_flat is None:
             table = frames_in(self._scan.file, frames)
             darks, flats = table.darks[:8], table.flats[:8]

@@ -1,4 +1,4 @@
-"""The watched run folder or scan file: its events, and one thread that reads HDF5."""
+"""The folder of the run, or the scan file, that the page shows: its events, and one thread that reads HDF5."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from beamline.storage.parts import joined_file_of
 from beamline.storage.run_record import DIED, read_record
 from beamline.storage.writer_lock import abandoned
 
-_ADVISED_FOR = 10.0  # s for which the next step holds: to find it opens files
-_AT_ONCE = 2**24  # bytes of a log that are read in one call
+_ADVISED_FOR = 10.0  # s for which the next step is valid, because finding it opens files
+_AT_ONCE = 2**24  # largest number of bytes of a log that are read in one call
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
 class Watched:
-    """Paths of a watched run."""
+    """Paths of a run that the page shows."""
 
     scan: Path  # the scan file
-    folder: Path | None  # of the run (of its newest part); None: a scan file alone
+    folder: Path | None  # log of the run (of its newest part); None: there is only a scan file
 
     @property
     def name(self) -> str:
@@ -42,7 +42,7 @@ class Watched:
 
     @property
     def run(self) -> Path | None:
-        """The folder of the run, which has the volume of all parts; None for a single scan file."""
+        """The folder of the run, which contains the volume of all parts; None for a single scan file."""
         return None if self.folder is None else run_of(self.folder.resolve())
 
     @property
@@ -52,8 +52,8 @@ class Watched:
 
 
 def watched(path: Path) -> Watched:
-    """The paths for a run folder, or a scan file; of a run whose parts are joined, the joined file. Raises DataError if
-    there is neither."""
+    """The paths for the folder of a run, or for a scan file. If the parts of a run are joined, the scan file is the
+    joined file. Raises DataError if there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
@@ -69,7 +69,7 @@ def watched(path: Path) -> Watched:
 
 
 def _joined(part: Path) -> Path:
-    """The file that joins a part of a run with the others, otherwise its own file."""
+    """The file with all parts of the run to which a file belongs, if there is one; otherwise the file itself."""
     joined = joined_file_of(part / SCAN) if is_below(run_of(part), JOINED) else None
     return part / SCAN if joined is None else joined[0]
 
@@ -101,14 +101,15 @@ class EventLog:
                 self._within = False
 
     def _add(self, line: bytes) -> None:
-        if b"\r" not in (line := line.strip()) and event_in(line) is not None:  # a carriage return ends a line of SSE
+        # a carriage return would end a line of server-sent events
+        if b"\r" not in (line := line.strip()) and event_in(line) is not None:
             self.lines.append(line.decode())
         else:
             self.skipped += 1
 
 
 class Reader:
-    """Opens scan and volume when they exist, and does all reading of HDF5 in one thread."""
+    """Opens scan and volume as soon as they exist, and reads HDF5 only in one thread."""
 
     def __init__(self, what: Watched) -> None:
         self.what, self.events = what, EventLog(what.folder)
@@ -117,7 +118,8 @@ class Reader:
         self._volume: ShownVolume | None = None
         self._volume_file: VolumeFile | None = None
         self._seen = 0, time.time()
-        self._advice: tuple[tuple[bool, float], str] = (False, 0.0), ""  # when it was looked up, and the next step
+        # the time at which the next step was determined, and the next step
+        self._advice: tuple[tuple[bool, float], str] = (False, 0.0), ""
         self._lock = threading.Lock()
 
     def close(self) -> None:
@@ -130,18 +132,19 @@ class Reader:
         self._thread.shutdown()
 
     def do(self, read: Callable[[Recording], _Result]) -> _Result:
-        """The result of `read`, called in the reading thread. Raises NotReadyError or DataError if the file cannot be
-        read.
+        """Call `read` in the reading thread, and return its result. Raises NotReadyError or DataError if the file
+        cannot be read.
         """
         return self._thread.submit(lambda: read(self._open())).result()
 
     def on_volumes(self, read: Callable[[Sequence[ShownVolume]], _Result]) -> _Result:
-        """The result of `read` for the newest volume only. Raises DataError if there is no volume."""
+        """The same for the newest volume. Raises DataError if there is no volume."""
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
-        """Frames in the file; its status, or that of the run once its process has ended (`over`), and then what can be
-        done next; seconds since the last frame, the time of the newest, free bytes, name of the newest volume."""
+        """The state of the run: number of frames in the file; status of the file, or of the run if its process has
+        ended (`over`), and in this case what can be done next; seconds since the last frame; time of the newest frame;
+        free bytes; name of the newest volume."""
         self.events.refresh()
         try:
             progress = self.do(Recording.progress)

@@ -28,20 +28,21 @@ from recon.base.volume import Grid
 from recon.prep.align import closest_pair, find_axis
 
 F32 = NDArray[np.float32]
-_REFERENCES = 8  # darks and flats that are averaged
-_VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
-_MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
-_CENTRED = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
-_BESIDE = 2  # rows next to that of the slice, by which the axis is found
-_MISSES = math.radians(2)  # by which a pair may miss 180 degrees
+_REFERENCES = 8  # largest number of darks and of flats that are averaged
+_VIEWS, _FAST_VIEWS = 360, 120  # largest number of projections for a slice; the same while a slider moves
+_MOST, _FAST_MOST = 768, 256  # largest number of voxels along a side of the slice
+# share of the columns: if the axis is farther from the detector's middle, the field of view of the slice is larger
+_CENTRED = 1 / 8
+_BESIDE = 2  # number of rows, next to that of the slice, from which the axis is found
+_MISSES = math.radians(2)  # largest difference of a pair from 180 degrees
 
 
 class _OverFlats:
-    """Projections [view, row, col] as transmission; without flats, as they are.
+    """Projections [view, row, col] as transmission; if there are no flats, as stored.
 
     Attributes:
-        dark, flat: means [row, col] of the first darks and flats; None without.
-        light: [view] mean of each projection that was read, else NaN.
+        dark, flat: means [row, col] of the first darks and flats; None if there are none. light: [view] mean intensity
+            of each projection that was read; NaN for the others.
     """
 
     dtype = np.dtype(np.float32)
@@ -75,13 +76,12 @@ class _OverFlats:
 
 
 class ShownScan:
-    """A scan, opened. All calls come from one thread (HDF5).
+    """An opened scan. All calls must come from one thread (HDF5).
 
     Attributes:
-        stack: its projections as slices: across projections, rows and columns.
+        stack: the projections of the scan as slices across projections, rows and columns.
 
-    Raises:
-        DataError: it has no projections.
+    Raises: DataError: the scan has no projections.
     """
 
     def __init__(self, source: ScanSource) -> None:
@@ -99,9 +99,9 @@ class ShownScan:
         self._source.close()
 
     def facts(self) -> dict[str, Any]:
-        """What the page shows of the scan: its format and angles, in a sentence; the kinds of frames that have a mean;
-        the mean intensity of each projection so far (null: not read). And two projections about 180 degrees apart, with
-        the difference of their angles from 180 degrees (null: the scan has no such pair)."""
+        """Facts about the scan for the page: a sentence on format and angles; the kinds of frames that have a mean; the
+        mean intensity of each projection so far (null: not read); and two projections about 180 degrees apart, with the
+        difference of their angles from 180 degrees (null: the scan has no such pair)."""
         known = self._degrees[np.isfinite(self._degrees)]
         angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
         over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"
@@ -124,7 +124,8 @@ class ShownScan:
         return mean
 
     def axis(self, row: int) -> dict[str, Any]:
-        """The axis from the file, or found from one row, in columns; where it comes from; and True if it may be tilted.
+        """The axis in columns, from the file or found from one row; a text on its source; and True if the axis may be
+        tilted.
 
         Raises:
             DataError: the projections cannot be corrected, or have no angles.
@@ -140,12 +141,13 @@ class ShownScan:
         return {"axis": round(axis, 2), "said": origin, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
-        """A part of the FBP slice of one row with this axis; `fast`: from fewer projections, with larger voxels.
+        """A part of the FBP slice of one row, with this axis. `fast`: use fewer projections and larger voxels.
 
         Raises:
             DataError: as `axis`.
         """
-        from recon.voxels.direct import direct  # here: it loads numba, which slices of projections do not need
+        # imported here, because it loads numba, which slices of projections do not need
+        from recon.voxels.direct import direct
 
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
@@ -154,7 +156,7 @@ class ShownScan:
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
         centred = abs(axis_col - (cols - 1) / 2) < _CENTRED * cols
-        n = cols if centred else whole.shape[1]  # else it jumps with each column
+        n = cols if centred else whole.shape[1]  # otherwise the slice would jump with each column
         shown, most = region.inside((n, n)), _FAST_MOST if fast else _MOST
         ends = (shown.first_row, shown.last_row), (shown.first_col, shown.last_col)
         step = -(-max(last - begin for begin, last in ends) // most)
@@ -196,7 +198,7 @@ class ShownScan:
         beside = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
         if row == self._row and beside <= self._beside:
             return
-        beside = 1 << (beside - 1).bit_length()  # a slider that moves on has its rows
+        beside = 1 << (beside - 1).bit_length()  # so that the rows are ready if the slider moves on
         near, far = row - beside, row + beside
         if (cone := self._cone) is not None:
             middle, half = (rows - 1) / 2, cols / 2 * (self._source.pixel_size_mm or 0.0) / cone[1]
@@ -216,7 +218,8 @@ class ShownScan:
         self._row, self._beside, self._band = row, beside, band
 
     def _line(self, data: F32, row: int, tilt_deg: float) -> F32:
-        """The row [view, col] of projections that are turned by the tilt, linear between pixels."""
+        """The row [view, col] of the projections after rotation by the tilt, with linear interpolation between
+        pixels."""
         if not tilt_deg:
             return data[:, row - self._band.start]
         turned = TiltAndLens(tilt_deg).of(self._scan)

@@ -1,5 +1,5 @@
-"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers, and the web answers
-with them.
+"""Tiles: parts of a picture, binned to the resolution of the screen and packed as 16-bit numbers; and the web responses
+that contain tiles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beamline.core.events import json_of
 from beamline.monitor.view import BRIGHT, UNLIT
 
 MOST = 1024
-"""Pixels that a tile has along an axis, at most."""
+"""Largest number of pixels of a tile along an axis."""
 _GREATEST = 65535
 
 
@@ -33,7 +33,7 @@ class TileRegion:
     last_col: int
 
     def inside(self, shape: tuple[int, int]) -> TileRegion:
-        """The part of the region inside a picture of this shape; at least one pixel."""
+        """The part of the region that is inside a picture of this shape, but at least one pixel."""
         rows, cols = shape
         first_row, first_col = min(max(self.first_row, 0), rows - 1), min(max(self.first_col, 0), cols - 1)
         last_row, last_col = min(max(self.last_row, first_row + 1), rows), min(max(self.last_col, first_col + 1), cols)
@@ -49,11 +49,12 @@ class TileRegion:
 
 
 def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float32]:
-    """Means of blocks of pixels, rows x columns; those left over at the last row and column are means of fewer."""
+    """Means of blocks of pixels, rows x columns. At the last row and column, the remaining pixels make smaller
+    blocks."""
     if factors == (1, 1):
         return pixels.astype(np.float32)
     (rows, cols), (down, across) = pixels.shape, factors
-    if rows % down == cols % across == 0:  # a third of the time
+    if rows % down == cols % across == 0:  # this takes a third of the time
         blocks = pixels.reshape(rows // down, down, cols // across, across)
         return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
     starts = [np.arange(0, n, factor) for n, factor in zip(pixels.shape, factors, strict=True)]
@@ -70,7 +71,8 @@ def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray
 
 @dataclass(frozen=True, eq=False)
 class PackedValues:
-    """Values as u2 [row, col]: a value is offset + scale * number; 65535 stands for one that is not finite."""
+    """Values as 16-bit unsigned numbers [row, col]. A value is offset + scale * number; 65535 stands for a value that
+    is not finite."""
 
     numbers: NDArray[np.uint16]
     offset: float
@@ -78,7 +80,7 @@ class PackedValues:
 
 
 def pack(values: NDArray[np.float32]) -> PackedValues:
-    """Values with 65534 steps from their least to their greatest."""
+    """Pack values in 65534 steps from the smallest to the largest value."""
     finite = np.isfinite(values)
     low, high = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (0.0, 0.0)
     scale = (high - low) / (_GREATEST - 1) or 1.0
@@ -87,7 +89,7 @@ def pack(values: NDArray[np.float32]) -> PackedValues:
 
 
 def tile_of(values: Any, facts: dict[str, Any]) -> Response:
-    """A header in JSON, its length before it as u4, and the numbers of `pack`."""
+    """The length of the header as a 32-bit number, the header in JSON, and the numbers of `pack`."""
     packed = pack(values)
     head = json_of({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
     padded = head.encode() + b" " * (-len(head.encode()) % 4)
@@ -96,7 +98,7 @@ def tile_of(values: Any, facts: dict[str, Any]) -> Response:
 
 
 class _Number(IntegerConvertor):
-    """An integer in a path; one with more digits cannot be the number of anything here."""
+    """Pattern of an integer in a path. A number with more digits cannot exist here."""
 
     regex = "[0-9]{1,9}"
 

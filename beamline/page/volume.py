@@ -1,5 +1,5 @@
-"""Volumes on the page: slices, histograms and profiles of volume files of any size, by the scales of a file that has
-them, else with the help of a coarse copy."""
+"""Volumes on the page: slices, histograms and profiles of volume files of any size. If a file has several resolutions,
+they are used; otherwise a coarse copy in memory is used."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from recon.base.greys import apart, grey_windows
 
 F32 = NDArray[np.float32]
 HELD = 2**29
-"""Bytes of the copy of a volume: all of it, or every n-th slice, binned by n."""
+"""Largest number of bytes of the copy of a volume. The copy has all voxels, or every n-th slice, binned by n."""
 FIRST_READ_BYTES = 2**26  # bytes of a volume that are read before the first picture
 SLICE_READ_BYTES = 2**28  # bytes of a file with scales that are read for one slice, at most
-_SAMPLE = 2_000_000  # values that show the histogram as well as all do
+_SAMPLE = 2_000_000  # number of values whose histogram is as good as that of all values
 _Piece = tuple[NDArray[Any], TileRegion, int]
 
 
@@ -42,10 +42,10 @@ def slices_of(path: Path, values: Any, held: int) -> ScaledSlices | CopiedSlices
 
 
 class ScaledSlices:
-    """Slices of a file with several scales: at the scale that a tile needs, or a coarser one if that would read more
-    than `SLICE_READ_BYTES`.
+    """Slices of a file with several resolutions. The resolution is that of the tile; if this would read more than
+    `SLICE_READ_BYTES`, a coarser one is used.
 
-    Methods as in CopiedSlices. All calls must come from one thread (HDF5).
+    The methods are those of CopiedSlices. All calls must come from one thread (HDF5).
     """
 
     bin, ready = 1, 1.0
@@ -79,10 +79,10 @@ class ScaledSlices:
 
 
 class CopiedSlices:
-    """Slices of a file whose slices across y and x are spread over all of it: these come from a copy in memory, those
-    across z from the file.
+    """Slices of a file in which slices across y and x are spread over the whole file. Slices across z come from the
+    file, and slices across y and x from a copy in memory.
 
-    The copy is read a slice at a time, first a few from all over the volume, then those between them.
+    The copy is read slice by slice: first a few slices from the whole volume, then the slices between them.
 
     Attributes:
         bin: binning of slices across y and x, at any zoom.
@@ -105,7 +105,7 @@ class CopiedSlices:
         return float(self._filled.mean())
 
     def read_more(self) -> bool:
-        """Read one more slice of the copy; False: there is no more."""
+        """Read one more slice of the copy; False if all slices are read."""
         z = next(self._waiting, None)
         if z is None:
             return False
@@ -114,7 +114,7 @@ class CopiedSlices:
         return True
 
     def part(self, axis: int, index: int, region: TileRegion) -> _Piece:
-        """A part of a slice that contains the region; the region of this part, and its binning."""
+        """A part of a slice that contains the given region, the region of this part, and its binning."""
         rows, cols = (n for i, n in enumerate(self._values.shape) if i != axis)
         shown, whole = region.inside((rows, cols)), TileRegion(0, rows, 0, cols)
         if axis == 0:
@@ -125,7 +125,7 @@ class CopiedSlices:
         return (values[shown.slices], shown, 1) if self.bin == 1 else (values, whole, self.bin)
 
     def sample(self) -> NDArray[Any]:
-        """A representative sample of the values, flat; all values if there are few."""
+        """A representative sample of the values as a one-dimensional array; all values if there are few."""
         step = max(1, math.isqrt(int(self._filled.sum()) * self._copy[0].size // _SAMPLE))
         return self._copy[:, ::step, ::step][self._filled].reshape(-1)
 
@@ -140,12 +140,13 @@ def _place(index: list[int]) -> tuple[int, int, int]:
 
 
 def _steps(finest: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Voxels of the finest scale in one, along each axis: powers of two, as `OmeZarr` writes them."""
+    """Number of voxels of the finest resolution in one voxel, along each axis: powers of two, as `OmeZarr` writes
+    them."""
     return tuple(2 ** round(math.log2(n / m)) for n, m in zip(finest, shape, strict=True))
 
 
 def _bytes_read(scale: ZarrScale, first: list[int], end: list[int]) -> int:
-    """Bytes read for a box: whole chunks."""
+    """Number of bytes that are read for a box, because whole chunks are read."""
     chunks = [-(-b // n) - a // n for a, b, n in zip(first, end, scale.chunk, strict=True)]
     return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk)
 
@@ -155,7 +156,7 @@ BINS = 256
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """A volume file at a certain time: the next snapshot replaces it."""
+    """A volume file at a certain time. The next snapshot replaces the file."""
 
     path: Path
     changed_ns: int
@@ -172,8 +173,8 @@ def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
 
 @dataclass(frozen=True, eq=False)
 class VolumeTile:
-    """Values, the region of the slice that they show, their binning, and the fraction of its voxels that has been
-    read."""
+    """Values, the region of the slice that they show, their binning, and the fraction of the voxels of the slice that
+    has been read."""
 
     values: F32
     region: TileRegion
@@ -185,12 +186,11 @@ class ShownVolume:
     """A volume file of any readable kind. All calls come from one thread (HDF5).
 
     Args:
-        held: bytes of the copy of a file without scales, see `slices_of`.
-        dataset: an array in a file with several; None: the volume.
-        record: what is shown instead of a volume in the file, whose voxels are sliced along z.
+        held: largest number of bytes of the copy of a file with a single resolution, see `slices_of`. dataset: name of
+            an array in a file with several arrays; None: the volume. record: object to show instead of a volume of the
+            file; its voxels are sliced along z.
 
-    Raises:
-        DataError: it cannot be read, or holds no volume.
+    Raises: DataError: the file cannot be read, or does not contain a volume.
     """
 
     def __init__(
@@ -224,13 +224,13 @@ class ShownVolume:
         self._file.close()
 
     def read_more(self) -> bool:
-        """Read one more slice for those across y and x; False: there is no more."""
+        """Read one more slice of the copy for slices across y and x; False if all slices are read."""
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, projections,
-        angles of the projections that are the slices (empty: it is a volume) and of those that a sector lacks, windows
-        of all times."""
+        """Facts about the volume: name; shape; voxel size along z, y, x with unit; unit of the values; method, and why
+        it is shown; number of projections; angles of the projections, if slices are projections (empty: it is a
+        volume); angles that no projection has; grey windows over all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
@@ -252,7 +252,7 @@ class ShownVolume:
         }
 
     def cut(self, axis: int, index: int, region: TileRegion, time: int = 0) -> VolumeTile:
-        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile; for a time series, at one of its times.
+        """Part of a slice across an axis (0: z, 1: y, 2: x), binned to a tile. For a time series, at one of its times.
 
         Raises:
             DataError: there is no such slice.
@@ -263,8 +263,9 @@ class ShownVolume:
         return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._at(time).ready)
 
     def histogram(self, time: int = 0) -> dict[str, list[float]]:
-        """Centres of 256 bins over the values, and voxels in each (of a sample, if there are many)."""
-        sample = self._sample(time).astype(np.float64)  # in float32 a wide range overflows
+        """Centres of 256 bins over the values, and the number of voxels in each bin (of a sample, if there are many
+        voxels)."""
+        sample = self._sample(time).astype(np.float64)  # in float32 a wide range would overflow
         ends = (float(sample.min()), float(sample.max())) if sample.size else (0.0, 1.0)
         counts, edges = np.histogram(sample, BINS, apart(*ends))
         return {"values": ((edges[1:] + edges[:-1]) / 2).tolist(), "voxels": counts.tolist()}
@@ -290,7 +291,7 @@ class ShownVolume:
         return list(np.asarray(self._parameters.get(name, ()), np.float64).tolist())
 
     def _at(self, time: int) -> ScaledSlices | CopiedSlices:
-        """The volume at one of the times; a volume that does not change is the same at all."""
+        """The volume at one of the times. A volume that is not a time series is the same at all times."""
         return self._slices[min(time, len(self._slices) - 1)]
 
     def _part(self, axis: int, index: int, region: TileRegion, time: int) -> tuple[NDArray[Any], TileRegion, int]:
@@ -303,7 +304,7 @@ class ShownVolume:
         return values[np.isfinite(values)]
 
     def _meant(self, values: NDArray[Any]) -> F32:
-        """The values that grey values represent."""
+        """The values that the grey values of a file stand for."""
         if self._grey is None:
             return np.asarray(values, np.float32)
         low, step = self._grey

@@ -1,4 +1,4 @@
-"""The choices after a pass: their cost, their expected improvement, and the one that the target asks for."""
+"""The choices after a pass: their costs, their expected improvements, and the choice that the target requires."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from recon.base.error_law import ErrorLaw, Gain
 
 @dataclass(frozen=True)
 class PassOption:
-    """One choice, with its cost and the predicted improvement in PSNR in dB (NaN: no error model is known).
+    """A choice, with its costs and the predicted improvement of the PSNR in dB (NaN: no error model is known).
 
     Attributes:
-        frames, seconds, bytes: the cost of the choice.
-        dose: its exposures of the sample, as a fraction of those of the whole plan.
+        frames, seconds, bytes: the costs of the choice. dose: number of exposures of the sample by this choice, as a
+            fraction of those in the whole plan.
         low, high: ends of the range of the improvement, as in `recon.base.error_law.Gain`.
     """
 
@@ -35,7 +35,7 @@ class PassOption:
 
 @dataclass(frozen=True)
 class ScanTarget:
-    """What a scan has to reach. None: no such target.
+    """The targets of a scan. None: there is no such target.
 
     Attributes:
         quality_db: dB of PSNR by which the volume may be worse than that of the whole plan.
@@ -60,7 +60,7 @@ def options(
 
     Args:
         law: the error model with `passes.n_frames` as its `n_views`; None: not known.
-        seconds_of: gives the duration of a block, from the present position of the stage.
+        seconds_of: function that returns the duration of a block, from the present position of the stage.
     """
 
     def option(choice: Choice, frames: int, seconds: float, **added: Any) -> PassOption:
@@ -85,15 +85,16 @@ def options(
 def choose(
     offered: Sequence[PassOption], target: ScanTarget, remaining: Gain, seconds: float, dose: float
 ) -> tuple[Choice, str]:
-    """The choice with the largest improvement per second until the target is met, and the reason.
+    """The choice with the largest improvement per second, as long as the target is not reached; and the reason for the
+    choice.
 
-    The next pass of the plan is chosen unless another choice is better by more than the uncertainty of both.
+    It is the next pass of the plan, unless another choice is better by more than the uncertainty of both.
 
     Args:
         offered: the possible choices, with known improvements.
         remaining: the improvement by the rest of the plan, see `remaining_gain`.
-        seconds, dose: time and dose of the scan so far, including what follows the passes in any case: offset
-            projections, darks and flats.
+        seconds, dose: time and dose of the scan so far, plus those of the frames that follow the passes in any case:
+            laterally offset projections, darks and flats.
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
@@ -122,8 +123,9 @@ def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
 def next_is_sure(
     passes: Passes, offered: Sequence[PassOption], target: ScanTarget, law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
-    """True if the error model of an earlier pass already decides: it chooses the next pass, and after this pass the
-    rest of the plan would certainly still improve the volume by more than the loss that the target accepts.
+    """True if the error model of an earlier pass is enough for the decision. It must choose the next pass; and after
+    this pass, the rest of the plan must still be certain to improve the volume by more than the loss that the target
+    accepts.
     """
     choice, _ = choose(offered, target, remaining_gain(passes, law), seconds, dose)
     later = remaining_gain(passes.after(Choice.NEXT), law)
@@ -131,13 +133,14 @@ def next_is_sure(
 
 
 def _excess(option: PassOption, target: ScanTarget, seconds: float, dose: float) -> str:
-    """Which limit of the target an option would exceed, in words; "" if none. Offset views come in any case."""
+    """A sentence on the limit of the target that an option would exceed; "" if it exceeds none. (Laterally offset
+    projections are taken in any case.)"""
     if option.choice is Choice.OFFSET:
         return ""
     seconds, percent = seconds + option.seconds, 100 * (dose + option.dose)
     if target.seconds is not None and seconds > target.seconds:
         return f"{option.choice} would end the scan after {seconds:.0f} s; the target allows {target.seconds:g} s"
-    if target.dose is not None and percent > 100.0000001 * target.dose:  # beyond rounding of the sum
+    if target.dose is not None and percent > 100.0000001 * target.dose:  # more than rounding of the sum
         return (
             f"with {option.choice} the scan would take {percent:.3g} % of the plan's dose; the target allows "
             f"{100 * target.dose:g} %"

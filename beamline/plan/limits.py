@@ -18,14 +18,14 @@ from drivers.stages.travel import least_interval
 
 @dataclass(frozen=True)
 class Scale:
-    """Radians at count 0, and radians a count, of a stage whose counts are linear in the angle."""
+    """Angle at count 0, and radians per count, of a stage whose counts are linear in the angle."""
 
     origin: float
     per_count: float
 
     @classmethod
     def of(cls, to_counts: Callable[[float], int]) -> Scale:
-        """The scale of a stage, from its own conversion: its direction and its zero."""
+        """The scale of a stage, computed from its own conversion. It contains direction and zero."""
         zero = to_counts(0.0)
         per_count = 2 * math.pi / (to_counts(2 * math.pi) - zero)
         return cls(-zero * per_count, per_count)
@@ -38,18 +38,18 @@ class Scale:
 class Flight:
     """Pulse trains of a fly scan."""
 
-    trains: tuple[TriggerTrain, ...]  # one a pass, in the order of the views
+    trains: tuple[TriggerTrain, ...]  # one train per pass, in the order of the projections
     interval: int  # whole counts between neighbouring pulses of a pass (positive)
     step: int  # whole counts between neighbouring angles of all passes together
     exact: float  # the step without rounding
     drift: float  # largest shift of a view by the rounding, radians
 
     def counts(self) -> NDArray[np.int64]:
-        """Count of every pulse, in the order of the views."""
+        """The count of every pulse, in the order of the projections."""
         return np.concatenate([train.start + train.interval * np.arange(train.n) for train in self.trains])
 
 
-_OTHER_SPAN = 0.05  # relative change of the span by rounding to counts that is accepted: 9 degrees of half a turn
+_OTHER_SPAN = 0.05  # accepted relative change of the range by rounding to counts: 9 degrees of 180
 
 
 def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) -> Flight:
@@ -91,7 +91,8 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
 
 
 def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int64], float]:
-    """Index of each angle on the lattice from the smallest to the largest, and the lattice's step in radians."""
+    """Index of each angle on the lattice from the smallest to the largest angle, and the step of the lattice in
+    radians."""
     low, high = float(angles.min()), float(angles.max())
     step = (high - low) / (angles.size - 1)
     if step > 0:
@@ -107,7 +108,7 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
 
 
 def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
-    """The longest runs of equal differences, one after another; a single count is a run of one."""
+    """The longest runs of equal differences, one after the other. A single count is a run of length one."""
     steps = np.diff(counts)
     ends = [*(1 + np.flatnonzero(np.diff(steps))).tolist(), steps.size]  # last count of each stretch of equal steps
     runs, at = list[TriggerTrain](), 0
@@ -119,18 +120,22 @@ def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
 
 
 MOST_PASSES = 100
-"""Most passes of a step scan: each holds the numbers of all views that it does not take."""
+"""Largest number of passes of a step scan, because each pass stores the numbers of all projections that it does not
+take."""
 ROOM = 1.1
-"""Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
+"""Required free disk space, as a multiple of the size of pixels and previews. The rest is for metadata of frames and
+for other files."""
 CLOSING = 20_000_000
-"""Bytes that closing a file may need, with its /exchange view. A scan pauses if its frames and these do not fit."""
+"""Bytes that may be needed to close a file, with its group /exchange. A scan pauses if its frames and these bytes do
+not fit on the disk."""
 MARGIN = 1.01
-"""Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
+"""Factor on the shortest trigger period of the camera. With a shorter period, jitter may lose frames (smallest camera
+margin of tomoscan)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanFacts:
-    """A plan with its computed speeds, times and sizes, to be checked."""
+    """A plan with its computed speeds, times and sizes, which the limits are checked against."""
 
     plan: ScanPlan
     views: Block
@@ -260,7 +265,7 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
 
 
 def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
-    """The trigger output must separate the pulses at any speed up to the full one."""
+    """Faults of the pulse spacing: the trigger output must separate the pulses at every speed up to the full speed."""
     least, unit = least_interval(stage), stage.interval_unit
     if interval % unit:
         yield (
@@ -290,13 +295,14 @@ def _limits(facts: PlanFacts) -> Iterator[str]:
 
 
 def _ways_within(facts: PlanFacts) -> Iterator[str]:
-    """What brings the stage between its limits: another start, less to go, or less taxi by a longer period."""
+    """Ways to keep the stage within its limits: another start, a smaller range, or a shorter run-up with a longer
+    period."""
     (low, high), stage, views = facts.reach, facts.stage, facts.views
-    down, up = stage.low - low, stage.high - high  # by which all may move
+    down, up = stage.low - low, stage.high - high  # by which all angles may be shifted
     if down <= up:
         start = math.degrees(float(facts.plan.angles[0]) + (down if down > 0 else up))
         yield f"begin at {start:.6g} degrees (scan.angles.start_deg)"
-    step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the taxi
+    step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the run-up
     if views.taxi and room > 2 * step:
         yield f"set scan.period_s >= {rounded(step / math.sqrt(2 * stage.acceleration * (room - 2 * step)), up=True):g}"
     yield "use a smaller range in scan.angles"

@@ -1,4 +1,4 @@
-"""Needs of scans: time, frames, bytes, dose, and what the operator has to do; of one scan, or of several together."""
+"""Needs of a scan, or of several scans together: time, frames, bytes, dose, and what the operator has to do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beamline.plan.plan import summed
 
 
 class OperatorRequest(NamedTuple):
-    """What a scan asks the operator to do, and how often at most."""
+    """What a scan asks the operator to do, and the largest number of times."""
 
     request: str
     times: int
@@ -23,9 +23,9 @@ class ScanNeeds:
     Attributes:
         parts: duration in s of each part: `dark`, `flat`, `projection`, `offset_view` (each with the moves of the
             stage), `warm_up`, `return`. The time for moving shutter and sample is not known.
-        n_frames, total_bytes: of the files, without projections that are taken again.
-        dose_gy: dose that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated.
-        volume_seconds: time from the last projection until the live volume is finished, in s, at most.
+        n_frames, total_bytes: number of frames and bytes of the files, without projections that are taken again.
+            dose_gy: dose in Gy that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated. volume_seconds:
+            longest time in s from the last projection until the live volume is finished.
         operator: what the operator is asked to do.
     """
 
@@ -38,16 +38,16 @@ class ScanNeeds:
 
     @property
     def duration(self) -> float:
-        """Seconds, without moves of shutter and sample."""
+        """Duration in s, without moves of shutter and sample."""
         return sum(self.parts.values())
 
     def data(self) -> dict[str, Any]:
-        """The values by name, for programs."""
+        """The values by name, as programs get them."""
         return {"duration": self.duration, **vars(self), "operator": [each._asdict() for each in self.operator]}
 
 
 def all_needs(scans: Iterable[ScanNeeds]) -> ScanNeeds:
-    """The needs of several scans together; a dose is that of the scans that state one."""
+    """The needs of several scans together. The dose is the sum over the scans that state one."""
     each = tuple(scans)
     doses = [one.dose_gy for one in each if one.dose_gy is not None]
     asked = summed(*(request for one in each for request in one.operator))
@@ -62,4 +62,4 @@ def all_needs(scans: Iterable[ScanNeeds]) -> ScanNeeds:
 
 
 NOTHING = ScanNeeds()
-"""The needs of a scan that cannot be computed."""
+"""Placeholder for the needs of a scan if they cannot be computed."""

@@ -1,4 +1,4 @@
-"""Passes: parts of the projections of a scan, and the choices of what to measure after each."""
+"""Passes: parts of the projections of a scan, and the choices of what to measure after each pass."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from beamline.plan.plan import Block
 
 
 class Choice(StrEnum):
-    """What is measured next."""
+    """A choice of what is measured next."""
 
     NEXT = "next"  # the next pass of the plan
-    AGAIN = "again"  # the angles of the last pass once more, in place of the last pass still to come
+    AGAIN = "again"  # the angles of the last pass once more, in place of the last pass that is still to come
     OFFSET = "offset"  # the offset views of the plan, now
     RETAKE = "retake"  # views that were flagged, or gave no frame, now
     ENOUGH = "enough"  # no further pass; offset views of the plan still come, as they set the density
@@ -28,13 +28,13 @@ class Choice(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """A scan at the end of a pass.
+    """The state of a scan at the end of a pass.
 
     Attributes:
         done: passes so far, oldest first; a pass that was taken again is listed twice.
         to_come: passes of the plan that are not taken yet.
         offset: blocks of offset projections that are not taken yet.
-        retakes: number of projections that can be taken again now.
+        retakes: number of projections that could be taken again now.
     """
 
     done: tuple[Block, ...]
@@ -49,7 +49,7 @@ class Passes:
 
     @property
     def n_planned(self) -> int:
-        """Number of frames of projections so far and to come, without retakes."""
+        """Number of frames of projections, so far and to come, without those that are taken again."""
         return self.n_frames + sum(block.n_to_take for block in self.to_come)
 
     @property
@@ -58,7 +58,8 @@ class Passes:
         return bool(self.to_come) and self.done[-1].n_to_take <= self.to_come[-1].n_to_take
 
     def after(self, choice: Choice) -> Passes:
-        """The scan after this choice is done. If the last pass cannot be taken again, AGAIN means NEXT."""
+        """The state of the scan after this choice was carried out. If the last pass cannot be taken again, AGAIN means
+        NEXT."""
         match choice:
             case Choice.AGAIN if self.may_repeat:
                 return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
@@ -68,11 +69,11 @@ class Passes:
                 return replace(self, offset=())
             case Choice.ENOUGH:
                 return replace(self, to_come=())
-        return self  # retakes do not belong to a pass
+        return self  # projections that are taken again do not belong to a pass
 
 
 def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
-    """A sentence on who ended a scan before the end of its plan, and why; "" if nobody did.
+    """A sentence on who ended a scan before the end of its plan, and why; "" if nobody ended it.
 
     Args:
         decisions: values of the events `next_chosen`, oldest first.
@@ -82,7 +83,7 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
     chosen = f" by the {by}" if by else ""
     chosen += (
         f": {why}".rstrip(".") if why and by != "operator" else ""
-    )  # the reason of the operator is only that the operator chose it
+    )  # if the operator decided, the reason only repeats this
     rest = f" {left} planned frames were not taken." if left else ""
     return (
         f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
@@ -92,18 +93,18 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:
-    """Triggers, counted within a block, of the frames that are taken in one of these parts of the block."""
+    """Triggers (counted within a block) of the frames that are taken in these parts of the block."""
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
 def passes_at_start(views: Block, size: int, choices: Iterable[str], offset: Iterable[Block] = ()) -> Passes:
-    """The passes of a scan at the end of its first pass, or, after these choices, at the end of the pass that it
-    resumes.
+    """The passes of a scan at the end of its first pass. With choices: at the end of the pass that the scan resumes
+    after these choices.
 
     The passes are those of the whole plan, even if earlier files contain some of their projections.
 
     Args:
-        size: frames of a pass, as of `pass_blocks`.
+        size: number of frames of a pass, as for `pass_blocks`.
     """
     passes = Passes((), pass_blocks(replace(views, stored=frozenset()), size), (*offset,))
     for choice in (Choice.NEXT, *choices):
@@ -112,9 +113,11 @@ def passes_at_start(views: Block, size: int, choices: Iterable[str], offset: Ite
 
 
 def pass_blocks(views: Block, size: int) -> tuple[Block, ...]:
-    """The passes of a block of views: one for each train, or `size` frames each in a step scan (0: all).
+    """The passes of a block of projections: one pass for each train; in a step scan, passes of `size` frames (0: all
+    frames).
 
-    Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
+    Each pass is the whole block, with the projections of other passes marked as stored. A pass without a projection to
+    take is left out.
     """
     size = size or views.n
     sizes = [train.n for train in views.trains] or [size] * -(-views.n // size)

@@ -1,4 +1,4 @@
-"""ScanPlan: the planned scan as a value, with its angles by each scheme."""
+"""ScanPlan: the planned scan as a value. The module also computes the angles of each scheme."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from recon.base.views import spread
 class Mode(StrEnum):
     FLY = "fly"
     STEP = "step"
-    STATIC = "static"  # darks and flats: the stage stands
+    STATIC = "static"  # darks and flats: the stage is at rest
 
 
 class Place(StrEnum):
@@ -32,7 +32,7 @@ class Place(StrEnum):
 
 @dataclass(frozen=True)
 class FieldPlan:
-    """Darks or flats: how many, where in the scan, and their own exposure in s."""
+    """Darks or flats: their number, when in the scan they are taken, and their exposure in s."""
 
     count: int
     at: Place
@@ -45,23 +45,24 @@ class ScanPlan:
 
     Attributes:
         angles: float64 [frame] radians, in the order of acquisition, with `frames_per_view` frames at each angle.
-        mode: FLY (pulses from the moving stage) or STEP (move, settle, expose).
-        exposure: exposure of a frame in s.
-        period: time in s between the projections of a fly scan (sets the speed); least time per projection of a step
-            scan.
+        mode: FLY (pulses from the moving stage) or STEP (move, settle, expose). exposure: exposure of a frame in s.
+            period: time in s between the projections of a fly scan, which sets the speed; shortest time per projection
+            of a step scan.
         settle: waiting time in s after each move of a step scan.
         darks, flats: plans of the darks and flats.
-        scheme: how the angles were chosen ("fixed", "golden", ...); only recorded.
+        scheme: how the angles were chosen ("fixed", "golden", ...). This value is only recorded.
         retake_share: largest fraction of the projections that are repeated after an alarm of the monitor; 0: none.
-        stored: triggers of projections, and after them of offset projections, that are not taken, because earlier files
-            of the scan have them or because the scan decided so.
-        choices: the choices (`passes.Choice`) in earlier files of the same scan after each of their passes, oldest
-            first. A continued scan is in the pass that the last choice started.
-        choice_due: True if that pass has ended, and no choice was made yet.
-        pass_views: number of projections in a pass of a step scan; 0: all. The passes of a fly scan are its trains.
+        stored: triggers of projections (followed by laterally offset projections) that are not taken: earlier files of
+            the scan have them, or the scan has decided to omit them.
+        choices: the choices (`passes.Choice`) that were made in earlier files of the same scan, one after each pass,
+            oldest first. A continued scan is in the pass that the last choice started. choice_due: True if this pass
+            has ended, and no choice was made yet.
+        pass_views: number of projections in a pass of a step scan; 0: one pass with all projections. (The passes of a
+            fly scan are its trains.)
         warm_up: time in s for which the scintillator is exposed each time the shutter opens, before frames with beam.
-        end_references: kinds of darks and flats that remain to be taken after the projections, if everything else
-            except offset projections is stored. None: all that are planned, before and after the projections.
+        end_references: kinds of darks and flats that must still be taken after the projections, for a scan in which
+            everything else (except laterally offset projections) is stored. None: all planned darks and flats are
+            taken, before and after the projections.
         offset_views: number of evenly spread angles at which one frame is taken with the sample shifted sideways to
             each of `offset_places` (mm).
         filter: position of the filter for all frames; None: leave it as it is.
@@ -103,19 +104,18 @@ class ScanPlan:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A sequence of frames taken in one way; blocks follow one another in the file.
+    """A sequence of frames that are taken in the same way. Blocks follow one another in the file.
 
     Attributes:
         kind: what the frames show.
         mode: how they are triggered.
         first_trigger: trigger of the first frame of the block, counted in the whole plan.
-        angles: float64 [frame] radians at whole counts, the angles of the rows. NaN in darks and flats until the
-            acquisition fills in the angle of the stage.
-        exposure, period: in s.
-        trains: for FLY, one pulse train per pass (interlaced plans have several).
+        angles: float64 [frame], angles of the rows in radians, at whole counts. For darks and flats they are NaN until
+            the acquisition fills in the angle of the stage.
+        exposure, period: times in s. trains: for FLY, one pulse train per pass (interlaced plans have several).
         speed: speed of the stage in rad/s during the pulses (FLY).
         taxi: run-up in radians before the first and after the last pulse (FLY).
-        stored: frames of the block, counted within it, that are not taken.
+        stored: frames of the block (counted within the block) that are not taken.
         aside: sideways shift of the sample in mm, as in `Frame.aside`.
     """
 
@@ -137,13 +137,13 @@ class Block:
 
     @property
     def n_to_take(self) -> int:
-        """Frames still to take."""
+        """Number of frames that must still be taken."""
         return self.n - len(self.stored)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """A plan computed for one stage and one camera. The scan may start exactly if `violations` is empty.
+    """A plan computed for one stage and one camera. The scan may start only if `violations` is empty.
 
     Attributes:
         blocks: in the order of acquisition.
@@ -153,14 +153,14 @@ class Timeline:
         total_bytes: size of the whole file, pixels and previews; without projections that are taken again.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
         step: the angular step in radians.
-        blur_px: how far a point at the detector's edge moves during an exposure, in pixels.
-        skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
+        blur_px: distance in pixels by which a point at the detector's edge moves during an exposure. skew_px: distance
+            in pixels by which this point moves between the exposures of the first and the last row (rolling shutter).
         violations: one sentence for each exceeded limit, with values and what to do.
         remarks: facts for the operator that do not exceed a limit.
         plan: the plan from which the timeline is computed.
-        retake_seconds: time for the largest number of projections that may be taken again.
-        parts: the parts of `duration` in s: of each kind of frames (with the moves before and between them), warm_up of
-            the scintillator, return of the stage.
+        retake_seconds: time for the largest number of projections that may be taken again. parts: the parts of
+            `duration` in s: each kind of frames (with the moves before and between them), the warm_up of the
+            scintillator, and the return of the stage.
     """
 
     blocks: tuple[Block, ...]
@@ -188,7 +188,8 @@ class Timeline:
 
     @property
     def in_beam(self) -> float:
-        """s for which the sample is in the beam: from the first move for projections to the last of their frames."""
+        """Time in s for which the sample is in the beam, from the first move for projections to the last frame of a
+        projection."""
         kinds = [block.kind for block in self.blocks if block.n_to_take and block.kind is not FrameKind.DARK]
         warm = "warm_up" if kinds[:1] == [FrameKind.PROJECTION] else ""
         return sum(self.parts.get(part, 0.0) for part in ("projection", "offset_view", warm))
@@ -200,7 +201,7 @@ class Timeline:
 
 
 def summed(*parts: tuple[str, float]) -> dict[str, float]:
-    """Seconds by part: equal parts are added up, and parts of 0 s are left out."""
+    """Seconds by part. Parts of the same name are added up, and parts of 0 s are left out."""
     sums = dict[str, float]()
     for part, seconds in parts:
         if seconds:
@@ -218,8 +219,8 @@ def _require(views: int) -> None:
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """Equal steps of span / views from `start`; the end is excluded, because it is the start again (or its mirror
-    image).
+    """Equal steps of span / views from `start`. The end is excluded, because it shows the same as the start (or its
+    mirror image).
 
     A negative span turns the other way.
     """
@@ -234,7 +235,7 @@ def sector(views: int, first: float, last: float) -> NDArray[np.float64]:
 
 
 def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Uniformly random over [start, start + span), sorted along the span, so that the stage passes it once."""
+    """Uniformly random angles in [start, start + span), sorted, so that the stage passes the range only once."""
     _require(views)
     return start + span * np.sort(rng.random(views))
 
@@ -242,8 +243,8 @@ def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.ran
 def pass_order(passes: int) -> NDArray[np.intp]:
     """The order in which the gaps of the first pass are filled: a permutation of 0 ... passes - 1.
 
-    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, leaving out values of
-    `passes` or more. Therefore each pass falls near the middle of the largest remaining gap, for any number of passes.
+    The order is the bit reversal (Mohan et al. 2015, TIMBIR) for the next power of two, without values that are
+    `passes` or more. Therefore each pass is near the middle of the largest remaining gap, for any number of passes.
     """
     _require(passes)
     bits = (passes - 1).bit_length()
@@ -256,7 +257,7 @@ def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.p
     """The `fixed` angles in `passes` rotations over the range. All rotations have the same direction, and each takes
     every passes-th projection.
 
-    All have the same direction, because the backlash of a motor would otherwise shift the projections of different
+    The reason for the same direction: the backlash of a motor would otherwise shift the projections of different
     rotations against each other.
 
     Raises:
@@ -276,15 +277,15 @@ def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.p
 
 
 def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """Projection k is at start + span * frac(k * GOLDEN) (Köhler 2004): the angles are well spread whenever the scan
+    """Projection k is at start + span * frac(k * GOLDEN) (Köhler 2004). So the angles are well spread whenever the scan
     ends."""
     _require(views)
     return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
 
 
 def one_way(angles: NDArray[np.float64]) -> bool:
-    """True if the angles [view] follow each other in one direction, so that they cover only a sector until the last
-    one."""
+    """True if the angles [view] follow each other in one direction, so that until the last projection they cover only a
+    sector."""
     steps = np.diff(angles)
     return bool((steps > 0).all() or (steps < 0).all())
 
@@ -324,7 +325,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Retake:
-    """A projection to repeat: its frame in the file (-1 if it has none), and its trigger among the projections."""
+    """A projection to take again: its frame in the file (-1 if it has none), and its trigger among the projections."""
 
     row: int
     trigger: int
@@ -336,9 +337,10 @@ def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
 
 
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
-    """float64 [view] radians that the stage turns from the trigger to the middle of each exposure.
+    """float64 [view], angle in radians by which the stage turns from the trigger to the middle of each exposure.
 
-    0 for a step scan. A stage at rest at this angle shows the same as the projection of a fly scan.
+    It is 0 for a step scan. A stage at rest at the angle of the trigger plus this angle shows the same as the
+    projection of the fly scan.
     """
     turned = np.zeros(views.n)
     first = 0
@@ -350,14 +352,14 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
 
 
 def offset_block(views: Block, n: int, aside: float) -> Block:
-    """The block of offset projections with the sample shifted by `aside`, at `n` evenly spread angles; the stage is
-    at rest."""
+    """The block of laterally offset projections, with the sample shifted by `aside`, at `n` evenly spread angles. The
+    stage is at rest during each exposure."""
     triggers = np.argsort(views.angles, kind="stable")[np.arange(n) * views.n // n]
     return replace(retake_block(views, triggers), kind=FrameKind.OFFSET_VIEW, aside=aside)
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:
-    """The block that repeats these projections, in this order; the stage is at rest during each exposure."""
+    """The block that takes these projections again, in this order. The stage is at rest during each exposure."""
     angles = views.angles[triggers] + middle_of_exposure(views)[triggers]
     period = views.exposure if views.trains else views.period
     return Block(FrameKind.PROJECTION, Mode.STEP, views.first_trigger + views.n, angles, views.exposure, period)

@@ -1,9 +1,10 @@
 """Timeline: speeds, times and sizes of a plan with one stage and one camera, as values and as lines for the operator.
 
-Darks and then flats come before the projections; offset projections, flats and then darks come after them. In a fly
-scan the stage rotates at step / period, rounded to whole counts per second (the block of projections has this period).
-It starts far enough before the first pulse to reach this speed (`taxi_angle`), and stops as far behind the last pulse.
-All passes have the same direction, and the stage returns at full speed between them.
+Before the projections, the scan takes darks and then flats. After the projections, it takes laterally offset
+projections, flats and then darks. In a fly scan the stage rotates at step / period, rounded to whole counts per second
+(the block of projections has this period). The stage starts far enough before the first pulse to reach this speed
+(`taxi_angle`), and stops at the same distance after the last pulse. All passes have the same direction, and the stage
+returns at full speed between them.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def work_out(
     preview_bin: int = 4,
     free_bytes: int | None = None,
 ) -> Timeline:
-    """Compute blocks, times, bytes and all violated limits. No device is used, so a dry run makes the same call.
+    """Compute blocks, times, bytes and all violated limits. No device is used, so a dry run calls the same function.
 
     The duration assumes that the stage starts at its zero and returns there, and does not include moves of shutter and
     sample.
@@ -56,9 +57,9 @@ def work_out(
     Args:
         to_counts: conversion of the stage from radians to whole counts.
         camera: timing of the camera with the exposure of the projections.
-        axis_col: column of the rotation axis (None: the middle), for blur and skew at the farther edge.
-        preview_bin: side in pixels of the blocks of the previews that the file also has.
-        free_bytes: free bytes of the disk; None: not checked.
+        axis_col: column of the rotation axis (None: the middle). Blur and skew are computed at the edge that is farther
+            from the axis. preview_bin: side in pixels of the blocks of the previews that the file also has. free_bytes:
+            free bytes of the disk; None: the disk space is not checked.
     """
     scale = Scale.of(to_counts)
     flight, broken = _flight(plan, to_counts)
@@ -101,12 +102,13 @@ def work_out(
 
 
 def row_bytes(shape: tuple[int, int], preview_bin: int) -> int:
-    """Bytes of a frame of this shape in the file, with its preview."""
+    """Number of bytes in the file for a frame of this shape, with its preview."""
     return math.prod(shape) * BYTES_PER_PIXEL + math.prod(preview_shape(shape, preview_bin)) * BYTES_PER_BLOCK
 
 
 def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight | None, list[str]]:
-    """The flight of a fly scan, or why it cannot be flown; None and no reason for a step scan."""
+    """The pulse trains of a fly scan, or the reason why the plan is not possible as a fly scan. For a step scan, None
+    and no reason."""
     if plan.mode is not Mode.FLY:
         return None, []
     try:
@@ -116,7 +118,8 @@ def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight |
 
 
 def _parts(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: CameraTiming) -> Mapping[str, float]:
-    """Seconds of the blocks by kind, of the way back to zero, and of the shutter's openings; without parts of 0 s."""
+    """Seconds for the blocks by kind, for the way back to zero, and for the warm-up at each opening of the shutter.
+    Parts of 0 s are left out."""
     *starts, end = _stands(blocks)
     placed = zip(blocks, starts, strict=True)
     return summed(
@@ -127,15 +130,17 @@ def _parts(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: 
 
 
 def _openings(blocks: Iterable[Block]) -> int:
-    """How often the shutter opens, which is closed at first."""
+    """Number of times that the shutter opens. It is closed at first."""
     lit = [False, *(block.kind is not FrameKind.DARK for block in blocks if block.n_to_take)]
     return sum(after and not before for before, after in pairwise(lit))
 
 
 def taxi_angle(speed: float, acceleration: float, step: float) -> float:
-    """Run-up in radians: whole angular steps, at least half a step more than reaching `speed` takes.
+    """Run-up in radians. It is a whole number of angular steps, and at least half a step longer than the distance
+    needed to reach `speed`.
 
-    ceil(accel distance / step + 0.5) steps, as tomoscan plans it; so the speed is steady at the first pulse.
+    The number of steps is ceil(acceleration distance / step + 0.5), as in tomoscan. So the speed is constant at the
+    first pulse.
     """
     return math.ceil(speed**2 / (2 * acceleration) / step + 0.5) * step
 
@@ -150,7 +155,8 @@ def move_seconds(distance: float, speed: float, acceleration: float) -> float:
 
 @dataclass(frozen=True)
 class FlyPass:
-    """A pass of a fly block: its first trigger within the block, its pulses, and where the stage starts and stops."""
+    """A pass of a block of a fly scan: its first trigger within the block, its pulses, and the angles at which the
+    stage starts and stops."""
 
     first: int
     train: TriggerTrain
@@ -159,9 +165,10 @@ class FlyPass:
 
 
 def passes(block: Block) -> list[FlyPass]:
-    """The passes of a fly block: each train, in several pieces if its frames need to be stored in between.
+    """The passes of a block of a fly scan. Each train is a pass; it is divided if some of its frames are already
+    stored.
 
-    The stage starts and stops `taxi` beyond the first and the last angle.
+    The stage starts `taxi` before the first angle and stops `taxi` after the last one.
     """
     return [flown for first, train in _firsts(block.trains) for flown in _pieces(block, first, train)]
 
@@ -185,7 +192,7 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
 
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float, start: float = 0.0) -> float:
-    """Duration of a block with its moves; `start`: the angle of the stage before it."""
+    """Duration of a block with its moves. `start` is the angle of the stage before the block."""
     if not block.n_to_take:
         return 0.0
     tail = block.exposure + camera.readout
@@ -232,7 +239,7 @@ def _blocks(
 def _static(
     kind: FrameKind, field: FieldPlan, row: int, plan: ScanPlan, camera: CameraTiming, *, stored: bool
 ) -> Block:
-    """References follow one another as fast as the camera can: its overhead per frame, on their own exposure."""
+    """Shortest period of darks or flats: their exposure plus the overhead of the camera per frame."""
     period = field.exposure + max(camera.min_period - plan.exposure, camera.readout)
     kept = frozenset(range(field.count)) if stored else frozenset[int]()
     return Block(kind, Mode.STATIC, row, np.full(field.count, np.nan), field.exposure, period, stored=kept)
@@ -243,7 +250,7 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     angles, stored = scale.angles(counts), plan.stored & {*range(counts.size)}
     if flight is None:
         return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period, stored=stored)
-    # A pulse generator's speed is a whole number of counts a second, which fixes the possible periods.
+    # The speed of the pulse generator is a whole number of counts per second, so only certain periods are possible.
     rate = max(1, round(flight.interval / plan.period))
     speed, period = rate * abs(scale.per_count), flight.interval / rate
     step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
@@ -259,12 +266,12 @@ def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
 def _reach(views: Block) -> tuple[float, float]:
     """The smallest and the largest angle of the stage's moves."""
     ends = np.array([(flown.start, flown.end) for flown in passes(views)]) if views.trains else views.angles
-    ends = ends if ends.size else views.angles  # all are stored
+    ends = ends if ends.size else views.angles  # all frames are stored
     return float(ends.min()), float(ends.max())
 
 
 def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: CameraTiming) -> float:
-    """Time of the largest number of repeated views, evenly spread, from the end of the views."""
+    """Time for the largest number of projections that may be taken again, evenly spread, after the last projection."""
     if not plan.retakes:
         return 0.0
     triggers = [retake.trigger for retake in spread_retakes([Retake(i, i) for i in range(views.n)], plan.retakes)]
@@ -275,14 +282,14 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
 
 
 def _end(block: Block) -> float:
-    """Where the stage stands after a block of views; at its zero where it takes none."""
+    """Angle of the stage after a block of projections; its zero if the block takes no frame."""
     if not block.n_to_take:
         return 0.0
     return passes(block)[-1].end if block.trains else float(block.angles[-1])
 
 
 def _stands(blocks: Iterable[Block]) -> list[float]:
-    """Angles at which the stage stands before each block, and after the last one."""
+    """Angles of the stage before each block, and after the last block."""
     moving = (block if block.n_to_take and block.mode is not Mode.STATIC else None for block in blocks)
     return [*accumulate(moving, lambda at, block: at if block is None else _end(block), initial=0.0)]
 

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 GreyWindow = tuple[float, float]
 DPI = 110
-_FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as that goes
-WIDTH = 8.6  # inches; the report's column
-LEFT, _TOP, _BELOW, GAP, BAR = 0.95, 0.35, 0.5, 0.15, 1.0  # inches around panels, between them, of a bar of colours
-LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
+_FINEST = 300  # pixels per inch for slices, which have one pixel per voxel if possible
+WIDTH = 8.6  # inches; width of the column of the report
+LEFT, _TOP, _BELOW, GAP, BAR = 0.95, 0.35, 0.5, 0.15, 1.0  # inches around panels, between panels, and for a colour bar
+LOOKED_AT = 256  # smallest number of slices along each axis, if the volume has more
 THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
 
 def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> GreyWindow:
-    """One range of grey values for all `arrays`: percentiles of all their values."""
+    """One range of grey values for all `arrays`, from percentiles of all of their values."""
     finite = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
     if finite.size == 0:
         return 0.0, 1.0
@@ -43,7 +43,7 @@ def show_image(
     stretched: bool = False,
     colours: str = "gray",
 ) -> AxesImage:
-    """Draw an image, row 0 at the top, in the colours of a window; a pixel is a square unless `stretched`.
+    """Draw an image, row 0 at the top, in the colours of a window. A pixel is square unless `stretched` is True.
 
     Args:
         extent: edges left, right, bottom, top; None: pixels.
@@ -56,8 +56,8 @@ def show_image(
 
 
 def finish(axes: Axes, across: str, down: str, title: str = "", size: float = 10.0, grid: bool = False) -> None:
-    """Add axis labels of `size` points, a title, a legend if curves have labels, and the lines of a `grid` under the
-    curves."""
+    """Add axis labels of `size` points, a title, and a legend if curves have labels. With `grid`, grid lines are drawn
+    under the curves."""
     axes.set_xlabel(across, fontsize=size, labelpad=1)
     axes.set_ylabel(down, fontsize=size, labelpad=1)
     axes.set_title(title, fontsize=size + 1, pad=4)
@@ -91,18 +91,18 @@ def draw_slice(
     colours: str = "gray",
     size: float = 10.0,
 ) -> AxesImage:
-    """Draw a slice with its axes, labels of `size` points; `window`, `colours`: as of `show_image`."""
+    """Draw a slice with its axes and labels of `size` points. `window` and `colours` are as for `show_image`."""
     from matplotlib.ticker import MaxNLocator
 
     across, down, edges = plane
     shown = show_image(axes, image, window, edges, image.shape[0] < THIN * image.shape[1], colours)
-    axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
+    axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the ticks of the next panel begin at its edge
     finish(axes, across, down, title, size)
     return shown
 
 
 def downwards(axis: str, unit: str) -> str:
-    """Label of a vertical axis whose numbers grow downwards: the text is turned, so that its arrow points down."""
+    """Label of a vertical axis whose numbers grow downwards. The text is rotated so that its arrow points down."""
     return f"← {axis} ({unit})"
 
 
@@ -113,12 +113,13 @@ def round_length(length: float) -> float:
 
 
 def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
-    """[z, y, x] of the centre of mass of the voxels brighter than half the grey window; the middle if none are."""
+    """[z, y, x] of the centre of mass of the voxels that are brighter than half the grey window. If there are none, the
+    middle of the volume."""
     steps = [max(1, n // LOOKED_AT) for n in data.shape]
     few = data[:: steps[0], :: steps[1], :: steps[2]]
     low, high = grey_window([few[::2, ::2, ::2]])
     marginals = [np.zeros(n) for n in few.shape]
-    for k, image in enumerate(few):  # a copy of all slices would be as large as they are
+    for k, image in enumerate(few):  # slice by slice, because a copy of all slices would need as much memory again
         bright = np.clip(image - (low + high) / 2, 0, high - low)
         marginals[0][k] = bright.sum(dtype=np.float64)
         marginals[1] += bright.sum(axis=1, dtype=np.float64)
@@ -136,7 +137,7 @@ def dpi_for(voxels: int, inches: float) -> float:
 
 
 def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = True) -> Figure:
-    """A figure of this width and height, inches; `constrained`: panels make room for their labels."""
+    """A figure with this width and height in inches. `constrained`: panels make room for their labels."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, dpi=dpi, layout="constrained" if constrained else None)
@@ -156,8 +157,8 @@ def panels(
     The grid is fixed, because a layout that measures labels needs as much time as the whole drawing.
 
     Args:
-        across, down: widths and heights of the panels, inches.
-        left, gap, right: next to the first column, between columns, and next to the last, inches; BAR: room for a bar.
+        across, down: widths and heights of the panels in inches. left, gap, right: space in inches to the left of the
+            first column, between columns, and to the right of the last column. BAR is the space for a colour bar.
     """
     width = left + sum(across) + gap * (len(across) - 1) + right
     height = _TOP + sum(down) + _BELOW * len(down)
@@ -172,7 +173,7 @@ def panels(
 
 
 def add_bar(figure: Figure, image: AxesImage, label: str, size: float = 10) -> None:
-    """A bar of the colours of an image, in the room on the right of `panels`; labels of `size` points."""
+    """A colour bar for an image, in the space to the right of `panels`, with labels of `size` points."""
     width, height = figure.get_size_inches()
     high = 0.8 * (height - _TOP - _BELOW)
     place = (width - BAR + 0.12) / width, (_BELOW + high / 8) / height, 0.16 / width, high / height
@@ -182,7 +183,7 @@ def add_bar(figure: Figure, image: AxesImage, label: str, size: float = 10) -> N
 
 
 def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
-    """A figure of one panel, inches."""
+    """A figure with a single panel; sizes are in inches."""
     figure = new_figure((width, height))
     return figure, figure.subplots()
 

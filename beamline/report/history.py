@@ -20,7 +20,7 @@ _WORDS = {"held_out": "held-out projections", "residual": "projections used"}
 
 
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
-    """The history of a fit as equally long arrays, by name; empty without a history.
+    """The history of a fit as arrays of equal length, by name; empty if there is no history.
 
     A quantity that was never measured (all NaN) is left out.
     """
@@ -57,7 +57,7 @@ class ResidualCurve:
 
     @property
     def decibels(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(s, -20 log10 of the residual) of the measurements above 0."""
+        """Time in s and -20 log10 of the residual, for the measurements above 0."""
         known = (self.seconds > 0) & (self.residuals > 0)
         return self.seconds[known], -20 * np.log10(self.residuals[known])
 
@@ -70,7 +70,7 @@ def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve 
         return None
     seconds, residuals = np.asarray(arrays["seconds"], np.float64), np.asarray(arrays[name], np.float64)
     measured = np.isfinite(residuals)
-    if name == "held_out":  # measured now and then; the history repeats the last value in between
+    if name == "held_out":  # measured only sometimes; in between, the history repeats the last value
         measured &= np.concatenate(([True], np.diff(residuals) != 0))
     return ResidualCurve(_WORDS[name], seconds[measured], residuals[measured])
 
@@ -83,10 +83,12 @@ def views_grew(result: Reconstruction) -> bool:
 def quality_against_time(
     history: Mapping[str, NDArray[np.floating]],
 ) -> bytes:
-    """A fit against time: loss and residuals, the residual as dB, number of views and Gaussians.
+    """Curves of a fit against time: loss and residuals, the residual in dB, and the numbers of projections and
+    Gaussians.
 
     Args:
-        history: equally long "seconds", "loss", and if known "residual", "held_out", "n_views", "n_gaussians".
+        history: arrays of equal length: "seconds", "loss", and, if known, "residual", "held_out", "n_views",
+            "n_gaussians".
     """
     seconds = history["seconds"]
     growing = [
@@ -113,7 +115,7 @@ def quality_against_time(
 
 
 def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
-    """Loss and residuals, on a logarithmic axis where they fall to less than a tenth."""
+    """Loss and residuals. The axis is logarithmic if they fall to less than a tenth."""
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     for name, label, colour in (

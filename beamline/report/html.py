@@ -17,12 +17,12 @@ from beamline.core.files import write_whole
 from beamline.core.installed import version
 from beamline.report.metrics import METRICS, formatted
 
-FactTable = Mapping[str, str]  # Values for people, by name; a table of two columns on the page
+FactTable = Mapping[str, str]  # Values for people by name, which the page shows as a table of two columns
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG and what it shows. `title` is a short heading, `caption` a sentence that also serves as its alt text."""
+    """A PNG with its description. `title` is a short heading. `caption` is a sentence that is also the alt text."""
 
     title: str
     caption: str
@@ -35,13 +35,13 @@ class Report:
 
     Attributes:
         summary: one or two sentences, the result first.
-        metrics: by method, then by name of the metric (see METRICS); a method need not have all of them.
+        metrics: figures of merit by method, then by name (see METRICS). A method need not have all of them.
         frames: number of frames in the file and number of planned frames, e.g. "90/90".
-        flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
-        recipe: the options that also apply to other scans; empty: no options are shown.
-        done: what was found in the projections and what was done with them, if nothing is wrong.
+        flags: remarks of the monitor (also facts) and of the reconstruction; `scan` has the number of flagged frames.
+        recipe: the options that also apply to other scans; empty: no options are shown. done: sentences on what was
+            found in the projections and what was done with them, although nothing is wrong.
         footnotes: definitions that the metrics need.
-        volume: name of the volume's file, in the folder of the page; empty: it was not written.
+        volume: name of the file of the volume, in the folder of the page; empty: the volume was not written.
         live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.
     """
 
@@ -64,16 +64,15 @@ class Report:
 def write_report(path: Path, report: Report, *, replace: bool = False) -> None:
     """Write the page to `path`, completely or not at all.
 
-    Raises:
-        DataError: if `path` exists and `replace` is not set.
+    Raises: DataError: `path` exists and `replace` is False.
     """
     write_whole(path, to_html(report), replace=replace)
 
 
 def write_timed(path: Path, report: Report, label: str, elapsed: float) -> None:
-    """Write the report page again, with the duration of the whole command in the column of a method.
+    """Write the page of the report again, with the duration of the whole command in the column of a method.
 
-    This duration is known only after everything else is written. If the disk is full, the page stays as it is.
+    This duration is known only after everything else is written. If the disk is full, the page is not changed.
     """
     timed = {**report.metrics, label: {**report.metrics[label], "elapsed": elapsed}}
     with suppress(DataError):
@@ -93,7 +92,7 @@ def to_html(report: Report) -> str:
 
 
 def render(template: str, **values: object) -> str:
-    """The template of this name, filled in; values are escaped, and a missing one raises jinja2.UndefinedError."""
+    """The template of this name, filled in. Values are escaped, and a missing value raises jinja2.UndefinedError."""
     return _templates().get_template(template).render(version=version(), **values)
 
 

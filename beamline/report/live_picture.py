@@ -26,16 +26,19 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
-_GAP, _LINE, _LETTER = 14, 15, 9  # pixels: between panels, a line of text, a letter of a heading at most
-_SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
-_SIGMAS, _MOST = 5.0, 99.0  # least range of the differences, and the percentile that it reaches: shapes stay seen
+# pixels: space between panels, height of a line of text, largest width of a letter of a heading
+_GAP, _LINE, _LETTER = 14, 15, 9
+# pixels: the longest side of an image has this length or up to twice this length; a label needs the same space
+_SIDE = 256
+# smallest range of the differences, and the percentile that the range reaches, so that shapes stay visible
+_SIGMAS, _MOST = 5.0, 99.0
 _ORANGE = (255, 127, 14)
-_DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
+_DIAL = 0.08  # radius of the dial of missing rays, as a share of the side of an image
 
 
 @dataclass(frozen=True, eq=False)
 class PictureRow:
-    """Panels side by side under a heading; "" for none."""
+    """Panels side by side under a heading; "" if there is no heading."""
 
     heading: str
     panels: Sequence[_Panel]
@@ -66,7 +69,7 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
 
 @cache
 def _font(size: int, bold: bool = False) -> FreeTypeFont:
-    """A font with arrows, `size` pixels high."""
+    """A font that has arrows, `size` pixels high."""
     import matplotlib
     from PIL import ImageFont
 
@@ -78,19 +81,19 @@ def volume_rows(
     volume: Volume, view: F32, render: F32, heading: str, unit: str,
     drawn: tuple[Sequence[float] | None, Wedge | None] = (None, None),
 ) -> tuple[PictureRow, PictureRow]:  # fmt: skip
-    """Slices of a volume; the newest view, the projection of the volume at its angle, their difference.
+    """Slices of a volume; and the newest projection, the forward projection of the volume at its angle, and their
+    difference.
 
     Args:
-        volume: so far, 1/unit.
-        view, render: the newest view [row, col] and the same view of the volume, line integrals.
-        heading: of the whole, one line.
-        unit: of length, "mm" or "px".
-        drawn: z, y and x of the slices (None: through what is bright), and the wedge of angles without views.
+        volume: the volume so far, in 1/unit. view, render: the newest projection [row, col] and the forward projection
+            of the volume at the same angle, as line integrals. heading: heading of the picture, one line. unit: unit of
+            length, "mm" or "px". drawn: z, y and x of the slices (None: through the bright parts), and the wedge of
+            angles without projections.
     """
     place, unseen = drawn
     grid, data = volume.grid, volume.data
     if place is None:
-        k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
+        k, j, i = (1 + n // 100 for n in data.shape)  # the middle of the bright parts need not be exact to a voxel
         z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
     else:
         z, y, x = (int(np.abs(axis - to).argmin()) for axis, to in zip(grid.coordinates(), place, strict=True))
@@ -159,11 +162,9 @@ class _Panel:
     """An image, row 0 at the top, below two lines of text.
 
     Attributes:
-        pixels: of the screen [row, col].
-        limits: values that are black and white.
-        label, note: the two lines.
-        bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
-        unseen: for a dial of the rays in a slice across z that no view has taken yet; None: no dial.
+        pixels: pixels of the screen [row, col]. limits: values that are black and white. label, note: the two lines of
+            text. bar: width of a pixel and its unit, for a scale bar of a round length; None: no bar. unseen: for a
+            dial of the rays in a slice across z that no projection has measured yet; None: no dial.
     """
 
     pixels: F32
@@ -174,7 +175,7 @@ class _Panel:
     unseen: Wedge | None = None
 
     def draw(self, picture: Image, left: int, top: int) -> None:
-        """Draw it at an offset in pixels from the left and the top of the picture, where its text begins."""
+        """Draw the image into the picture. Its text begins at this offset in pixels from the left and the top."""
         from PIL import Image, ImageDraw
 
         draw = ImageDraw.Draw(picture)
@@ -185,7 +186,7 @@ class _Panel:
         picture.paste(Image.fromarray((255 * np.clip(shares, 0, 1)).astype(np.uint8)), (left, top))
         if self.bar is not None:
             pixel, unit = self.bar
-            length = round_length(pixel * self.pixels.shape[1] / 3)  # a third of the image at most
+            length = round_length(pixel * self.pixels.shape[1] / 3)  # at most a third of the image
             x, y = left + 6, top + self.pixels.shape[0] - 6
             draw.line((x, y, x + length / pixel, y), _ORANGE, 4)
             draw.text((x, y - 18), f"{length:g} {unit}", _ORANGE, _font(11, bold=True))
@@ -193,18 +194,19 @@ class _Panel:
             self._dial(draw, left + self.pixels.shape[1] - 6, top + 6, self.unseen)
 
     def _dial(self, draw: ImageDraw, right: int, top: int, unseen: Wedge) -> None:
-        """Rays in a slice (y downwards) that no view has taken yet, as a double wedge: edges along them are unknown."""
+        """Rays in a slice (y downwards) that no projection has measured yet, drawn as a double wedge. Edges along these
+        rays are unknown."""
         side = 2 * _DIAL * min(self.pixels.shape)
         place, (first, last) = (right - side, top, right, top + side), unseen.rays
         draw.ellipse(place, outline="#999999")
-        for turn in (0, 180):  # a ray runs both ways
+        for turn in (0, 180):  # a ray has two directions
             draw.pieslice(place, first + turn, last + turn, _ORANGE)
         draw.text((right - side - 4, top), "rays not yet measured", _ORANGE, _font(11), anchor="ra")
 
 
 def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:
-    """The images with pixels repeated, or means of several, so that the longest side is _SIDE pixels or more, less than
-    twice as many. Then how many pixels one became."""
+    """The images with repeated or averaged pixels, so that the longest side has _SIDE to 2 _SIDE pixels; and the factor
+    between the sizes."""
     longest = max(max(image.shape) for image in images)
     if longest < _SIDE:
         factor = math.ceil(_SIDE / longest)
@@ -214,7 +216,8 @@ def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:
 
 
 def _means(image: F32, step: int) -> F32:
-    """Means of step x step pixels, or of as many as there are; what is left over at the ends is left out."""
+    """Means of step x step pixels, or of fewer if the image is smaller. Pixels that do not fill a block at the ends are
+    left out."""
     rows, cols = (max(1, n // step) for n in image.shape)
     each = min(step, image.shape[0]), min(step, image.shape[1])
     cut = image[: rows * each[0], : cols * each[1]]

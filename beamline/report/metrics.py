@@ -1,4 +1,4 @@
-"""Figures of merit as people read them: label, unit, number of digits, and which direction is better."""
+"""Figures of merit for people: label, unit, number of digits, and the direction that is better."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a report, as PNG bytes: projections, slices, and what shows the quality of the volume."""
+"""Pictures of a report, as PNG bytes: projections, slices, and pictures of the quality of the volume."""
 
 from __future__ import annotations
 
@@ -44,13 +44,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-_PROFILE = 16.0  # voxels to either side of an edge
-_BESIDE = 0.5  # inches, of small labels
+_PROFILE = 16.0  # number of voxels on each side of an edge
+_BESIDE = 0.5  # inches; size of small labels
 _BESIDE_BAR = WIDTH - LEFT - BAR
 
 
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
-    """One corrected view [row, col] with the rotation axis, as the camera sees it: row 0 at the top, z downwards."""
+    """One corrected projection [row, col] with the rotation axis, as the camera sees it: row 0 at the top, z
+    downwards."""
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
@@ -67,7 +68,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
 
 
 def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
-    """All views of one detector row, in order of angle."""
+    """All projections of one detector row, in the order of their angles."""
     from matplotlib.ticker import MaxNLocator
 
     order = np.argsort(geometry.angles, kind="stable")
@@ -89,15 +90,13 @@ def orthogonal_slices(
     unit: str,
     kind: VoxelKind = VoxelKind.ATTENUATION,
 ) -> bytes:
-    """A row of three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers
+    """For each volume, a row of three orthogonal slices, all in one grey window; y and z downwards, as image viewers
     show them.
 
-    They intersect at the centre of mass of the bright voxels of the last volume.
+    The slices intersect at the centre of mass of the bright voxels of the last volume.
 
     Args:
-        volumes: by name, all on the same grid.
-        unit: of length.
-        kind: what the voxels are.
+        volumes: the volumes by name, all on the same grid. unit: unit of length. kind: physical quantity of the voxels.
     """
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
@@ -121,7 +120,7 @@ def _orthogonal_cuts(volume: Volume, centre: Sequence[int]) -> list[NDArray[np.f
 def _draw_cuts(
     row: Sequence[Axes], volume: Volume, at: Sequence[int], unit: str, name: str, window: GreyWindow, colours: str
 ) -> AxesImage:
-    """Draw the orthogonal slices through a voxel side by side, the first one under a name."""
+    """Draw the orthogonal slices through a voxel side by side. The first slice has the name as its heading."""
     centres, cuts = volume.grid.coordinates(), _orthogonal_cuts(volume, at)
     for i, (axes, image, plane) in enumerate(zip(row, cuts, planes(volume.grid, unit), strict=True)):
         place = f"{'zyx'[i]} = {centres[i][at[i]]:.3g} {unit}"
@@ -148,8 +147,8 @@ def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = Voxe
 def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """Profile of each volume through the sharpest edge of the last one, and a histogram of its values.
 
-    The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
-    voxel. Therefore single noisy voxels do not count as edges.
+    The line lies in the slice z of `orthogonal_slices`. It runs along the gradient at the point at which the gradient
+    is largest after a blur of a voxel. Because of the blur, single noisy voxels do not count as edges.
     """
     from matplotlib.ticker import MaxNLocator, NullFormatter
 
@@ -171,8 +170,9 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
         right.stairs(count / few.size, edges, lw=1.2, label=name)
     left.xaxis.set_major_locator(MaxNLocator(5))
     right.set_yscale("log")
-    right.yaxis.set_major_formatter("{x:g}")  # powers set as formulas take as long as the rest
-    right.yaxis.set_minor_formatter(NullFormatter())  # which ticks of a decade to name takes long, and none is named
+    right.yaxis.set_major_formatter("{x:g}")  # powers drawn as formulas take as long as all of the rest
+    # choosing which ticks of a decade to label takes long, so none is labelled
+    right.yaxis.set_minor_formatter(NullFormatter())
     edge = f"Edge at y = {y}, x = {x} of slice {z} (voxels)"
     finish(left, f"along the line ({unit})", kind.label(unit), edge, 9, grid=True)
     finish(right, kind.label(unit), "share of voxels", "Values", 9, grid=True)
@@ -180,12 +180,13 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
 
 
 def significance(image: NDArray[np.float32], grid: Grid, index: int, unit: str) -> bytes:
-    """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
+    """A slice [y, x] of the back-projected residual, in units of its noise. `at` is the number of the slice in the
+    volume."""
     return _map(image, grid, unit, f"Slice {index}", "standard deviations of the noise", (-8.0, 8.0), "RdBu_r")
 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
-    """The map [y, x] of density in empty voxels."""
+    """A map [y, x] of the density in voxels that the projections show to be empty."""
     window, title = (float(np.min(image)), float(np.max(image))), "Highest density where projections show nothing"
     return _map(image, grid, unit, title, kind.label(unit), window, "magma")
 
@@ -193,7 +194,7 @@ def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKin
 def _map(
     image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, window: GreyWindow, colours: str
 ) -> bytes:
-    """An image [y, x] of a slice of the grid, with a bar of its colours."""
+    """An image [y, x] of a slice of the grid, with a colour bar."""
     figure, axes = one_panel(5.4, 6.4)
     drawn = draw_slice(axes, image, planes(grid, unit)[0], title, window, colours)
     figure.colorbar(drawn, ax=axes, label=label, pad=0.02)
@@ -201,7 +202,7 @@ def _map(
 
 
 def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
-    """A slice through the bright voxels, with the directions of missing rays as sectors about the axis."""
+    """A slice through the bright voxels. Sectors about the axis show the directions of missing rays."""
     from matplotlib.patches import Wedge as Sector
 
     at, grid = bright_centre(volume.data)[0], volume.grid
@@ -211,7 +212,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
         first, last = wedge.rays
-        for turn in (0, 180):  # a ray runs both ways
+        for turn in (0, 180):  # a ray has two directions
             sector = Sector((0, 0), radius, first + turn, last + turn, facecolor=("tab:orange", 0.08))
             sector.set(edgecolor="tab:orange", linewidth=1.2)
             axes.add_patch(sector)
@@ -265,7 +266,7 @@ def change(
 
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
-    """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
+    """The mismatch of the projections for each candidate column of the rotation axis, with the chosen column."""
     figure, ((axes,),) = panels([WIDTH - LEFT - GAP], [1.95])
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
@@ -277,7 +278,8 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
 def pose_curves(
     angles_deg: NDArray[np.float64], shifts: NDArray[np.float64], turns_deg: NDArray[np.float64], unit: str
 ) -> bytes:
-    """Displacement (col, row) in `unit`, and roll and tilt in degrees, of the views [view, 2] against their angle."""
+    """Displacement (col, row) of the projections in `unit`, and their roll and tilt in degrees, plotted against the
+    angle."""
     curves = [(shifts, unit, ("along the columns", "along the rows")), (turns_deg, "degrees", ("roll", "tilt"))]
     shown = [curve for curve in curves if curve[0].any()]
     figure = new_figure((WIDTH, 2.4 * len(shown)))

@@ -32,18 +32,19 @@ if TYPE_CHECKING:
 
 COLUMNS = 4
 _CROP = 200
-"""Pixels a side: of larger slices the part is shown in which they differ most. Four columns of these are 800 pixels
-wide, which any screen shows pixel for pixel."""
+"""Pixels per side. Of larger slices, only the part in which they differ most is shown. Four columns of this size are
+800 pixels wide, which every screen can show without scaling."""
 
 
 class SliceSheet:
-    """The slice [y, x] of each volume by label: through the bright parts of the first one, in its grey window.
+    """The slice [y, x] of each volume, by label. Position and grey window are those of the bright parts of the first
+    volume.
 
     Args:
         down: name of the axis that points down, if the volumes are turned.
         across: number of slices side by side.
-        closer: show the middle slice instead, in a grey window for all slices; if slices are large, only the part in
-            which they differ most.
+        closer: True: show the middle slice instead, in one grey window for all slices. If slices are large, only the
+            part in which they differ most is shown.
     """
 
     def __init__(self, down: str = "y", across: int = COLUMNS, *, closer: bool = False) -> None:
@@ -53,7 +54,7 @@ class SliceSheet:
         self._drawn: set[tuple[str, str]] = set()
 
     def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
-        """Add a slice of the volume; of each family and method, only the first volume is shown."""
+        """Add a slice of the volume. For each family and method, only the first volume is shown."""
         if family and (family, method) in self._drawn:
             return
         if not self._shown:
@@ -62,14 +63,14 @@ class SliceSheet:
         self._shown[label] = volume[len(volume) // 2 if self._closer else self._at].copy()
 
     def labels(self, method: str = "") -> list[str]:
-        """The labels of slices that belong to no row, then those of a method ("": none)."""
+        """The labels of slices that do not belong to a row, then the labels of slices of a method ("": no method)."""
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
 
     def png(self, labels: Sequence[str], marks: Mapping[str, tuple[str, str]] | None = None) -> bytes:
-        """PNG of these slices, all in the size of the largest.
+        """PNG of these slices. All are drawn in the size of the largest slice.
 
         Args:
-            marks: a line below the label, and the colour of a frame, by label; empty: none.
+            marks: for each label, a line of text below it and the colour of a frame; empty: neither.
         """
         from matplotlib.patches import Rectangle
 
@@ -80,7 +81,7 @@ class SliceSheet:
         rows, cols = np.max([image.shape for image in images], axis=0).tolist()
         gap, down, lines = round(0.04 * cols), -(-len(labels) // self._across), 3 if marks else 2
         head = round(0.06 * lines * cols)
-        # One image: a panel for each slice takes ten times as long to draw.
+        # Drawn as one image, because a panel for each slice would take ten times as long.
         sheet = np.full((down * (rows + head), self._across * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
         figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
@@ -103,13 +104,14 @@ class SliceSheet:
 
 
 def _differ_most(images: Sequence[F32]) -> tuple[slice, slice]:
-    """The square in which images of one size differ most; all of them if they are small or differ in size."""
+    """The square in which images of equal size differ most. If they are small or differ in size, the whole images."""
     shape = images[0].shape
     if max(shape) <= _CROP or any(image.shape != shape for image in images):
         return slice(None), slice(None)
     size = tuple(min(_CROP, n) for n in shape)
     sums = ndimage.uniform_filter(np.ptp(np.stack(images), axis=0), size, mode="constant")
-    whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]  # squares in the image
+    # number of squares in the image
+    whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]
     at = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
     rows, cols = (slice(int(first), int(first) + n) for first, n in zip(at, size, strict=True))
     return rows, cols
@@ -117,15 +119,14 @@ def _differ_most(images: Sequence[F32]) -> tuple[slice, slice]:
 
 @dataclass(frozen=True, eq=False)
 class FlaggedFrame:
-    """A frame for the sheet.
+    """A frame on the sheet.
 
     Attributes:
         image: [row, col] counts, binned if there are many.
         extent: (rows, cols) of the whole frame, in pixels of the detector.
         reasons: a line for each flag.
-        regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
-            the last; each with the colour of its box.
-        colour: of the frame around it.
+        regions: regions of the flags, in pixels of the detector (first row, row after the last, first column, column
+            after the last), each with the colour of its box. colour: colour of the border around the image.
     """
 
     image: NDArray[np.float32]
@@ -137,7 +138,8 @@ class FlaggedFrame:
 
 
 def contact_sheet(frames: Sequence[FlaggedFrame], window: GreyWindow | None = None, title: str = "") -> bytes:
-    """The frames as PNG, row 0 at the top, in one grey window (None: by all of them), with a box around each region."""
+    """The frames as PNG, row 0 at the top, in one grey window (None: computed from all frames), with a box around each
+    region."""
     from matplotlib.patches import Rectangle
 
     down = -(-len(frames) // COLUMNS)
@@ -166,8 +168,8 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
     """Mean darks and flats as PNG, row 0 at the top, each in its own grey window with its scale.
 
     Args:
-        images: [row, col] by title, counts or ratios, binned if they are large.
-        shape: (rows, cols) of the detector.
+        images: the images [row, col] by title, as counts or ratios, binned if they are large. shape: (rows, cols) of
+            the detector.
     """
     rows, cols = shape
     width = WIDTH / max(len(images), 2) - 1.3
@@ -181,7 +183,8 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
 
 
 def _show(axes: Axes, image: NDArray[np.float32], window: GreyWindow, shape: tuple[int, int]) -> AxesImage:
-    """Draw an image of the whole detector, whose rows and columns `shape` gives, in its pixels."""
+    """Draw an image of the whole detector. Its axes are in pixels of the detector, whose rows and columns are
+    `shape`."""
     rows, cols = shape
     edges = -0.5, cols - 0.5, rows - 0.5, -0.5
     return show_image(axes, image, window, edges, stretched=rows < 0.15 * cols)

@@ -27,14 +27,13 @@ from drivers.base.protocols import CameraSettings, Devices
 
 
 class Acquisition:
-    """The frames of one scan. `frames()` may be called once; `missing` can be read at any time.
+    """Takes the frames of one scan. `frames()` may be called once; `missing` can be read at any time.
 
     Args:
-        timeline: without violations.
-        camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
-        settle: s to wait after each move of a step scan.
-        sink: gets the events `BlockStarted` and `BlockDone`, and warnings.
-        supervision: callbacks that may pause the scan, or end it before its first projection; they get its states.
+        timeline: timeline of the scan; it must have no violations. camera_settings: roi, binning and readout; each
+            block sets its own exposure and trigger. settle: waiting time in s after each move of a step scan. sink:
+            gets the events `BlockStarted` and `BlockDone`, and warnings. supervision: callbacks that may pause the
+            scan, or end it before its first projection. They also get the states of the scan.
     """
 
     def __init__(
@@ -55,32 +54,34 @@ class Acquisition:
         )
         self._done: list[BlockTally] = []
         self.recovered = 0
-        """Views that gave no frame at first, but when they were repeated."""
+        """Number of projections that gave no frame at first, but gave one when they were taken again."""
         self.unsafe = False
-        """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
+        """True if a device failed while the instrument was made safe. Stage, camera or shutter may still be as during
+        the scan."""
 
     @property
     def n_frames(self) -> int:
-        """Frames delivered so far."""
+        """Number of frames delivered so far."""
         return sum(taken.frames for taken in self._done)
 
     @property
     def missing(self) -> list[int]:
-        """Triggers, counted over the whole plan, that gave no frame so far; triggers not yet reached do not count."""
+        """Triggers (counted over the whole plan) that gave no frame so far. Triggers that were not reached yet do not
+        count."""
         return [taken.block.first_trigger + i for taken in self._done if not taken.again for i in taken.missing]
 
     def frames(self) -> Generator[Frame, None, None]:
-        """Frames, each with its own memory, its row in the file, its trigger and its angle.
+        """Yields the frames, each with its own memory, its row in the file, its trigger and its angle.
 
-        At the end, also when the caller closes the iterator, the stage is stopped, camera and trigger
-        output are disarmed and the shutter is closed. Sample and stage return to where they were unless the scan was
+        At the end, or when the caller closes the iterator, the stage is stopped, camera and trigger output are
+        disarmed, and the shutter is closed. Sample and stage return to their first positions, unless the scan was
         aborted or a device failed. A lost frame does not end the scan; the error is raised after the last frame.
 
         Raises:
-            LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
-            ScanStopped: a stop was requested, and the scan has ended in order.
+            LedgerError: frames are missing, or some frames have no trigger. All other frames were delivered with their
+                angles. ScanStopped: a stop was requested, and the scan has ended cleanly.
             ReferencesError: no projection was taken, because supervision found that darks or flats cannot be used.
-            ScanAborted: an abort, or a stop before the first frame.
+            ScanAborted: an abort was requested, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
         home = self._devices.stage.position()
@@ -90,11 +91,11 @@ class Acquisition:
             devices_work = all_taken = True
         except ScanAborted as aborted:
             raise ScanAborted(f"{aborted}{discrepancies(self._done)}") from None
-        except GeneratorExit:  # closed by the caller; no device has failed
+        except GeneratorExit:  # the caller closed the iterator; no device has failed
             devices_work = True
             raise
         except (BeamlineError, DeviceError) as ended_by:
-            devices_work = isinstance(ended_by, DataError)  # then the disk failed, not a device
+            devices_work = isinstance(ended_by, DataError)  # in this case the disk failed, not a device
             self._warn_discrepancies()
             raise
         finally:
@@ -128,7 +129,7 @@ class Acquisition:
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            # Offset projections may have been taken already, if they were chosen after a pass.
+            # Laterally offset projections may have been taken already, if they were chosen after a pass.
             if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
                 continue
             if block.kind is FrameKind.OFFSET_VIEW:
@@ -141,11 +142,12 @@ class Acquisition:
                 yield from self._retake(block)
 
     def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Generator[Frame, None, bool]:
-        """Take the projections in passes, with a decision after each; True if they are enough. What nobody chose is
-        left to the plan.
+        """Take the projections in passes, with a decision after each pass. Returns True if the projections are enough.
+        If nobody decides, the scan follows its plan.
 
-        A resumed scan begins with the rest of the pass in which it was interrupted, and with projections that earlier
-        passes lack. If that pass had ended, its end is not reported again, and the decision comes next.
+        A resumed scan begins with the rest of the pass in which it was interrupted, and with projections that are
+        missing from earlier passes. If that pass had ended, its end is not reported again, and the decision comes
+        first.
         """
         plan, blocks = self._timeline.plan, [block for block in self._timeline.blocks if block.n_to_take]
         offset = [block for block in blocks if block.kind is FrameKind.OFFSET_VIEW]
@@ -153,7 +155,7 @@ class Acquisition:
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         blocks = [*([unfinished] if unfinished.n_to_take else []), *(offset if choice is Choice.OFFSET else [])]
-        if not self._done:  # no darks or flats were taken first, and the decision may come first
+        if not self._done:  # no darks or flats were taken before, and the decision may come first
             self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
             self._supervision.states.enter(_state_of(views))
         while True:
@@ -206,10 +208,10 @@ class Acquisition:
             self._devices.sample.back()
 
     def _retake(self, views: Block) -> Iterator[Frame]:
-        """Take the projections again that supervision wants repeated.
+        """Take again the projections that the supervision requests.
 
-        Each names the frame that it replaces, or has a missing trigger, which is then no longer missing. A repeated
-        projection without a frame is not an additional failure.
+        Each of them either names the frame that it replaces, or has a missing trigger, which then no longer counts as
+        missing. If a repeated projection gives no frame, this is not an additional failure.
         """
         retakes = self._supervision.retakes(missing_views(self._done))
         if not retakes:
@@ -236,18 +238,20 @@ class Acquisition:
             )
 
     def _offset(self, block: Block) -> Iterator[Frame]:
-        """Take offset projections, at angles of the first projections. They replace nothing."""
+        """Take laterally offset projections, at angles of the first projections. They do not replace other
+        projections."""
         views = self._timeline.views
-        # every pass has the same direction; a single pulse has none
+        # every pass has the same direction; a single pulse has no direction
         beyond = float(max(middle_of_exposure(views), key=abs))
-        first = block.first_trigger - views.first_trigger  # in files, offset projections are projections, too
+        # in files, laterally offset projections also have the kind projection
+        first = block.first_trigger - views.first_trigger
         for frame in self._block(BlockTally(block)):
             invalid = frame.kind is FrameKind.INVALID
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """True if a stopped scan still needs this block: darks or flats of a kind that it does not have, although it
-        took projections.
+        """True if a stopped scan still needs this block: the scan has projections, and the block has darks or flats of
+        a kind that is missing.
 
         A stop during the block itself ends it, because each block is considered once.
         """
@@ -255,7 +259,7 @@ class Acquisition:
         return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
     def _warm_up(self) -> None:
-        """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
+        """Wait with open shutter until the scintillator is warm. A stop ends the wait."""
         if not (seconds := self._timeline.plan.warm_up):
             return
         self._sink(StateEntered(self._supervision.states.state, f"Warming up the scintillator for {seconds:g} s"))
@@ -264,10 +268,10 @@ class Acquisition:
             self._clock.sleep(min(SLICE, left))
 
     def wait_while_paused(self, reopen: bool = True) -> None:
-        """Wait with a closed shutter while a pause is requested; a stop ends the wait.
+        """Wait with closed shutter as long as a pause is requested. A stop ends the wait.
 
-        The request to move a manual shutter follows the report of the state. In a pause that ends automatically the
-        shutter stays open.
+        If the shutter is manual, the operator is asked to move it after the state was reported. In a pause that ends
+        automatically the shutter stays open.
 
         Args:
             reopen: open the shutter afterwards, because frames follow at once.
@@ -314,7 +318,7 @@ class Acquisition:
             )
 
     def _warn_discrepancies(self) -> None:
-        """Report missing frames if the scan ends with another error, which would hide them."""
+        """Report missing frames if the scan ends with another error, which would otherwise hide them."""
         if text := discrepancies(self._done):
             self._sink(Warned(text.strip()))
 

@@ -1,5 +1,5 @@
-"""Backlog: how many frames may wait for the disk, when a scan pauses before memory or disk is full, and the time
-left.
+"""Backlog: computes how many frames may wait for the disk and the remaining time, and pauses a scan before memory or
+disk is full.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from drivers.base.frame import Frame
 from drivers.frame_memory import FrameMemory
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
-WAITING_FRAMES = (4, 128)  # least and most frames
-CHECKED_FRAMES = 2  # most frames that wait between the recorder's threads
+WAITING_FRAMES = (4, 128)  # smallest and largest number of frames
+CHECKED_FRAMES = 2  # largest number of frames that wait between the threads of the recorder
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # number of last frames from which the rate is computed
 
@@ -37,8 +37,8 @@ def frames_in_memory(timeline: Timeline) -> int:
 
 
 def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[int, int]) -> str:
-    """Reserve memory, before the first frame comes, for the frames that may wait for the disk; returns a sentence on
-    it, or "" if none is needed.
+    """Reserve memory, before the first frame comes, for the frames that may wait for the disk. Returns a sentence about
+    the memory, or "" if no sentence is needed.
 
     At most a quarter of the free memory is reserved, because a live volume may use half of it.
     """
@@ -54,12 +54,11 @@ def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[
 
 
 def hold_for_space(pause: PauseRequest, reserve: int, free: int, remaining: int) -> None:
-    """Pause a scan before its disk is full, until twice the limit is free.
+    """Pause a scan before its disk is full. The pause lasts until twice the limit is free.
 
     Args:
-        reserve: bytes that must stay free for the frames that still come when the scan is to pause.
-        free: bytes of the disk.
-        left: bytes that are still to be written.
+        reserve: bytes that must stay free for frames that still come after the pause was requested. free: free bytes of
+            the disk. left: bytes that must still be written.
     """
     again = min(2 * reserve, remaining) + CLOSING
     if remaining and free < min(reserve, remaining) + CLOSING:
@@ -73,12 +72,13 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, remaining: int)
 
 
 def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
-    """Pause a fly scan before the queue is full, until only few frames wait to be written.
+    """Pause a fly scan before the queue is full. The pause lasts until only few frames wait to be written.
 
     Args:
         most: limit for the number of waiting frames.
         waiting: number of waiting frames.
-        checking, writing: busy s of the recorder's threads; the disk is too slow if writing took longer.
+        checking, writing: time in s for which the threads of the recorder were busy. If writing took longer, the disk
+            is too slow.
     """
     if 4 * waiting >= 3 * most:
         what, advice = (
@@ -111,13 +111,13 @@ class FrameProgress:
         self._last_event = -EVENT_INTERVAL
 
     def expect_more(self, done: int, n: int, seconds: float) -> None:
-        """Count `n` frames that were not planned; they come after `done` frames and take `seconds`."""
+        """Add `n` frames that were not planned. They come after `done` frames and take `seconds`."""
         before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
         self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
         self.total += n
 
     def expect_fewer(self, done: int, n: int) -> None:
-        """Count `n` frames fewer: those planned next after `done` will not come."""
+        """Subtract `n` frames: the next `n` planned frames after `done` frames will not come."""
         remaining = min(done + n, self.total)
         self._ahead = np.append(
             self._ahead[:done] - self._ahead[done] + self._ahead[remaining], self._ahead[remaining:]
@@ -125,7 +125,7 @@ class FrameProgress:
         self.total -= remaining - done
 
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
-        """Record the n-th frame; None if the last event was less than EVENT_INTERVAL ago."""
+        """Record the n-th frame. Returns None if the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
         if now - self._last_event < EVENT_INTERVAL and n < self.total:

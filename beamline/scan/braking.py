@@ -5,9 +5,9 @@ Noise on the trigger line also exposes frames, and during braking the times of t
 position of the stage confirms the frames: with speed u and constant deceleration a, the stage stops u²/2a after braking
 began. The final position therefore gives the time at which braking began, and the position of the stage at the time of
 each frame. If the stage brakes in another way, for example with jerk-limited ramps, the number of exposures must equal
-the number of triggers up to the final position, and the intervals between exposures must increase. Frames that neither
-test confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that wait for their
-trigger.
+the number of triggers up to the final position, and the intervals between exposures must increase. Frames that are
+confirmed by neither test are not assigned to a trigger. All functions are pure. A FlownTrain keeps the frames of a
+train that wait for their trigger.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, enter, start_kno
 from beamline.scan.tally import Exposed
 from drivers.base.protocols import CameraFrame, TriggerTrain
 
-EARLY, LATE = 0.02, 0.5  # s: braking begins at most this long before, and this long after, the stop was sent
-MOST = 0.75  # share of the triggers that must have a frame at their times; by chance 0.4 do
-FEW = 4  # triggers; with fewer exposures nothing can be concluded
+EARLY, LATE = 0.02, 0.5  # s: braking begins at most this time before the stop was sent, and at most this time after it
+MOST = 0.75  # share of the triggers that must have a frame at their times; by chance the share is 0.4
+FEW = 4  # number of triggers; with fewer exposures the motion cannot be tested
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
 BESIDE = 0.02  # intervals: a stage that stands this close to a trigger may or may not have passed it
 
@@ -32,18 +32,20 @@ BESIDE = 0.02  # intervals: a stage that stands this close to a trigger may or m
 class Braking:
     """A stage that was stopped during a train of triggers and is now at rest."""
 
-    stop_sent: float  # time at which it was told to stop, in s
-    position: float  # where it stands, in intervals beyond trigger 0
+    stop_sent: float  # time in s at which the stop was sent
+    position: float  # its position, in intervals beyond trigger 0
     deceleration: float  # intervals/s²
 
 
 NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
-"""Gives a frame the time at which its trigger would have come at constant speed; NaN if unknown."""
+"""Function that gives the time at which the trigger of a frame would have come at constant speed; NaN if it is
+unknown."""
 
 
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
-    """How to assign frames that arrived during braking: by the stage's motion, by their number, or not at all."""
+    """The way to assign frames that arrived during braking: by the motion of the stage, by their number, or not at
+    all."""
     steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
     fewest, most = (min(math.floor(braking.position + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last
@@ -98,7 +100,7 @@ def _matched(ledger: Ledger) -> int:
 
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
-    """True if the intervals between exposures grow from the last steady one on."""
+    """True if the intervals between exposures increase after the last exposure at constant speed."""
     steady = [
         DeliveredFrame(ledger.exposed, ledger.phase),
         *(frame for frame in frames if frame.time < braking.stop_sent),
@@ -111,15 +113,13 @@ def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFra
 
 @dataclass
 class FlownTrain:
-    """A pulse train that is being flown.
+    """A pulse train of a fly scan while the stage moves.
 
     Attributes:
-        first: its first trigger within the block.
-        seconds: duration of its move.
-        stop_sent: time at which the stage was told to stop during the pass.
-        paused: for a pause: the triggers after the last stored frame are exposed again afterwards.
-        braking: for a stop, as soon as the stage has stopped.
-        waiting: frames whose trigger is known only from those that follow.
+        first: first trigger of the train within the block. seconds: duration of the move. stop_sent: time at which a
+            stop was sent to the stage during the pass. paused: True for a pause; the triggers after the last stored
+            frame are then exposed again after the pause. braking: for a stop, the data on the braking, as soon as the
+            stage has stopped. waiting: frames whose trigger can be determined only with later frames.
     """
 
     ledger: Ledger
@@ -133,22 +133,23 @@ class FlownTrain:
 
     @property
     def so_far(self) -> Ledger:
-        """The ledger so far, settled as if no further frame came."""
+        """The present ledger, closed as if no further frame came."""
         return assigned(self.ledger, self.braking, self._exposed, unassigned)
 
     @property
     def last_due(self) -> float:
-        """When the last trigger of the pass is due, in s since the Unix epoch; inf if that is not known."""
+        """The time at which the last trigger of the pass is due, in s since the Unix epoch; inf if it is not known."""
         ledger, train = self.so_far, self.ledger.train
         if ledger.last >= 0:
             return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
         return math.inf if train.first is None else train.first + (train.n - 1) * train.period
 
     def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[Exposed]:
-        """Enter frames; yield those whose trigger is now known (or EXTRA), with trigger in the block and angle.
+        """Enter frames. Yields the frames whose trigger is now known (or EXTRA), with the trigger in the block and the
+        angle.
 
         Args:
-            last: no further frame will come, so none waits.
+            last: True if no further frame will come; then no frame waits.
         """
         self.waiting += frames
         brakes = self.braking is not NOT_BRAKING

@@ -1,8 +1,9 @@
 """Control: the states of a scan and their allowed order, and commands to a running scan from another terminal.
 
-docs/states.md has a diagram of the states and explains the commands in each state. A command is an empty file of that
-name in the folder `control` of the run, which only the owner of the run can enter. The scan removes the file and
-carries out the command. This works on every operating system and file system, without an open port or a parser.
+docs/states.md has a diagram of the states and explains the commands in each state. A command is an empty file with the
+name of the command, in the folder `control` of the run. Only the owner of the run can enter this folder. The scan
+removes the file and carries out the command. This works on every operating system and file system, without an open port
+or a parser.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ NEXT: Mapping[State, frozenset[State]] = {
     State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
     **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
 }
-"""The states that may follow each one."""
+"""The states that may follow each state."""
 
 
 class StateMachine:
@@ -69,10 +70,10 @@ class StateMachine:
         self._sink, self.state = sink, state
 
     def enter(self, state: State, message: str = "") -> None:
-        """Change to a state, with a message; staying in a state without a message emits nothing.
+        """Change to a state, with a message. If the state stays the same and there is no message, no event is sent.
 
         Raises:
-            ValueError: the state must not follow the present one; nothing has changed.
+            ValueError: the state must not follow the present one. Nothing has changed.
         """
         if state is not self.state and state not in NEXT[self.state]:
             raise ValueError(f"a scan cannot go from {self.state} to {state}")
@@ -82,8 +83,8 @@ class StateMachine:
 
 
 POLL = 0.1  # real s between checks
-ANSWER_WITHIN = 5.0  # real s within which a scan accepts a verb
-EFFECT_WITHIN = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
+ANSWER_WITHIN = 5.0  # real time in s within which a scan accepts a command
+EFFECT_WITHIN = 20.0  # real time in s within which most commands are done: the stage has braked, the frame is exposed
 
 
 class Verb(StrEnum):
@@ -99,11 +100,11 @@ class Verb(StrEnum):
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, choose: Callable[[Choice], None] = lambda choice: None
 ) -> Iterator[None]:
-    """A context in which the scan of this folder obeys commands, which are files in a folder that only its owner can
-    enter.
+    """A context in which the scan of this folder carries out commands. They are files in a folder that only the owner
+    can enter.
 
     Args:
-        choose: function that gets the operator's choice of what is measured next.
+        choose: function that receives the operator's choice of what is measured next.
 
     Raises:
         DataError: the folder for the commands cannot be created.
@@ -168,10 +169,11 @@ class Asked:
     since: float
 
     def state(self) -> State | None:
-        """The state of the scan once the command is carried out, or after 20 s; None before that. Returns at once.
+        """The state of the scan if the command is carried out, or if 20 s have passed; otherwise None. The function
+        returns at once.
 
         Raises:
-            ConfigError: the scan has not answered for 5 s; the request is withdrawn.
+            ConfigError: the scan has not answered for 5 s. The request is withdrawn.
         """
         request, seconds = self.part / CONTROL / self.verb, time.monotonic() - self.since
         if request.exists():
@@ -191,11 +193,11 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
-        verb: the command; or a choice of what the scan measures next, which the scan accepts only while it waits for a
+        verb: the command; or a choice of what is measured next, which the scan accepts only while it waits for a
             decision.
 
     Raises:
-        ConfigError: no scan runs there, or it is not waiting for a decision.
+        ConfigError: no scan runs there, or the scan is not waiting for a decision.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
@@ -218,7 +220,7 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
 
 
 def tell(run: Path, verb: Verb | Choice) -> State:
-    """Send a command to a running scan, and wait until it is done; returns the state. Raises the errors of `ask` and
+    """Send a command to a running scan, and wait until it is done. Returns the state. Raises the errors of `ask` and
     `Asked`.
     """
     asked = ask(run, verb)
@@ -234,7 +236,7 @@ def state_of(part: Path) -> State:
 
 
 def _done(state: State, verb: Verb | Choice) -> bool:
-    """True if a scan in this state has obeyed the verb."""
+    """True if a scan in this state has carried out the command."""
     if state is State.FINISHING or state.ended:
         return True
     if verb in (Verb.PAUSE, Verb.RESUME):

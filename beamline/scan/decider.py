@@ -1,6 +1,7 @@
 """Decider: after each pass of projections, decides from the error model, or asks the operator, what to measure next.
 
-It needs no additional frame, and the scan does not depend on it: if no error model arrives in time, the plan continues.
+The decider needs no additional frame, and the scan does not depend on it: if no error model arrives in time, the scan
+continues its plan.
 """
 
 from __future__ import annotations
@@ -26,23 +27,20 @@ _NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="no p
 
 @dataclass(eq=False, kw_only=True)
 class Decider:
-    """Called after each pass with the passes so far and to come, it returns what is measured next.
+    """Decides what is measured next. It is called after each pass, with the passes so far and to come.
 
     Attributes:
-        asks: True: the operator is asked; False: the program chooses.
-        wait: real s to wait for the error model of a pass, and again for the operator's answer, at most; pauses do not
-            count.
-        seconds_of: duration of a block, from the present position of the stage.
-        now: the instrument's clock, s.
-        began: time of the first frame; inf: no frame yet, because a resumed scan makes a choice first.
-        added_seconds: s that count in addition to those since `began`: of earlier parts of the run, and of the darks
-            and flats that follow the projections.
-        retaken: projections that earlier parts of the run took again.
-        number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
-        why_no_law: why no error model can come any more; "" while one may. Then the plan continues without a wait.
-        wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; returns True if Enter was pressed.
-        close_shutter: called before the scan waits.
-        record: takes the values of a decision, for the file.
+        asks: True: the operator is asked; False: the program chooses. wait: longest real time in s to wait for the
+            error model of a pass, and again for the answer of the operator; pauses do not count. seconds_of: function
+            that returns the duration of a block, from the present position of the stage. now: clock of the instrument,
+            in s. began: time of the first frame; inf: no frame yet, because a resumed scan makes a choice first.
+            added_seconds: time in s that counts in addition to the time since `began`: that of earlier parts of the
+            run, and of the darks and flats after the projections. retaken: number of projections that earlier parts of
+            the run took again. number: number of the pass that ended last, from 1; at first that of the last pass of
+            earlier parts of the run. why_no_law: why no error model can come any more; "" if one may still come. If
+            none can come, the plan continues without a wait. wait_a_moment: function that waits `PAUSE_POLL` real s, or
+            as long as the scan is paused. It returns True if Enter was pressed. close_shutter: function that is called
+            before the scan waits. record: function that gets the values of a decision, for the file.
     """
 
     asks: bool
@@ -63,14 +61,15 @@ class Decider:
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
     _law: LawMeasured = _NO_LAW  # the newest
-    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options, by the pass before each
+    # options, by the number of the pass before them
+    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # the result of a choice, as in `NextChosen`
-    _no_more_laws: str = ""  # why, once it was reported
-    _answers: frozenset[Choice] = frozenset()  # choices that the operator can make now
+    _no_more_laws: str = ""  # the reason, after it was reported
+    _answers: frozenset[Choice] = frozenset()  # choices that the operator can make at present
     _answer: Choice | None = None
 
     def add_law(self, law: LawMeasured) -> None:
-        """Take an error model from the live reconstruction; may be called in any thread."""
+        """Receive an error model from the live reconstruction. The method may be called in any thread."""
         self._law = law
         option = self._chosen.get(law.number - 1, {})
         if law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
@@ -78,7 +77,8 @@ class Decider:
             self._outcome = {"predicted": option.get("gain"), "gained": law.gained, **ends, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:
-        """Take the operator's choice; may be called in any thread. A choice that is not possible becomes a warning."""
+        """Receive the operator's choice. The method may be called in any thread. If the choice is not possible, a
+        warning is given."""
         if choice in self._answers:
             self._answer = choice
         else:
@@ -129,9 +129,10 @@ class Decider:
         return choice
 
     def _predict(self, passes: Passes) -> tuple[ErrorLaw | None, tuple[PassOption, ...]]:
-        """The error model of the projections so far and the options that it predicts; None if none comes in time.
+        """The error model of the projections so far, and the options with its predictions; None if no error model comes
+        in time.
 
-        An earlier error model is used if the next pass is certain with it, so that the stage does not wait.
+        If an earlier error model makes the next pass certain, it is used, so that the stage does not wait.
         """
         law = self._newest_law(passes)
         offered = options(passes, law, self.timeline, self.seconds_of)
@@ -142,37 +143,38 @@ class Decider:
             or not next_is_sure(passes, offered, self.target, law, *self._spent(passes))
         ):
             if not self._law_has_come():
-                self.close_shutter()  # an error model takes seconds
+                self.close_shutter()  # computing an error model takes seconds
                 self._wait(self._law_has_come)
             law = self._newest_law(passes) if self._law.number == self.number else None
             offered = options(passes, law, self.timeline, self.seconds_of)
         return law, offered
 
     def _law_has_come(self) -> bool:
-        """True if the error model of all projections so far is there, or none can come."""
+        """True if the error model of all projections so far has arrived, or if no error model can come."""
         return self._law.number == self.number or bool(self.why_no_law())
 
     def _newest_law(self, passes: Passes) -> ErrorLaw | None:
         """The newest error model, applied to all frames so far; None if there is none.
 
-        It may have been measured on some of the projections, because the improvement depends only on ratios of their
-        numbers.
+        The error model may have been measured on a part of the projections, because the improvement depends only on
+        ratios of their numbers.
         """
         values = self._law.exponent, self._law.exponent_error, self._law.noise, self._law.offset
-        # from another process, so check it
+        # checked, because it comes from another process
         if self._law.reason or None in values or not 0 <= values[2] + values[3] <= 1:
             return None
         return ErrorLaw(passes.n_frames, *values)
 
     def _spent(self, passes: Passes) -> tuple[float, float]:
-        """Seconds and share of the dose that the scan has used, including what follows the passes in any case."""
+        """Seconds and share of the dose that the scan has used, plus those of the frames that follow the passes in any
+        case."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         offset = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.OFFSET_VIEW)
         seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.offset))
         return seconds, (passes.n_frames + self.retaken + retaken + offset) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
-        """Wait until this is true, at most `wait` s, and not beyond a stop."""
+        """Wait until the function returns True, but at most `wait` s. A stop ends the wait."""
         for _ in range(round(self.wait / PAUSE_POLL)):
             if self.stop.stopping or until():
                 return
@@ -180,18 +182,19 @@ class Decider:
                 at_enter()
 
     def _ask(self, recommended: Choice, offered: Sequence[PassOption]) -> tuple[str, Choice, str]:
-        """Who chose, what, and why: the operator, or the plan if there is no answer in time."""
-        messages = iter([""])  # none when it asks for the first time
+        """The decision: who made it, the choice, and the reason. The operator makes it; without an answer in time, the
+        plan."""
+        messages = iter([""])  # no message when it asks for the first time
 
         def answered() -> bool:
-            if self.states.state is not State.ASKING:  # at first, and after a pause
+            if self.states.state is not State.ASKING:  # at the beginning, and after a pause
                 self.close_shutter()
                 self.states.enter(
                     State.ASKING, next(messages, "The scan again waits for a decision on what to measure next")
                 )
             return self._answer is not None
 
-        self.wait_a_moment()  # earlier input does not count
+        self.wait_a_moment()  # earlier input is ignored
         self._answer, self._answers = None, frozenset({Choice.NEXT, *(option.choice for option in offered)})
         self._wait(answered, lambda: self.answer(recommended))
         self._answers = frozenset()

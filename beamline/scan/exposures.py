@@ -27,23 +27,23 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
-SLICE = 0.5  # s: the longest wait for a frame between two checks of the stop request
-PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera counts as silent; lower limit
+SLICE = 0.5  # s: longest wait for a frame between two checks of the stop request
+# s without a frame, in addition to exposure and readout, after which a camera counts as silent; lower limit
+PATIENCE = 2.0
 PATIENCE_PERIODS = 10  # the same in trigger periods
 RAMP_TOLERANCE = 0.1  # share of the time that acceleration adds before the first pulse
 SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera counts as silent
-# s within which a stage that somebody else moves must stop, before it is sent to a projection again
+# s within which a stage that somebody else moves must stop before it is moved to a projection again
 STANDS_WITHIN = 10.0
 
 
 class Exposures:
-    """Takes blocks of frames with a camera and a stage. Shutter and sample are operated by Acquisition.
+    """Takes blocks of frames with a camera and a stage. `Acquisition` moves shutter and sample.
 
     Args:
         camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
-        settle: s to wait after each move of a step scan.
-        sink: where warnings go.
-        supervision: tells when to pause, and gets the states of a fly scan.
+        settle: waiting time in s after each move of a step scan. sink: receives the warnings. supervision: requests
+            pauses, and gets the states of a fly scan.
         wait_while_paused: called before each frame with the stage at rest, and before each run-up.
     """
 
@@ -64,9 +64,9 @@ class Exposures:
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
     def take(self, taken: BlockTally, first_row: int) -> Iterator[Frame]:
-        """Record the block's frames, numbered from `first_row`; `taken` collects what is missing.
+        """Take the frames of a block, numbered from `first_row`. `taken` collects the missing frames.
 
-        A stop during the block ends it early. A block that begins after the stop is taken completely.
+        A stop during the block ends it early. A block that begins after the stop is taken as a whole.
 
         Raises:
             ScanAborted: an abort was requested; the stage may still be moving.
@@ -96,7 +96,7 @@ class Exposures:
 
     def _fly(self, taken: BlockTally) -> Iterator[Exposed]:
         block, ahead, i = taken.block, passes(taken.block), 0
-        # The block begins within a pass only after a pause.
+        # A block begins within a pass only after a pause.
         while (i := self._after_pause(i, taken)) < block.n and not self._stop.stopping:
             flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
             train, done = flown.train, i - flown.first
@@ -108,9 +108,11 @@ class Exposures:
             i += yield from self._pass(taken, rest, i, (begin, flown.end))
 
     def _after_pause(self, i: int, taken: BlockTally) -> int:
-        """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame.
+        """Wait as long as the scan is paused. Returns the next trigger: `i`, or the next trigger without a stored
+        frame.
 
-        After a loss of the beam it is the first trigger that may lack beam; it and later ones are repeated.
+        After a loss of the beam, the next trigger is the first one that may be without beam. This and later triggers
+        are repeated.
         """
         block = taken.block
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
@@ -128,9 +130,10 @@ class Exposures:
     def _pass(
         self, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
     ) -> Generator[Exposed, None, int]:
-        """Fly once over a train whose first trigger within the block is `first`; the stage is at the first of the ends.
+        """Make one pass over a train whose first trigger within the block is `first`. The stage is at the first of the
+        ends.
 
-        Returns how many of its triggers are done: all, or those up to the last frame before a pause.
+        Returns the number of its triggers that are done: all, or those up to the last frame before a pause.
         """
         block, (start, end) = taken.block, ends
         self._camera.arm(train.n)
@@ -148,7 +151,7 @@ class Exposures:
             except (BeamlineError, DeviceError):
                 yield from flight.enter(last=True)
                 raise
-            if not flight.paused:  # otherwise the triggers of waiting frames are repeated
+            if not flight.paused:  # if not, the triggers of waiting frames are repeated
                 yield from flight.enter(last=True)
             cut_short = self._stop.stopping or flight.paused
         finally:
@@ -165,7 +168,7 @@ class Exposures:
         return flight.ledger.last + 1 if flight.paused else train.n
 
     def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
-        """When the pulses should come: run-up at constant acceleration, then constant speed.
+        """Expected times of the pulses, for a run-up with constant acceleration and then constant speed.
 
         The stage may have started at any time between `before` and `after`, and its acceleration is only nearly
         constant.
@@ -175,10 +178,11 @@ class Exposures:
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: FlownTrain) -> Iterator[Exposed]:
-        """Frames while the stage turns; after a stop, all frames until the stage has stopped.
+        """Yields frames while the stage turns. After a stop, it yields all frames until the stage has stopped.
 
-        After a pause only the frames exposed before the stop was sent: they equal those of a scan without a pause. The
-        method waits for frames, not for the stage, so that a camera without frames is noticed at once.
+        After a pause, it yields only the frames that were exposed before the stop was sent. These frames are the same
+        as in a scan without a pause. The method waits for frames and not for the stage, so that a camera that sends no
+        frames is noticed at once.
         """
         tail = block.exposure + self._camera.timing.readout
         patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
@@ -196,11 +200,11 @@ class Exposures:
                     yield from flight.enter(frame)
             elif stands:
                 break
-            elif self._clock.now() >= silent_at:  # the pause was requested earlier, and perhaps withdrawn
+            elif self._clock.now() >= silent_at:  # the pause was requested earlier, and may have been withdrawn
                 if not self._stage.moving():
                     break
                 if self._clock.now() >= flight.last_due + tail:
-                    break  # no trigger is still to come: what is missing is named with the rest of the pass
+                    break  # all triggers have come, and missing frames are reported with the rest of the pass
                 raise InstrumentError(
                     f"Check the trigger cable and the camera. {self._camera.name}: no frame for "
                     f"{wait:.3g} s while the stage turned. Earlier frames are in the file."
@@ -210,10 +214,11 @@ class Exposures:
         if not stands:
             arrive(self._stage, flight.seconds, self._clock, self._stop)
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
-            yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
+            # all triggers have their frames, so the ledger counts further frames as extra
+            yield from flight.enter(frame)
 
     def _brake(self, flight: FlownTrain) -> None:
-        """Stop the stage within a train, wait until it has stopped, and read its position."""
+        """Stop the stage within a train, wait until it is at rest, and read its position."""
         train, limits = flight.train, self._stage.limits
         flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
         stand(self._stage, self._clock, self._stop)
@@ -225,7 +230,7 @@ class Exposures:
     def _one_by_one(self, taken: BlockTally) -> Iterator[Exposed]:
         """Take frames with software triggers: at each angle of a step scan, or at rest for darks and flats.
 
-        Yields each frame with its trigger, the position of the stage, and True if this was the right angle.
+        Yields each frame with its trigger, the position of the stage, and True if the position was the right angle.
         """
         block = taken.block
         self._camera.arm(block.n)
@@ -251,7 +256,8 @@ class Exposures:
             if not self._rest(triggered + period - self._clock.now(), owed):
                 break
             self._camera.software_trigger()
-            triggered = self._clock.now()  # after the call, because the time of the exposure within it is not known
+            # read after the call, because the time of the exposure within the call is not known
+            triggered = self._clock.now()
             frame = self._next_frame(patience, until_stop=False)
             if frame is not None:
                 silent, wrong = 0, ""
@@ -277,7 +283,7 @@ class Exposures:
                     f"Check the camera. {self._camera.name}: {silent} triggers in a row gave no frame "
                     f"within {patience:.3g} s each. Earlier frames are in the file."
                 )
-            self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
+            self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next frame
         self._camera.disarm()
 
     def _until_nobody_moves_it(self) -> None:
@@ -286,8 +292,8 @@ class Exposures:
             self._clock.sleep(POLL)
 
     def _rest(self, seconds: float, owed: bool) -> bool:
-        """Wait for some seconds; False if a stop ended the wait early. A stop does not end it in a block that is still
-        needed.
+        """Wait for some seconds. Returns False if a stop ended the wait early. In a block that is still needed, a stop
+        does not end the wait.
         """
         deadline = self._clock.now() + seconds
         while seconds > SLICE:
@@ -304,10 +310,11 @@ class Exposures:
         self._camera.arm(n)
 
     def _next_frame(self, timeout: float, until_stop: bool) -> CameraFrame | None:
-        """The next frame, or None after `timeout` s (with `until_stop`, also at a request to stop or pause).
+        """The next frame; None if no frame comes within `timeout` s. With `until_stop`, a request to stop or pause also
+        ends the wait.
 
-        A first error of the camera is a warning (frames lost from its ring buffer become missing ones); a second one is
-        raised.
+        The first error of the camera becomes a warning, and frames lost from its ring buffer count as missing. A second
+        error is raised.
         """
         deadline = self._clock.now() + timeout
         failed = False

@@ -1,5 +1,5 @@
-"""Flagged frames: which frames of a scan have flags, what the flags do to the scan, and which projections are taken
-again.
+"""Flagged frames: which frames of a scan have flags, the effect of the flags on the scan, and which projections are
+taken again.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class FlaggedFrames:
     """The flags of the frames so far.
 
     Args:
-        sink: takes `FrameFlagged` if a check begins to flag or its level changes, not for every frame.
-        react: gets the flags of each frame.
-        retaken_warnings: checks whose warnings also cause projections to be taken again.
+        sink: gets the event `FrameFlagged` if a check begins to flag or its level changes, but not for every frame.
+            react: function that gets the flags of each frame. retaken_warnings: checks whose warnings also cause
+            projections to be taken again.
 
     Attributes:
         retaken: projections that were taken again.
@@ -66,17 +66,18 @@ class FlaggedFrames:
 
     @property
     def alarmed(self) -> set[int]:
-        """Frames with an alarm of any check, except those that were repeated."""
+        """Frames with an alarm of any check, except projections that were taken again."""
         return self._frames(lambda flag: flag.level is Level.ALARM)
 
     @property
     def alarmed_views(self) -> set[int]:
-        """The projections among them."""
+        """The projections among the frames with an alarm."""
         return self.alarmed & self._triggers.keys()
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Projections with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
+        """Projections with an alarm, or with a warning that requires taking them again, each with the trigger that
+        takes it again."""
         warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
         return [Retake(row, self._triggers[row]) for row in sorted((self.alarmed | warned) & self._triggers.keys())]
 
@@ -86,12 +87,11 @@ class FlaggedFrames:
 
 
 class AlarmReaction:
-    """What the monitor's alarms do to a scan.
+    """Carries out the effects of the monitor's alarms on a scan.
 
     Args:
-        act_after: number of consecutive frames with an alarm of a check after which its policy is carried out; and
-            again after as many.
-        policies: by the name of the check.
+        act_after: number of consecutive frames with an alarm of a check after which its policy is carried out (and
+            again after the same number). policies: the policies by the name of the check.
     """
 
     def __init__(

@@ -1,14 +1,14 @@
-"""Ledger: assigns frames to triggers from framestamps and times, so that no angle is guessed.
+"""Ledger: assigns frames to triggers, using framestamps and times, so that no angle is guessed.
 
 A camera counts the frames that it exposes. A gap in its framestamps means that a frame was exposed but lost in
 transfer. If a trigger comes too early, the camera ignores it: framestamps then stay contiguous, and only the times show
 a gap of two periods. While the stage rotates at constant speed, trigger times are linear in the index of the trigger.
 Therefore the index of a frame follows from the nearest whole number of periods since the previous frame. Slow drift is
 followed by an alpha-beta filter (Benedict & Bordner 1962). Noise on the trigger line exposes frames, too. If the time
-of the first trigger is not known well, the first frames are those that form a regular train. If two frames could belong
-to a trigger, it gets the nearer one. This requires the following frames, see `enter`. Frames exposed while the stage
-brakes come with the times at which their triggers would have come at constant speed (see braking.py). All functions are
-pure; a Ledger is a value.
+of the first trigger is not known precisely, the first frames are those that form a regular train. If two frames could
+belong to a trigger, the nearer frame gets it. This decision needs the following frames, see `enter`. Frames exposed
+while the stage brakes come with the times at which their triggers would have come at constant speed (see braking.py).
+All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 
-FREE = 0.35  # periods by which a frame may be away from its trigger; a frame further away was not exposed by a trigger
-NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next frame, which may be nearer
+# largest distance of a frame from its trigger, in periods; a frame farther away was not exposed by a trigger
+FREE = 0.35
+NEAR = 0.1  # periods; if a frame is earlier than its trigger by more, it waits for the next frame, which may be nearer
 CONFIRMED = 0.2  # periods; the same for a frame taken while the stage brakes
 KNOWN = 0.25  # periods: largest error of the first trigger's time that still identifies the first frame
-TRAIN, LOOK = 3, 6  # frames that make a train, and the most frames searched for one
-UNEVEN = 0.25  # periods; frames of a train are more regular than this
+TRAIN, LOOK = 3, 6  # number of frames that make a train, and largest number of frames in which a train is searched
+UNEVEN = 0.25  # periods; frames of a train are at least this regular
 PHASE_GAIN, PERIOD_GAIN = 0.3, 0.05
 PERIOD_RANGE = 0.2  # the true period may differ from the planned one by this fraction
 
-EXTRA = -1  # the trigger of a frame that no trigger exposed
+EXTRA = -1  # stands for the trigger of a frame that no trigger exposed
 
 
 class LedgerError(DataError):
-    """Triggers and frames do not match; `missing` are the planned rows without a frame."""
+    """Triggers and frames do not match. `missing` contains the planned rows without a frame."""
 
     def __init__(self, message: str, missing: Sequence[int]) -> None:
         super().__init__(message)
@@ -44,12 +45,12 @@ class LedgerError(DataError):
 
 @dataclass(frozen=True, eq=False)
 class Train:
-    """The triggers to expect."""
+    """The expected triggers."""
 
     angles: NDArray[np.float64]  # float64 [trigger] radians
     period: float  # s between triggers
     first: float | None = None  # time of trigger 0, s since the Unix epoch; None if unknown
-    tolerance: float = 0.0  # largest error of `first`, in s
+    tolerance: float = 0.0  # largest error of `first` in s
 
     def __post_init__(self) -> None:
         if self.angles.ndim != 1 or self.angles.size == 0:
@@ -64,7 +65,7 @@ class Train:
 
 @dataclass(frozen=True)
 class LedgerEntry:
-    """The trigger of a frame (EXTRA: no trigger exposed it) and the angle in radians at its time."""
+    """The trigger of a frame (EXTRA: no trigger exposed it), and the angle in radians at the time of the frame."""
 
     trigger: int
     angle: float
@@ -72,32 +73,33 @@ class LedgerEntry:
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """The matching of triggers and frames so far: `Ledger(train)`, then `assign` for each frame, then `settle`.
+    """The assignment of frames to triggers so far. Use `Ledger(train)`, then `assign` for each frame, then `settle`.
 
     Without faults every trigger has its frame and every frame its trigger.
     """
 
     train: Train  # the expected triggers
     last: int = -1  # the trigger of the last matched frame, -1 before the first
-    exposed: int = -1  # framestamp of the last frame, matched or not, -1 before the first
-    unmatched: int = 0  # exposures since the last matched frame, delivered or not
+    exposed: int = -1  # framestamp of the last frame, whether it was matched or not; -1 before the first frame
+    unmatched: int = 0  # number of exposures since the last matched frame, whether they were delivered or not
     # phase, period: estimated time of the last matched trigger, and estimated period, both in s
     phase: float = math.nan
     period: float = math.nan
-    # first: the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0
+    # first: framestamp and trigger of the first matched frame, and its periods since the expected time of trigger 0
     first: tuple[int, int, float] = (-1, -1, math.nan)
-    missing: tuple[int, ...] = ()  # triggers without a frame, ascending: up to `last`, in a settled ledger all
-    lost: int = 0  # of these, exposed but never delivered (framestamp gap)
-    ignored: int = 0  # of these, not exposed (time gap). Those after the last frame may be either
+    missing: tuple[int, ...] = ()  # triggers without a frame, ascending: those up to `last`; in a closed ledger, all
+    lost: int = 0  # number of these that were exposed but never delivered (gap in the framestamps)
+    # number of these that were not exposed (gap in the times). Triggers after the last frame may be either
+    ignored: int = 0
     extra: tuple[int, ...] = ()  # framestamps of frames that no trigger exposed
-    beyond: int = 0  # of these, frames that came when a trigger after the last one would have come
-    unconfirmed: int = 0  # of the extra frames, those exposed while the stage braked
-    # off: the largest distance of a matched frame from its trigger's expected time, in periods. The angle of a frame
-    # may be wrong by as many steps
+    beyond: int = 0  # number of these that came at the time of a trigger after the last one
+    unconfirmed: int = 0  # number of extra frames that were exposed while the stage braked
+    # off: largest distance of a matched frame from the expected time of its trigger, in periods. The angle of a frame
+    # may be wrong by this many steps
     off: float = 0.0
-    # shift: of a settled ledger. All angles may be wrong by as many triggers. Triggers missing at one end may be
-    # missing at the other; an extra frame at the end may be one at the beginning. 0 without such frames, or if the
-    # time of the first trigger is known
+    # shift: in a closed ledger, the number of triggers by which all angles may be wrong. The reason: triggers that seem
+    # to be missing at one end may be missing at the other end, and an extra frame at the end may belong to the
+    # beginning. 0 if there are no such frames, or if the time of the first trigger is known
     shift: int = 0
 
     @property
@@ -108,7 +110,7 @@ class Ledger:
 
 @dataclass(frozen=True)
 class DeliveredFrame:
-    """A frame as received from the camera: see `assign`."""
+    """A frame as it was received from the camera, see `assign`."""
 
     framestamp: int
     time: float
@@ -116,15 +118,15 @@ class DeliveredFrame:
 
 
 def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
-    """Assign the first of the waiting frames, using those after it; None if it must wait for further frames.
+    """Assign the first of the waiting frames with the help of the frames after it. Returns None if it must wait for
+    further frames.
 
     Args:
-        frames: in the order in which they were exposed.
-        last: there will be no further ones.
+        frames: waiting frames in the order in which they were exposed. last: True if there will be no further frames.
     """
     first, *others = frames
     ahead = [frame for frame in others if not math.isnan(frame.time)]
-    last = last or len(ahead) < len(others)  # frames without a known time show nothing
+    last = last or len(ahead) < len(others)  # frames without a known time do not help
     after, entry = assign(ledger, first.framestamp, first.time, first.steady)
     if math.isnan(first.time):
         return after, entry
@@ -145,14 +147,14 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
 
 
 def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, LedgerEntry]:
-    """Assign a received frame; returns the new ledger, and the frame's trigger and angle.
+    """Assign a received frame. Returns the new ledger, and the trigger and the angle of the frame.
 
     Frames come in the order in which they were exposed.
 
     Args:
-        time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
-        steady: True if the stage rotated at constant speed; otherwise `time` is the time at which the trigger would
-            have come at constant speed, and must fit better.
+        time: time of the frame's trigger in s; nan: it is not known which trigger exposed the frame. steady: True if
+            the stage rotated at constant speed. If False, `time` is the time at which the trigger would have come at
+            constant speed, and must match more precisely.
     """
     train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):
@@ -195,7 +197,7 @@ def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool 
     after = replace(
         ledger,
         exposed=max(frame.framestamp, ledger.exposed),
-        # An extra frame is accounted for: it takes no part in the count of exposures between two triggers.
+        # An extra frame is known, so it does not count among the exposures between two triggers.
         unmatched=ledger.unmatched + max(new_exposures - 1, 0),
         extra=(*ledger.extra, frame.framestamp),
         beyond=ledger.beyond + beyond,
@@ -208,7 +210,8 @@ def settle(ledger: Ledger, cut_short: bool = False) -> Ledger:
     """Close the ledger: every trigger after the last frame is marked missing.
 
     Args:
-        cut_short: the scan was stopped; triggers after the last frame were not waited for and do not count as missing.
+        cut_short: True if the scan was stopped. The scan did not wait for triggers after the last frame, so they do not
+            count as missing.
     """
     at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
     shift = _shift(ledger, None if cut_short else len(at_the_end))
@@ -220,15 +223,17 @@ def start_known(train: Train) -> bool:
 
 
 def _off(ledger: Ledger, trigger: int, time: float) -> float:
-    """Periods from the expected time of a frame's trigger to the frame; negative: the frame came before."""
+    """Periods from the expected time of a frame's trigger to the frame; negative if the frame came earlier."""
     if ledger.last >= 0:
         return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
     return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger
 
 
 def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
-    """The first frames that belong to a train of triggers: those that come most regularly, whole periods apart."""
-    best: list[tuple[float, tuple[int, ...]]] = []  # the best train that ends with each frame, and how good it is
+    """The first frames that belong to a train of triggers: the frames that are most regularly spaced, whole periods
+    apart."""
+    # the best train that ends with each frame, and a measure of its quality
+    best: list[tuple[float, tuple[int, ...]]] = []
     for i, time in enumerate(times):
         trains: list[tuple[float, tuple[int, ...]]] = [(0.0, (i,))]
         for good, chain in best:
@@ -248,10 +253,10 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     """Position in periods, trigger, and distance between the two, of the first frame.
 
     Args:
-        framestamp: exposures before it, without those that no trigger made.
+        framestamp: number of exposures before the frame, without those that no trigger made.
 
-    If the expected time is not precise enough, framestamps decide. No trigger was ignored before the first frame,
-    because an armed, idle camera takes every trigger.
+    If the expected time is not precise enough, framestamps decide. The camera ignored no trigger before the first
+    frame, because an armed, idle camera accepts every trigger.
     """
     if train.first is None:
         return float(framestamp), framestamp, 0.0
@@ -265,8 +270,8 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
     """The largest shift of all angles that the time of the first frame allows.
 
     Args:
-        at_the_end: triggers without a frame there; None if it is not known: then as many as the first frame's time
-            suggests.
+        at_the_end: number of triggers without a frame at the end. None: it is not known, and the number that the time
+            of the first frame suggests is used.
     """
     if ledger.last < 0:
         return 0
@@ -281,7 +286,7 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
 
 
 def _follow(before: Ledger, after: Ledger, time: float, steps: int, residual: float) -> Ledger:
-    """Let phase and period follow the frames slowly enough that jitter averages out."""
+    """Update phase and period with a frame, slowly enough that jitter averages out."""
     nominal = after.train.period
     error = residual * before.period
     low, high = nominal * (1 - PERIOD_RANGE), nominal * (1 + PERIOD_RANGE)

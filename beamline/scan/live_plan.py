@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from beamline.core.text import count, size
 from beamline.plan.plan import Mode, ScanPlan, one_way
 
-# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 projections.
+# Bytes for line integrals, fit and voxel refinement, measured with 128 x 256 pixels and 300 projections.
 _A_RAY, _A_VOXEL = 40, 50
 _WIDEST = 512  # columns: no processor can reconstruct a wider volume as fast as projections arrive
 _FEWEST = 90  # projections
 _SHARE = 0.5  # share of the free memory
-_PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
+_PASSES = range(8, 1, -1)  # numbers of passes of an interlaced scan, the best first
 _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
-"""dB of the live volume after a quarter, half and three quarters: 90 views of particles."""
+"""PSNR in dB of the live volume after a quarter, half and three quarters of a scan of particles with 90 projections."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class LivePlan:
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Choose binning and omitted projections so that the live volume has at most 512 columns and fits half of the free
-    memory.
+    """Choose binning and omitted projections so that the live volume has at most 512 columns and fits into half of the
+    free memory.
 
-    Projections are left out as long as 90 are used, then the binning grows.
+    First, projections are left out, as long as at least 90 are used. Then the binning is increased.
 
     Args:
         shape: rows and columns of a frame.
@@ -56,8 +56,8 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that recommends an order of angles with a better live volume before the end; empty if the plan already
-    has it.
+    """A sentence that recommends an order of angles with which the live volume is better before the end of the scan;
+    empty if the plan already has such an order.
     """
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:

@@ -30,25 +30,26 @@ from recon.methods import streams
 if TYPE_CHECKING:
     from beamline.scan.resume import ResumableRun
 
-LiveCommand = Callable[[Path, Path], Sequence[str]]  # (scan file, output file) -> the command line
+# function of scan file and output file that returns the command line
+LiveCommand = Callable[[Path, Path], Sequence[str]]
 
-_SILENCE = 300.0  # real s without output after which the process is ended
-_GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
+_SILENCE = 300.0  # real time in s without output after which the process is ended
+_GRACE = 120.0  # real time in s for which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
 _AGAIN = 2  # how often it is started again
 _SHOWN_WITHIN = 10.0  # real s after the scan
 _POLL = 0.1  # real s between two checks of its readiness
 _SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
-"""Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
-within 10 s; the time that the scan takes to end counts."""
+"""Real time in s from the request to stop a scan to the request for the volume of the live reconstruction. With this
+time, the volume comes within 10 s. The time that the scan takes to end is included."""
 
 
 def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequence[Path] = ()) -> LiveCommand:
     """The command `beamline recon SCAN --follow` with the options of the configuration.
 
     Args:
-        earlier: files of the same scan, whose projections come first.
+        earlier: earlier files of the same scan. Their projections come first.
     """
     plan = plan or LivePlan()
     options = _common(config)
@@ -69,7 +70,8 @@ def finished_command(config: Config) -> LiveCommand:
 
 @dataclass(frozen=True)
 class Commands:
-    """The commands that reconstruct a scan: while it runs, or when it is complete; neither: no reconstruction.
+    """The commands that reconstruct a scan while it runs, or when it is complete. If both are None, there is no
+    reconstruction.
 
     Attributes:
         live: while the scan runs; it makes the volume, unless it only `draws` pictures and ends with the scan.
@@ -121,7 +123,7 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     """True if the live reconstruction of an ended scan should end with its present volume.
 
-    That is after a new stop, or ASK_LIVE_AFTER after the stop of the scan; also if the file is `useless`: broken or
+    It should end after a new stop, ASK_LIVE_AFTER after the stop of the scan, or if the file is `useless`: damaged or
     without projections.
     """
     last = ASK_LIVE_AFTER if stop.stopping else 0.0
@@ -129,12 +131,13 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
 
 
 def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
-    """A function that is called during the wait for the live volume after a scan; it returns True if the scan was
-    aborted, and the live reconstruction is then killed.
+    """A function that is called during the wait for the live volume after a scan. It returns True if the scan was
+    aborted; then the live reconstruction is killed.
 
-    For a stopped scan it reports how long the wait has lasted, when first called and then every 5 s.
+    For a stopped scan, the function reports the duration of the wait, at its first call and then every 5 s.
     """
-    asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0  # for the volume, see `live_should_end`
+    # waiting time for the volume, see `live_should_end`
+    asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0
     due, most = 0.0, asked_at + _GRACE
 
     def aborting() -> bool:
@@ -154,21 +157,21 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
 class LiveReconstruction:
     """A running reconstruction whose events are passed on, each marked with source="recon".
 
-    Its `done` becomes `recon_done` and its `failed` a warning, because `done` and `failed` belong to the scan. Its
-    stderr goes to the file `log`. If the process cannot be started, that is a warning, too. It ends with this process,
-    also if this one is killed, and then leaves no volume. If a signal kills it during the scan, it is started again, at
-    most twice: the file has all projections, and the final fit makes up for the lost steps.
+    Its event `done` becomes `recon_done`, and its event `failed` becomes a warning, because `done` and `failed` belong
+    to the scan. Its stderr goes to the file `log`. If the process cannot be started, there is only a warning. The
+    process ends when this process ends, even if this process is killed; it then leaves no volume. If a signal kills it
+    during the scan, it is started again, at most twice. No data are lost, because the file has all projections, and the
+    final fit makes up for the lost steps.
 
     Args:
         on_law: function that gets each measured error model, in the thread that reads the output.
-        what: its name in messages.
-        silence: s without output after which `finish` stops it.
-        low_priority: a scan on the same computer takes precedence.
-        child: starts the process, as `Standby.start`.
+        what: name of the reconstruction in messages. silence: time in s without output after which `finish` stops the
+            process. low_priority: True if a scan on the same computer takes precedence. child: function that starts the
+            process, such as `Standby.start`.
 
     Attributes:
-        ended: no error model will come: the process could not be started, or ended during the scan and is not started
-            again.
+        ended: True if no error model will come, because the process could not be started, or ended during the scan and
+            is not started again.
     """
 
     def __init__(
@@ -189,7 +192,7 @@ class LiveReconstruction:
         self._ready, self._shown = threading.Event(), threading.Event()
         self._process: ChildProcess | None = None
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
-        self._changing = threading.Lock()  # protects the process and the wish for another one
+        self._changing = threading.Lock()  # protects the process, and the request for another one
         with self._changing:
             self._start("a" if self._log.exists() else "x")
 
@@ -207,7 +210,7 @@ class LiveReconstruction:
         """Wait until the reconstruction has compiled its kernels or ended, `stop` returns True, or the timeout (s of
         real time) has passed; `say` gets a sentence on what the scan waits for.
 
-        After a timeout there is only a warning, because the scan can start without the reconstruction.
+        After a timeout, there is only a warning, because the scan can start without the reconstruction.
         """
         deadline = time.monotonic() + seconds
         if not self._ready.is_set():
@@ -228,11 +231,12 @@ class LiveReconstruction:
                 return
 
     def finish(self, stop: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
-        """Wait until it ends; returns the data of its `done` event, or None if it failed.
+        """Wait until the reconstruction ends. Returns the data of its event `done`, or None if it failed.
 
         Args:
-            stop: polled a few times a second; True asks it to end with its present volume.
-            hurry: polled in the same way, also while it ends; True kills it. It may report how long the wait takes.
+            stop: function that is called a few times a second; if it returns True, the reconstruction is asked to end
+                with its present volume. hurry: function that is called in the same way, also while the reconstruction
+                ends; if it returns True, the process is killed. It may also report the duration of the wait.
         """
         with self._changing:
             process, self._wanted = self._process, False
@@ -257,15 +261,15 @@ class LiveReconstruction:
                 return
 
     def close(self) -> None:
-        """Terminate it if it is still running."""
+        """End the process if it is still running."""
         with self._changing:
             process, self._wanted = self._process, False
         if process is not None:
             process.end(_CLOSE)
 
     def _on_end(self) -> None:
-        """Warn at once if it ends while the scan runs, because the operator watches a volume that does not grow; start
-        it again if it was killed."""
+        """Warn at once if the process ends while the scan runs, because otherwise the operator would watch a volume
+        that does not grow. If the process was killed, start it again."""
         with self._changing:
             process = self._process
             if not self._wanted or self._done is not None or process is None:
@@ -312,14 +316,15 @@ class LiveReconstruction:
 
 
 class Standby:
-    """A process that loads a live reconstruction before its scan begins, and then becomes it, until `close`."""
+    """A process that loads the modules of a live reconstruction before a scan begins, and then runs the reconstruction.
+    `close` ends it."""
 
     def __init__(self) -> None:
         self._process: ChildProcess | None = None
 
     def prepare(self) -> None:
-        """Start a waiting process, unless there already is one; if the start fails, the error appears when the process
-        is used."""
+        """Start a waiting process, unless there already is one. If the start fails, the error is raised when the
+        process is used."""
         if self._process is None or not self._process.running:
             with suppress(OSError), Path(os.devnull).open("w") as nowhere:
                 self._process = ChildProcess(
@@ -330,7 +335,8 @@ class Standby:
         self, command: Sequence[str], stderr: TextIO, on_line: Callable[[str], None], *, on_end: Callable[[], None],
         tether: bool, behind: bool,
     ) -> ChildProcess:  # fmt: skip
-        """Run a command of this program as a `ChildProcess`: in the waiting process, or else in a new one."""
+        """Run a command of this program as a `ChildProcess`, in the waiting process if there is one, otherwise in a new
+        process."""
         process, self._process = self._process, None
         if process is None or not process.running:
             return ChildProcess(command, stderr, on_line, tether=tether, on_end=on_end, behind=behind)
@@ -344,7 +350,7 @@ class Standby:
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """Reconstruct a complete scan, and return the data of the event `done`, as `LiveReconstruction.finish` does."""
+    """Reconstruct a complete scan in a separate process, and return the data of its event `done`; None if it failed."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

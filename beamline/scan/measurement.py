@@ -41,17 +41,17 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame
 
 READY_WITHIN = 300.0
-"""Real s that a scan waits for its live reconstruction, which compiles once on a machine: before its first frame. A
-simulated one, whose references do not age, waits before its first view."""
+"""Longest real time in s for which a scan waits for its live reconstruction, which compiles its kernels once on a
+machine. A scan waits before its first frame. A simulated scan waits before its first projection, because its darks and
+flats do not age."""
 
 
 class FrameSource(Protocol):
-    """Delivers the frames of a scan, as `Acquisition` does on our devices.
+    """An object that delivers the frames of a scan, as `Acquisition` does with the devices of this program.
 
-    Attributes, to be read after the last frame:
-        missing: triggers, counted over the whole plan, that gave no frame.
-        recovered: projections that gave no frame at first, but gave one when they were repeated.
-        unsafe: a device failed while the instrument was made safe.
+    Attributes, to be read after the last frame: missing: triggers (counted over the whole plan) that gave no frame.
+        recovered: number of projections that gave no frame at first, but gave one when they were taken again. unsafe:
+        True if a device failed while the instrument was made safe.
     """
 
     recovered: int
@@ -61,7 +61,7 @@ class FrameSource(Protocol):
     def missing(self) -> list[int]: ...
 
     def frames(self) -> Generator[Frame, None, None]:
-        """The frames in the order of the file. Raises LedgerError after the last one if some are missing."""
+        """Yields the frames in the order of the file. Raises LedgerError after the last frame if frames are missing."""
 
 
 Turn = Callable[["Measurement", Callable[[], bool]], None]
@@ -69,7 +69,7 @@ Turn = Callable[["Measurement", Callable[[], bool]], None]
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The frames of a scan on connected devices, from the first one to the closed file.
+    """One scan on connected devices, from the first frame to the closed file.
 
     Attributes:
         began: time at which the run began, on the monotonic clock.
@@ -179,7 +179,7 @@ class Measurement:
         early = "stopped" if isinstance(ended.error, ScanStopped) else "failed"
         status, reason = ("complete", "") if ended.error is None else (early, user_message(ended.error))
         with ended.kept():
-            if not recorder.hangs:  # a write that does not return holds HDF5's lock: closing would wait for it
+            if not recorder.hangs:  # a write that does not return holds the lock of HDF5, and closing would wait for it
                 writer.close(status, missing, beam.readings, reason)
                 closed = True
         with ended.kept():
@@ -225,7 +225,7 @@ class Measurement:
     ) -> None:
         if self.config.simulation is None and self.source_of is None:
             self._wait_for(follower)
-        # Closing the iterator makes the instrument safe if the recorder fails.
+        # If the recorder fails, closing the iterator makes the instrument safe.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
                 self.decider.began = min(self.decider.began, frame.time)
@@ -285,7 +285,8 @@ class Measurement:
         return acquisition
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
-        """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
+        """The reason why no projection should be taken after these darks and flats. None: they have no fault, or faults
+        are only logged."""
         recorder.wait()
         if self.config.simulation is not None:
             self._wait_for(follower)
@@ -303,7 +304,8 @@ class Measurement:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Projections that are taken again because they were flagged or gave no frame; they are announced."""
+        """Projections that are taken again because they were flagged or gave no frame. Their number is announced to the
+        recorder."""
         chosen, n_bad = self._to_retake(recorder, missing)
         if not chosen:
             return ()
@@ -320,8 +322,8 @@ class Measurement:
         return chosen
 
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
-        """Projections that may be taken again now, and how many were flagged or gave no frame. If more than the plan
-        allows, an even selection.
+        """Projections that may be taken again now, and the number of those that were flagged or gave no frame. If there
+        are more than the plan allows, an evenly spread part of them.
         """
         allowed = self.ready.plan.retakes - recorder.announced - self.decider.retaken
         if allowed <= 0:
@@ -335,15 +337,15 @@ class Measurement:
 
 
 def wait_in_pause(recorder: Recorder) -> bool:
-    """Wait a moment during a pause, and check the disk; returns whether Enter was pressed at the terminal."""
+    """Wait a moment during a pause, and check the disk. Returns True if Enter was pressed at the terminal."""
     time.sleep(PAUSE_POLL)
     recorder.check()
     return enter_pressed()
 
 
 class _Ending:
-    """Collects the error that ends a run, and raises it after everything is closed. Any other error has precedence over
-    a stop or lost frames, which become a warning.
+    """Collects the error that ends a run, and raises it after everything is closed. If there are several errors, other
+    errors take precedence over a stop or lost frames, which become a warning.
     """
 
     def __init__(self, sink: Sink) -> None:
@@ -352,7 +354,7 @@ class _Ending:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """A step whose failure does not prevent the next ones."""
+        """A step whose failure does not prevent the following steps."""
         try:
             yield
         except BaseException as after:

@@ -1,5 +1,5 @@
-"""Moves: brings stage, shutter and sample to the positions that a block needs, checks them afterwards, and leaves
-them safe.
+"""Moves: brings stage, shutter and sample to the positions that a block needs, checks the positions afterwards, and
+makes the instrument safe.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices, Rechecked, RotationStage
 
 WRITTEN = "Writing the last frames"  # Message of the state `finishing`
-SAFE = "Stage stopped, shutter closed; writing the last frames"  # the same for devices of this program
+SAFE = "Stage stopped, shutter closed; writing the last frames"  # the same, if this program operates the devices
 UNSAFE = (
     "DANGER: stage, camera or shutter did not respond at the end of the scan. Check the instrument "
     "before anybody goes near the beam; writing the last frames"
 )
-"""The same where a device failed while the instrument was made safe; warnings name it."""
+"""The same if a device failed while the instrument was made safe. Warnings name the device."""
 POLL = 0.02  # s between status queries of a moving stage
 
 
 def go(stage: RotationStage, angle: float, clock: Clock, stop: StopRequest, *, until_stop: bool = True) -> bool:
-    """Move to `angle` at full speed and wait; returns False if a stop (or only an abort) interrupted the move."""
+    """Move to `angle` at full speed and wait. Returns False if a stop (or, on request, only an abort) interrupted the
+    move."""
     limits = stage.limits
     distance = angle - stage.position()
     stage.start_move(angle, limits.max_speed)
@@ -38,7 +39,7 @@ def go(stage: RotationStage, angle: float, clock: Clock, stop: StopRequest, *, u
 
 
 def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest, until_stop: bool = True) -> bool:
-    """Wait for a move that should take `seconds`; False if a stop cut it short."""
+    """Wait for a move that should take `seconds`. Returns False if a stop ended it early."""
     deadline = clock.now() + 2 * seconds + 5.0
     while stage.moving():
         stop.refuse_abort()
@@ -48,7 +49,7 @@ def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest
         if clock.now() > deadline:
             break
         clock.sleep(POLL)
-    stage.wait(timeout=POLL)  # raises if the stage still moves or stopped short
+    stage.wait(timeout=POLL)  # raises an error if the stage still moves, or stopped before reaching the angle
     return True
 
 
@@ -65,7 +66,7 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
 
 
 def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
-    """Position of the stage during the exposure of a frame that was planned at `angle`, and a sentence if this position
+    """Position of the stage during the exposure of a frame that was planned at `angle`, and a sentence if the position
     is wrong.
 
     The frame exists, and the stage was at `before` (rad) when its exposure began.
@@ -82,10 +83,10 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
 
 
 def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[], None]) -> None:
-    """Move shutter and sample to the positions that the block needs; if the shutter does not move, the scan ends.
+    """Move shutter and sample to the positions that the block needs. If the shutter does not move, the scan ends.
 
     Args:
-        warm_up: called once a closed shutter has opened.
+        warm_up: function that is called after a closed shutter has opened.
     """
     shutter, sample, kind = devices.shutter, devices.sample, block.kind
     if kind is FrameKind.DARK:
@@ -101,10 +102,11 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
 
 
 def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
-    """Functions that test whether each device stays where this kind of frame needs it, by its name."""
+    """For each device, by name, a function that tests whether the device is still in the position that this kind of
+    frame needs."""
     shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
     if not shutter.by_hand:
-        # A scan that is stopped in a pause ends with a closed shutter.
+        # A scan that is stopped during a pause ends with a closed shutter.
         remembered[shutter.name] = lambda: "" if stop.stopping else _wrong_shutter(kind, shutter.is_open())
     for device in (devices.sample, devices.filter, devices.monochromator):
         if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
@@ -113,7 +115,7 @@ def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> d
 
 
 def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range, stop: StopRequest) -> None:
-    """Raise InstrumentError if a device has left the place that it had before a block."""
+    """Raise InstrumentError if a device has left the position that it had before a block."""
     moved = {name: problem for name, look in looks.items() if (problem := look())}
     if moved and rows and not stop.aborting:
         raise InstrumentError(
@@ -125,7 +127,7 @@ def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows:
 
 
 def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
-    """What is wrong with a shutter for this kind of frame; "" if it is as it must be."""
+    """A sentence if the state of a shutter is wrong for this kind of frame; "" if it is right."""
     if is_open is not (kind is FrameKind.DARK):
         return ""
     wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
@@ -135,24 +137,26 @@ def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
 def make_safe(
     devices: Devices, home: float | None, clock: Clock, stop: StopRequest, sink: Sink
 ) -> tuple[list[BaseException], bool]:
-    """Stop the stage, disarm, close the shutter; all steps are tried.
+    """Stop the stage, disarm camera and trigger output, and close the shutter. If a step fails, the others are still
+    tried.
 
     Args:
-        home: angle in rad to which the stage moves after the sample is back; None: neither moves.
+        home: angle in rad to which the stage moves after the sample was brought back. None: neither stage nor sample
+            moves.
 
     Returns:
-        The first error of each step, and True if stage, camera or shutter may still be as during the scan.
+        The first error of each step; and True if stage, camera or shutter may still be as during the scan.
     """
     stage, camera, shutter = devices.stage, devices.camera, devices.shutter
     failed: list[BaseException] = []
 
     def attempt(*ways: Callable[[], object]) -> bool:
-        """Try the actions in turn until one works: a serial line that failed once often works again."""
+        """Try the actions one after the other until one works. (A serial line that failed once often works again.)"""
         failures: list[BaseException] = []
         for way in ways:
             try:
                 way()
-            except ScanAborted:  # requested while the stage was moving here
+            except ScanAborted:  # the stop was requested while the stage was moving here
                 return attempt(stage.abort, stage.abort)
             except BaseException as error:  # a failure of one device must not leave the others unsafe
                 failures.append(error)
@@ -176,5 +180,5 @@ def make_safe(
 
 
 def in_words(error: BaseException) -> str:
-    """The message of an error; with its type if it is not an error of this program."""
+    """The message of an error. If it is not an error of this program, the message includes its type."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"

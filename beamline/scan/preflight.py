@@ -1,4 +1,4 @@
-"""Preflight: check a scan before anything moves, without devices (dry run) or with connected ones."""
+"""Preflight: checks a scan before anything moves, without devices (dry run) or with connected devices."""
 
 from __future__ import annotations
 
@@ -40,11 +40,12 @@ from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, Tr
 from drivers.orca_quest import PITCH_MM
 from recon.methods import streams
 
-Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earlier files of the same scan
+# Function that removes from a plan the frames that earlier files of the same scan contain
+Remaining = Callable[[ScanPlan], ScanPlan]
 
 
 def all_of(plan: ScanPlan) -> ScanPlan:
-    """The whole plan."""
+    """Returns the whole plan unchanged."""
     return plan
 
 
@@ -66,7 +67,7 @@ class StateNeeds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DryRun:
-    """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
+    """A scan that was planned without devices: plan, timeline, limits of stage and camera, and free bytes on the disk.
 
     For a series it is the first scan; `energies` or `states` lists the needs of each scan.
 
@@ -88,7 +89,7 @@ class DryRun:
     every: float | None = None
 
     def lines(self) -> list[str]:
-        """Lines of text, without violations: `refuse_violations` states them."""
+        """The plan as lines of text. Violations are not included; `refuse_violations` reports them."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
         each, needs = self.energies, self.needs
         if each:
@@ -115,7 +116,7 @@ class DryRun:
         )
 
     def data(self) -> Mapping[str, Any]:
-        """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
+        """The numbers in these lines, for programs, in s, rad, bytes and pixels."""
         worked, views = self.timeline, self.timeline.views
         return {
             **self.needs.data(),
@@ -141,7 +142,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Warnings of implausible values, for example because of a wrong unit; empty if all are plausible."""
+    """Warnings about implausible values, for example because of a wrong unit; empty if all values are plausible."""
     theta = np.degrees(plan_of(config).angles)
     ends = float(np.ptp(theta))
     spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
@@ -162,7 +163,8 @@ def _doubt_optics(config: Config) -> str:
     """
     optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
+    # mm; half the width of the field of view
+    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
             f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
@@ -196,7 +198,7 @@ def dry_run(
 
     Raises:
         ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
-            timeline's violations.
+            violations of the timeline.
     """
     each = [one for one in each_scan(settings) if (one.scan.state or one.scan.energy) not in whole]
     if settings.scan.energies is not None and len(each) > 1:  # a scene is read at both ends of the energy range
@@ -294,7 +296,7 @@ def _worked(
 
 
 def _lockable(worked: Timeline, no_locking: str) -> Timeline:
-    """The plan, with a violation if files in its folder cannot be locked."""
+    """The plan, with an additional violation if files in its folder cannot be locked."""
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
 
@@ -308,10 +310,9 @@ def refuse_violations(worked: Timeline) -> None:
 
 
 def disk_of(folder: Path) -> Path:
-    """`folder`, or its nearest existing parent, which is on the same disk.
+    """`folder` if it exists, otherwise its nearest existing parent, which is on the same disk.
 
-    Raises:
-        ConfigError: a file has this name, or the disk does not exist.
+    Raises: ConfigError: a file has the name of the folder, or the disk does not exist.
     """
     folder = folder.absolute()
     if link := broken_link(folder):
@@ -334,10 +335,10 @@ class ReadyScan:
 
     plan: ScanPlan
     timeline: Timeline
-    settings: CameraSettings  # of the camera for the projections, as it accepted them
-    timing: CameraTiming  # of the camera with these settings
+    settings: CameraSettings  # settings of the camera for the projections, as the camera has accepted them
+    timing: CameraTiming  # timing of the camera with these settings
     monitor: Monitor  # before the first frame
-    info: ScanInfo  # written into the file before the first frame
+    info: ScanInfo  # metadata that are written into the file before the first frame
 
 
 def preflight(
@@ -350,9 +351,9 @@ def preflight(
     """Read the limits of the devices, and compute the plan for them. Nothing moves.
 
     Args:
-        runs: where the file will be, for the free disk.
-        remaining: the part of the plan that is still to be taken.
-        check_stop: function that is called between long steps, such as loading kernels; an exception from it ends them.
+        runs: folder in which the file will be, for the free disk space. remaining: function that returns the part of
+            the plan that must still be taken. check_stop: function that is called between long steps, such as loading
+            kernels; an exception from it ends the work.
 
     Raises:
         ConfigError: the plan is impossible, limits are exceeded (all are listed), or the simulated scene cannot be
@@ -380,10 +381,10 @@ def ready_scan(
     info: ScanInfo,
     check_stop: Callable[[], None] = lambda: None,
 ) -> ReadyScan:
-    """A planned scan, with the state of the monitor before the first frame; the sections `monitor` and `storage` of
+    """A planned scan, with the state of the monitor before the first frame. The sections `monitor` and `storage` of
     `config` are used."""
     monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
-    # The first call compiles, which must not happen while frames arrive.
+    # The first call compiles kernels, which must not happen while frames arrive.
     check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     check_stop()
@@ -395,7 +396,8 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
         saturation=_saturation(timing),
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
-        step=usual_step(np.radians(np.degrees(plan.angles[:: plan.frames_per_view]))),  # as the file states them
+        # in the form in which the file states them
+        step=usual_step(np.radians(np.degrees(plan.angles[:: plan.frames_per_view]))),
         frames_per_view=plan.frames_per_view,
         stored=plan.stored,
         cone=info.source_distance_mm is not None,
@@ -404,7 +406,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
 
 
 def _saturation(timing: CameraTiming) -> int:
-    """The count from which a pixel is saturated."""
+    """The number of counts from which a pixel counts as saturated."""
     return int(2**timing.bits - 1)
 
 
@@ -438,13 +440,13 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Metadata of the file that do not depend on the plan; filter and energy as currently set. Raises DeviceError if a
-    device does not answer.
+    """Metadata of the file that do not depend on the plan. Filter and energy have their present values. Raises
+    DeviceError if a device does not answer.
     """
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
-        # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
+        # The cone beam of the scene in the form of NXtomo, in which the pixel size is that on the detector.
         source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     energy = None if devices.monochromator is None else devices.monochromator.energy()

@@ -1,4 +1,5 @@
-"""Plan of a queue: which of several scans can run, what each needs, and what all of them need, without devices."""
+"""Plan of a queue, made without devices: which of several scans can run, the needs of each, and the needs of all
+together."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ from beamline.scan.preflight import DryRun
 
 @dataclass(frozen=True)
 class ScanFault:
-    """Why a scan cannot run: a sentence. file, line: where the value is given; None: the value is not in a file, or the
-    sentence concerns several lines."""
+    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file. None: the value is not
+    in a file, or the sentence concerns several lines."""
 
     message: str
     file: str | None = None
@@ -33,18 +34,16 @@ class ScanFault:
 
 @dataclass(frozen=True, eq=False)
 class PlannedScan:
-    """One scan of a queue, with the plan that was made for it without devices.
+    """One scan of a queue, with its plan, which was made without devices.
 
     Attributes:
         source: the file of its configuration, or the line of its table (day.csv:3).
         sample: name of the sample; empty if the configuration cannot be read.
-        faults: why the scan cannot run; empty: it can.
-        warnings: sentences on values that are unusual, for example because of a wrong unit.
-        needs: time, frames, bytes, dose, and what the operator has to do; all 0 if they cannot be computed.
-        disk: an existing folder on the disk of the file; None: there is no file.
+        faults: reasons why the scan cannot run; empty: the scan can run. warnings: sentences on unusual values, for
+            example because of a wrong unit. needs: time, frames, bytes, dose, and what the operator has to do; all are
+            0 if they cannot be computed. disk: an existing folder on the disk of the file; None: there is no file.
         config: the configuration; None if it cannot be read.
-        worked: timeline and limits; None if they cannot be
-            computed.
+        worked: the plan with its timeline and limits; None if it cannot be computed.
     """
 
     source: str
@@ -62,7 +61,7 @@ class PlannedScan:
         return not self.faults
 
     def data(self) -> Mapping[str, Any]:
-        """The values as a mapping for other programs, in s, bytes and Gy."""
+        """The values as a mapping for other programs. Times are in s, sizes in bytes, doses in Gy."""
         facts = {name: getattr(self, name) for name in ("source", "sample", "valid", "faults", "warnings")}
         return {**(self.worked.data() if self.worked else {}), **self.needs.data(), **facts}
 
@@ -72,11 +71,9 @@ class QueuePlan:
     """Several scans, one after the other, planned without devices.
 
     Attributes:
-        scans: in their order.
-        faults: reasons why each scan alone can run, but not all of them, such as a disk that is too small for all
-            files.
-        needs: of the scans that can run, together.
-        free_bytes: free space on the fullest of the disks; 0 if no scan can run.
+        scans: the scans in their order. faults: reasons why not all scans can run although each alone could, such as a
+            disk that is too small for all files. needs: needs of all scans that can run, together. free_bytes: free
+            space in bytes on the fullest of the disks; 0 if no scan can run.
     """
 
     scans: tuple[PlannedScan, ...]
@@ -90,7 +87,7 @@ class QueuePlan:
         return not self.faults and all(scan.valid for scan in self.scans)
 
     def lines(self) -> list[str]:
-        """Lines to print: one for each scan, then the time of each part, then the sums."""
+        """The plan as lines to print: one line for each scan, then the time of each part, then the sums."""
         rows = [(scan.sample or "-", scan.source, "yes" if scan.valid else "no", *_cells(scan)) for scan in self.scans]
         head = ("scan", "from", "can run", "frames", "size (MB)", "time (h:min:s)", "requests", "dose (Gy)")
         needs, can_run = self.needs, sum(scan.valid for scan in self.scans)
@@ -106,12 +103,13 @@ class QueuePlan:
         ]  # fmt: skip
 
     def data(self) -> Mapping[str, Any]:
-        """The plan as a mapping for other programs: s, bytes and Gy of each scan and of all scans."""
+        """The plan as a mapping for other programs, for each scan and for all scans together. Times are in s, sizes in
+        bytes, doses in Gy."""
         facts = {"valid": self.valid, "faults": self.faults, "free_bytes": self.free_bytes}
         return {"scans": [scan.data() for scan in self.scans], **facts, **self.needs.data()}
 
     def refuse_impossible(self) -> None:
-        """Raise ConfigError with all faults of all scans. Nothing was started."""
+        """Raise ConfigError with all faults of all scans, if there are any. Nothing was started."""
         found = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
         if found or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")
@@ -124,7 +122,7 @@ def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:
     """The plan of these scans together."""
     planned = tuple(scans)
     can_run = [scan for scan in planned if scan.valid]
-    disks = dict[int, tuple[Path, int]]()  # a folder on each, and the bytes that are needed there
+    disks = dict[int, tuple[Path, int]]()  # for each disk, a folder on it and the bytes that are needed there
     for scan in can_run:
         if scan.disk is not None:
             folder, needed = disks.get(number := scan.disk.stat().st_dev, (scan.disk, 0))
@@ -143,13 +141,13 @@ def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:
 
 
 def _named(scan: PlannedScan, fault: ScanFault) -> str:
-    """A line about a fault, which names its scan."""
+    """A line about a fault, with the name of its scan."""
     text, sample = str(fault), f" ({scan.sample})" if scan.sample else ""
     return text if text.startswith(scan.source) else f"{scan.source}{sample}: {text}"
 
 
 def _cells(scan: PlannedScan) -> tuple[str, ...]:
-    """Frames, MB, time, requests to the operator and dose (Gy) as text; `-` for what is not known."""
+    """Frames, MB, time, requests to the operator and dose (Gy) as text; `-` for a value that is not known."""
     needs = scan.needs
     if not needs.parts:
         return ("-",) * 5

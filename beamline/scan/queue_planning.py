@@ -1,4 +1,4 @@
-"""Planning of a queue: reads configurations and tables of several scans, and finds out what is wrong with each."""
+"""Planning of a queue: reads the configurations and tables of several scans, and finds the faults of each scan."""
 
 from __future__ import annotations
 
@@ -35,18 +35,17 @@ def plan_queue(
     rehearse: bool = False,
     no_live: Callable[[str], None] | None = None,
 ) -> QueuePlan:
-    """Plan several scans without devices. A scan that cannot run does not end the planning of the others.
+    """Plan several scans without devices. If a scan cannot run, the others are still planned.
 
     Args:
-        scans: files of configurations, tables of scans, rows of such tables as mappings, and scans that were planned
-            already. A table is a CSV file. Its first line names the column `config`, the file of a configuration
-            (relative to the table), and keys of configurations, whose values go before those of the file; an empty cell
-            changes nothing.
-        overrides: of all scans, after those of a table.
-        place: folder in which the folders of the runs would be created; None: the configured ones.
-        rehearse, no_live: as of `load`.
+        scans: files of configurations, tables of scans, rows of such tables as mappings, and scans that are already
+            planned. A table is a CSV file. Its first line has the name `config`, for the column with files of
+            configurations (relative to the table), and names of keys. The values of these keys replace those of the
+            file; an empty cell changes nothing. overrides: overrides for all scans, which are applied after those of a
+            table. place: folder in which the folders of the runs would be created; None: the configured folder of each
+            scan. rehearse, no_live: as in `load`.
     """
-    locks = cache(no_locks)  # once a folder: on a network disk it takes a while
+    locks = cache(no_locks)  # only once per folder, because it takes time on a network disk
 
     def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
         try:
@@ -60,7 +59,8 @@ def plan_queue(
 
 
 def _described(scan: Path | Mapping[str, object] | PlannedScan) -> Iterator[_Described | PlannedScan]:
-    """The scans of a file, a table or a row; those that are not described as expected are planned with that fault."""
+    """The scans of a file, a table or a row. If the description of a scan is wrong, the scan is returned with this
+    fault."""
     if isinstance(scan, PlannedScan):
         yield scan
         return
@@ -119,16 +119,15 @@ def plan_of_config(
     """The planned scan of a configuration.
 
     Args:
-        place, source: as in `plan_queue` and `PlannedScan`.
-        read: the configuration with its places, and with what is wrong with it; None: nothing is known to be.
-        locks: as in `dry_run`.
+        place, source: as in `plan_queue` and `PlannedScan`. read: the configuration with the places of its values and
+            its faults; None: no faults are known. locks: as in `dry_run`.
     """
     faults = [] if read is None else [_placed_at(at, sentence) for at, sentence in read.faults]
     planned = PlannedScan(source, config.sample.name, config=config)
     try:
         unusual = doubts(config)
         worked = dry_run(config, place, locks=locks)
-    except (ConfigError, DataError, OSError) as error:  # which the faults of the values may have caused
+    except (ConfigError, DataError, OSError) as error:  # the faults of the values may have caused this error
         return replace(planned, faults=tuple(faults or [_named_in(read, fault) for fault in _faults_of(error)]))
     warnings = [warning for warning in unusual if all(warning not in fault.message for fault in faults)]
     faults += [_named_in(read, ScanFault(sentence)) for sentence in worked.timeline.violations]
@@ -143,7 +142,7 @@ def _faults_of(error: Exception, file: str | None = None) -> tuple[ScanFault, ..
 
 
 def _placed_at(place: str, sentence: str) -> ScanFault:
-    """The fault of a value by its place: file:line, or an option or a variable."""
+    """The fault of a value, made from its place: file:line, an option, or a variable."""
     file, _, line = place.rpartition(":")
     is_file = line.isdecimal() and not place.startswith("--")
     return ScanFault(sentence, file, int(line)) if is_file else ScanFault(f"{place}: {sentence}")

@@ -1,10 +1,11 @@
-"""Recorder: computes statistics of every frame, checks it and writes it, in threads of its own, so that acquisition
-never waits for the disk.
+"""Recorder: computes statistics of every frame, checks the frame and writes it, all in separate threads, so that the
+acquisition does not wait for the disk.
 
 Two threads handle the frames in order. The first computes the statistics of a frame and runs the checks of the monitor,
 while the second writes the previous frame. Both spend nearly all their time in code that releases the interpreter lock.
-The monitor sees each frame as a reader of the file will see it, in blocks that do not depend on the preview in the
-file, so that `beamline monitor FILE` finds the same. If a check hangs, the second thread continues without the first.
+The monitor gets each frame in the form in which a reader of the file will get it, in blocks that do not depend on the
+preview in the file. So `beamline monitor FILE` has the same findings. If a check hangs, the second thread continues
+without the first.
 """
 
 from __future__ import annotations
@@ -33,41 +34,40 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 
 LOOK = 1.0  # real s between two checks of the free space
-BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
-STALL = 60.0  # real s that a write may take, after which the disk counts as dead
-CHECKS = 60.0  # real s that the checks of a frame may take, after which they count as hanging
-COMPILES = 300.0  # the same for the first frame of a kind, whose checks may have to be compiled
+BRAKING = 5.0  # s for which frames may still come after a pause was requested
+STALL = 60.0  # real time in s of a write after which the disk counts as dead
+CHECKS = 60.0  # real time in s of the checks of a frame after which they count as hanging
+COMPILES = 300.0  # the same for the first frame of a kind, because checks may be compiled for it
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
-SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two checks of the stop request
+SLICE = 0.25  # real s: longest wait for space in the queue, or for a frame, between two checks of the stop request
 
 _Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
-"""A frame, its digests for the checks and for the file, and the flags; None: no check has looked at it."""
+"""A frame, its digests for the checks and for the file, and its flags (None: the frame was not checked)."""
 _Call = Callable[[], object]
 _Item = _Checked | BaseException | _Call | None
-"""What comes to the second thread. An exception: the frame could not be digested. A call: made when its turn comes."""
+"""Items for the second thread. An exception: the statistics of the frame could not be computed. A function: it is
+called when its turn comes."""
 
 
 class Recorder:
-    """Records frames given to `put`: each is checked by the monitor, and written with its checksum and flags.
+    """Records the frames that `put` gets. The monitor checks each frame, and the frame is written with its checksum and
+    flags.
 
-    Appended frames are flushed when no frame waits; otherwise the writer decides how often.
+    Frames are flushed to the file if no frame waits. If frames wait, the writer decides how often it flushes.
 
-    No frame is dropped: while the disk is too slow, `put` waits. A fly scan cannot wait for room, so it pauses before
-    the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish` raise DataError if a
+    No frame is dropped: if the disk is too slow, `put` waits. A fly scan cannot wait for space, so it pauses before the
+    queue is full. Every scan pauses before the disk is full. `put`, `check`, `wait` and `finish` raise DataError if a
     frame could not be written, or if a write takes longer than STALL. If checks hang, the monitor is switched off. A
     stop or an abort waits neither for the disk nor for the checks: frames that the camera still delivers are kept in
     memory.
 
     Args:
-        flagged: gets the flags of each frame.
-        pause: a request that pauses the scan.
-        stop: the stop request of the scan.
+        flagged: object that gets the flags of each frame. pause: request that pauses the scan. stop: stop request of
+            the scan.
 
     Attributes:
-        n_frames: written so far.
-        announced: frames beyond the timeline, from `expect_more`.
-        references: the darks and flats so far.
-        flagged: the flags so far.
+        n_frames: number of frames written so far. announced: number of frames beyond the timeline, from `expect_more`.
+            references: the darks and flats so far. flagged: the flags so far.
     """
 
     def __init__(
@@ -87,18 +87,19 @@ class Recorder:
         self._progress = FrameProgress(timeline)
         self._stop, self._pause = stop or StopRequest(), pause or PauseRequest()
         self._monitor_off = False
-        self._unjudged: list[int] = []  # frames that the monitor did not check
-        self._check_name = ""  # the check that is running, or ran last
-        self._handing = threading.Lock()  # for the next two values: only one thread passes the frame on
-        self._under_checks: tuple[Frame, float] | None = None  # the frame of the first thread, and since when
+        self._unjudged: list[int] = []  # rows of frames that the monitor did not check
+        self._check_name = ""  # name of the check that is running, or ran last
+        self._handing = threading.Lock()  # protects the next two values, so that only one thread passes the frame on
+        # the frame of the first thread, and the time since which it has the frame
+        self._under_checks: tuple[Frame, float] | None = None
         self._alone = False  # the second thread continues without the first
-        self._compiled: set[FrameKind] = set()  # kinds of frames that were checked
+        self._compiled: set[FrameKind] = set()  # kinds of frames that were checked so far
         self.n_frames = 0
         self._invalid: set[int] = set()  # rows that were invalid from the start
         self.announced, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
-        self._checking = self._writing = 0.0  # busy s of the threads
+        self._checking = self._writing = 0.0  # time in s for which the threads were busy
         self._most, views = room(timeline), timeline.views
         self._waiting: Queue[Frame | _Call | None] = Queue(self._most)
         self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
@@ -106,7 +107,7 @@ class Recorder:
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
         self._reserve = self._row_bytes * (self._most + in_work + on_the_way)
-        # True if the projections are a fly scan; True while it flies
+        # True if the projections are a fly scan; True while the stage flies
         self._flies, self._flying = bool(views.trains), False
         self._looked_at, self._writing_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
@@ -114,7 +115,7 @@ class Recorder:
         threading.Thread(target=self._check_frames, name="recorder's checks", daemon=True).start()
 
     def put(self, frame: Frame) -> None:
-        """Queue a frame for writing; waits while the queue is full."""
+        """Queue a frame for writing. The call waits as long as the queue is full."""
         self._enqueue(frame)
         if frame.kind is not FrameKind.INVALID:  # invalid frames may come in any block
             self._flying = frame.kind is FrameKind.PROJECTION and not self._retaking
@@ -122,12 +123,12 @@ class Recorder:
         self._raise_failure()
 
     def check(self) -> None:
-        """Check whether the disk answers, while no frames come."""
+        """Check whether the disk answers, at a time at which no frames come."""
         self._refuse_stall()
         self._raise_failure()
 
     def wait(self) -> None:
-        """Wait until every frame that was put is written, or a stop is requested."""
+        """Wait until every frame that was given to `put` is written, or until a stop is requested."""
         reached = threading.Event()
         self._enqueue(reached.set)
         while not reached.wait(SLICE) and not self._stop.stopping:
@@ -135,19 +136,20 @@ class Recorder:
         self._raise_failure()
 
     def end_pass(self) -> None:
-        """Record that the frames so far end a pass, if the scan makes decisions. Repeated projections end with it."""
+        """If the scan makes decisions, record that the frames so far end a pass. (Projections that were taken again
+        belong to this pass.)"""
         self._enqueue(self._writer.end_pass)
         if self._retaking:
             self.wait()
             self._retaking = False
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass (the values of its event), if the scan makes decisions."""
+        """If the scan makes decisions, record the choice after a pass (the values of its event)."""
         self._enqueue(lambda: self._writer.add_decision(values))
         self._enqueue(lambda: self._progress.expect_fewer(self.n_frames, int(str(values.get("dropped", 0)))))
 
     def finish(self) -> None:
-        """Wait until all queued frames are written; no frame may be put afterwards."""
+        """Wait until all queued frames are written. No frame may be given to `put` afterwards."""
         self._enqueue(None)
         while self.hangs:
             self._refuse_stall()
@@ -166,20 +168,20 @@ class Recorder:
         )
 
     def expect_more(self, n: int, seconds: float) -> None:
-        """Announce frames beyond the timeline; may be called while no frame waits."""
+        """Announce frames beyond the timeline. Call this only when no frame waits."""
         self._retaking, self.announced = True, self.announced + n
         self._progress.expect_more(self.n_frames, n, seconds)
 
     @property
     def hangs(self) -> bool:
-        """True if a frame is still being written; after `finish` this means that the disk does not respond."""
+        """True if a frame is still being written. After `finish`, this means that the disk does not respond."""
         return self._thread.is_alive()
 
     def _enqueue(self, item: Frame | _Call | None) -> None:
-        """Queue a frame, a call to be made when its turn comes, or None after the last frame."""
+        """Queue a frame, a function that is called when its turn comes, or None after the last frame."""
         while True:
             if self._stop.aborting or (self._stop.stopping and self._flying):
-                self._waiting.maxsize = 0  # the stage turns in front of an open shutter: its frames come first
+                self._waiting.maxsize = 0  # the stage turns with open shutter, so its frames come first
             try:
                 self._waiting.put(item, timeout=SLICE)
             except Full:
@@ -210,7 +212,7 @@ class Recorder:
         while (item := self._next()) is not None:
             if not isinstance(item, Frame):
                 self._checked.put(item)
-            elif self._failure is None:  # frames after a failure are discarded, so that `put` does not wait for room
+            elif self._failure is None:  # after a failure, frames are discarded, so that `put` does not wait for space
                 self._under_checks = item, time.monotonic()
                 checked = self._digested(item)
                 with self._handing:
@@ -225,8 +227,8 @@ class Recorder:
         self._check_name = name
 
     def _digested(self, frame: Frame) -> _Item:
-        """A frame with its statistics and flags, or the error why it has none, which is raised when the frame is to be
-        written.
+        """A frame with its statistics and flags. If there was an error, the error is returned, and raised when the
+        frame should be written.
         """
         begun = time.monotonic()
         try:
@@ -238,7 +240,7 @@ class Recorder:
             self._checking += time.monotonic() - begun
 
     def _next_checked(self) -> _Item:
-        """The next item of the second thread, which computes statistics itself once the checks hang."""
+        """The next item of the second thread. If the checks hang, this thread computes the statistics itself."""
         while True:
             with suppress(Empty):
                 return self._checked.get(not self._alone, SLICE)
@@ -248,7 +250,7 @@ class Recorder:
             self._give_up_checks_that_hang()
 
     def _give_up_checks_that_hang(self) -> None:
-        """Switch the monitor off because it takes too long, and continue with its frame; the first thread may hang for
+        """Switch the monitor off because it takes too long, and continue with its frame. The first thread may hang for
         ever.
         """
         with self._handing:
@@ -269,7 +271,7 @@ class Recorder:
         self._checked.put(self._digested(frame))
 
     def _write_frames(self) -> None:
-        """The second thread: writes, and reports."""
+        """The second thread: writes frames and reports them."""
         item, flushed = self._next_checked(), True
         while True:
             begun = time.monotonic()
@@ -289,8 +291,8 @@ class Recorder:
                     item()
             # a plug-in may raise SystemExit, which would end this thread without a message
             except BaseException as error:
-                with suppress(BaseException):  # the first one counts
-                    self._writer.flush()  # the frames before
+                with suppress(BaseException):  # the first error counts
+                    self._writer.flush()  # the frames before it
                 self._failure = self._failure or error
             self._writing += time.monotonic() - begun
             self._writing_since = math.inf
@@ -299,12 +301,12 @@ class Recorder:
             item = self._next_checked()
 
     def _next(self) -> Frame | _Call | None:
-        """The next item of the queue; checks the disk about once a second meanwhile."""
+        """The next item of the queue. While it waits, it checks the disk about once a second."""
         while True:
             self._look_at_backlog()
             if time.monotonic() - self._looked_at > LOOK:
                 self._looked_at = time.monotonic()
-                with suppress(OSError):  # a failing disk ends the scan when it does not accept a frame
+                with suppress(OSError):  # a failing disk ends the scan only when it does not accept a frame
                     remaining = max(0, self._progress.total - self.n_frames) * self._row_bytes
                     hold_for_space(
                         self._pause, self._reserve, shutil.disk_usage(self._writer.path.parent).free, remaining
@@ -331,14 +333,15 @@ class Recorder:
         if frame.kind is FrameKind.INVALID:
             self._invalid.add(frame.index)
         if frame.kind is FrameKind.INVALID or beside:
-            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # unplanned and unannounced
+            # frames that were neither planned nor announced
+            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)
         self.flagged.add(frame, flags)
         if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
             self._sink(event)
 
     def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...] | None:
-        """The monitor's flags; None if it is off. No frame is lost by an error: a check that raises one is switched
-        off, with a warning.
+        """The flags of the monitor; None if the monitor is off. An error does not lose a frame: a check that raises an
+        error is switched off, with a warning.
         """
         if self._monitor_off:
             return None
@@ -354,8 +357,9 @@ class Recorder:
 
 
 def _as_stored(frame: Frame) -> Frame:
-    """The frame as a reader of the file gets it: a file contains degrees, whose radians differ in the last bit.
+    """The frame in the form in which a reader of the file gets it. A file contains degrees; converted to radians, they
+    differ in the last bit.
 
-    A check that keeps "a projection every 5°" must choose the same projections now and later.
+    This matters for a check that keeps a projection every 5°: it must choose the same projections now and later.
     """
     return replace(frame, angle=math.radians(math.degrees(frame.angle)))

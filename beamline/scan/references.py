@@ -1,4 +1,4 @@
-"""Darks and flats of a running scan: collects them as they are recorded, and checks them before the projections."""
+"""Darks and flats of a running scan: collects them when they are recorded, and checks them before the projections."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ def copied(taken: BlockTally, frames: Sequence[Frame], first: int) -> Iterator[F
 
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
-VIEWS = 4  # projections that are enough for a median
+VIEWS = 4  # number of projections that are enough for a median
 
 
 class ReferenceLog:
-    """The evidence of the darks, the flats and the first projections of a scan, as they are recorded."""
+    """Collects the evidence of the darks, the flats and the first projections of a scan while they are recorded."""
 
     def __init__(self) -> None:
         self.evidence, self._before = Evidence(), FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """The next frame, in the order of the file. `digest`: that of the checks."""
+        """Add the next frame, in the order of the file. `digest` is the digest for the checks."""
         if frame.kind in REFERENCES or (frame.kind is FrameKind.PROJECTION and len(self.evidence.views) < VIEWS):
             seen = FrameStatistics.of(frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape))
             self.evidence = self.evidence.with_frame(seen, begins=frame.kind is not self._before)
@@ -69,11 +69,11 @@ class ReferenceLog:
             self.evidence = self.evidence.without({frame.replaces})
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """What is wrong with darks and flats so far, by kind, in one or more sentences each.
+        """The faults of darks and flats so far, by kind, each in one or more sentences.
 
         Args:
-            planned: planned blocks that should be done by now; darks or flats without any frame are reported as
-                missing.
+            planned: planned blocks that should be done by now. If a block of darks or flats has no frame, it is
+                reported as missing.
         """
         missing = {
             block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."
@@ -84,8 +84,8 @@ class ReferenceLog:
         return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
     def too_few_photons(self, limits: ReferenceLimits, exposure: float) -> str | None:
-        """A warning if noise would dominate the projections, because a pixel of the open beam has few photons; or None.
-        `exposure`: s, of the projections."""
+        """A warning if noise would dominate the projections because a pixel in the open beam gets few photons;
+        otherwise None. `exposure`: exposure of the projections in s."""
         bad = {row for finding in reference_findings(self.evidence, limits) for row in finding.frames}
         good = self.evidence.without(bad)
         flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
@@ -105,10 +105,10 @@ class ReferenceLog:
 
 
 class ReferenceReport:
-    """Warns of the faults of darks and flats, once for each group, and once of too little light.
+    """Warns about faults of darks and flats (once for each group), and about too little intensity (once).
 
     Args:
-        exposure: s, of the projections.
+        exposure: exposure of the projections in s.
     """
 
     def __init__(self, section: ReferencesSection, exposure: float, sink: Sink) -> None:
@@ -116,7 +116,7 @@ class ReferenceReport:
         self._warned_of: set[str] = set()
 
     def faults(self, log: ReferenceLog, planned: Sequence[Block] = ()) -> Mapping[str, str]:
-        """The faults of the darks and flats so far, as `ReferenceLog.faults`."""
+        """The faults of the darks and flats so far, as from `ReferenceLog.faults`."""
         faults = log.faults(self._limits, planned)
         few_photons = log.too_few_photons(self._limits, self._exposure)
         statements = faults if few_photons is None else {"little light": few_photons, **faults}

@@ -1,4 +1,4 @@
-"""Resume: continues a run that was killed, failed, stopped or aborted; the missing frames go into a new file.
+"""Resume: continues a run that was killed, failed, stopped or aborted. The missing frames go into a new file.
 
 Existing files are only read (after `recover`, if their process was killed), so that stored frames are never at risk.
 The new part gets a folder like that of a run, inside the folder of the run: `part-2`, `part-3` ... The file `joined.h5`
@@ -40,7 +40,7 @@ from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
 _UNTOUCHED = "Nothing was changed."
-_IDENTITY = (  # facts about a device that stay the same from scan to scan and day to day
+_IDENTITY = (  # facts about a device that do not change from scan to scan or from day to day
     "model", "identity", "serial", "firmware", "axis", "device", "channel", "counts_per_turn", "vendor", "cameraid",
     "cameraversion",
 )  # fmt: skip
@@ -51,20 +51,15 @@ class ResumableRun:
     """A run that can be resumed.
 
     Attributes:
-        run: its folder.
-        lock: keeps other processes from recovering or continuing the run.
-        config: its configuration.
-        parts: its files so far, each with at least one frame.
-        views: planned projections that are in these files, or that the scan decided to omit.
-        planned: projections of the whole plan.
-        offset: triggers of the offset projections in these files; offset_missing: number of planned offset projections
-            that are missing.
-        choices: the choice after each pass that ended in these files, oldest first.
-        choice_due: True if the last pass has ended and no choice was made yet.
-        seconds: duration of the files, from the first frame of each to its last one.
-        retaken: projections in these files that were taken again and replace others.
-        end_references: missing kinds of darks and flats after the projections, if no projection is missing; None if
-            some are.
+        run: folder of the run. lock: lock that keeps other processes from recovering or continuing the run. config:
+            configuration of the run. parts: files of the run so far, each with at least one frame. views: planned
+            projections that are in these files, or that the scan decided to omit. planned: number of projections of the
+            whole plan. offset: triggers of the laterally offset projections in these files. offset_missing: number of
+            planned laterally offset projections that are missing. choices: the choice after each pass that ended in
+            these files, oldest first. choice_due: True if the last pass has ended and no choice was made yet. seconds:
+            duration of the files, each from its first frame to its last one. retaken: number of projections in these
+            files that were taken again and replace others. end_references: kinds of darks and flats that are missing
+            after the projections, if no projection is missing. None: some projections are missing.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
     """
@@ -102,7 +97,7 @@ class ResumableRun:
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
-        """The part of the plan that is still missing."""
+        """The part of the plan that must still be taken."""
         stored = self.views | self.offset
         references = self.end_references
         return replace(plan, stored=stored, choices=self.choices, choice_due=self.choice_due, end_references=references)
@@ -118,18 +113,18 @@ class ResumableRun:
             _require_same_instrument(self.run, first, ready)
         for part in self.parts:
             recover(part)
-        if len(self.parts) > 1 and not is_joined(self.run / JOINED):  # in case the new part takes no frame
+        if len(self.parts) > 1 and not is_joined(self.run / JOINED):  # needed if the new part takes no frame
             join(self.parts, self.run / JOINED)
         return create_part(self.run)
 
     def join(self, part: Path) -> tuple[Path, int]:
-        """Join the parts and the new one; returns the joined file and its number of frames."""
+        """Join all parts, including the new one. Returns the joined file and its number of frames."""
         joined = self.run / JOINED
         return joined, join([*self.parts, part], joined)
 
 
 class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
-    """All frames of the run are recorded, but a file was not closed or the parts are not joined; `recover_run` does
+    """All frames of the run are recorded, but a file was not closed or the parts are not joined. `recover_run` can do
     both.
     """
 
@@ -150,9 +145,9 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must equal that of the run.
 
     Raises:
-        ConfigError: the folder is not a run, another process is working on it, or its configuration differs.
-            NothingMissing, NoFrame, or NotJoined if only `recover_run` is needed.
-        DataError: a file of it cannot be read. In all these cases nothing was changed.
+        ConfigError: the folder is not a run, another process is working on it, or its configuration differs. Its
+            subclasses: NothingMissing, NoFrame, and NotJoined (only `recover_run` is needed). DataError: a file of the
+            run cannot be read. In all of these cases nothing was changed.
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
         raise ConfigError(f"{run} is not the folder of a run: it has no {' and no '.join(absent)}. {_UNTOUCHED}")
@@ -165,7 +160,7 @@ def _alone(run: Path) -> Iterator[WriterLock]:
     """A context in which no other process recovers or continues the run.
 
     Raises:
-        ConfigError: a process is taking, recovering or continuing it; or it is write-protected.
+        ConfigError: a process is taking, recovering or continuing the run, or the run is write-protected.
     """
     try:
         lock = WriterLock(run / EVENTS, exclusive=True)
@@ -203,12 +198,12 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 raise DataError(f"The missing projections are unknown, because {part} has no plan. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
-                table = frames_in(file)  # the error names a damaged file
+                table = frames_in(file)  # this raises an error that names a damaged file
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
                 numbers = table.triggers[table.views]
-                retaken += int((numbers >= planned).sum())  # their numbers continue after those of the plan
+                retaken += int((numbers >= planned).sum())  # their triggers are counted after those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: start the scan again. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
@@ -227,7 +222,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
-    """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
+    """Raise NothingMissing; or NotJoined, if the run has all of its frames but a file was not closed or joined."""
     whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
@@ -236,8 +231,8 @@ def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
-    """The files of the parts, without those of parts that ended before their first frame, and a sentence on each of
-    these."""
+    """The files of the parts, without parts that ended before their first frame; and a sentence on each part that was
+    left out."""
     files = files_with_frames(run)
     empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
     return files, [
@@ -246,8 +241,8 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:
-    """Raise ConfigError if the configuration differs from that in a file of the run, whose first line is the program's
-    version.
+    """Raise ConfigError if the configuration differs from that in a file of the run. (The first line of the file is the
+    version of the program.)
     """
     before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
     differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
@@ -268,7 +263,7 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
 
 
 def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str]]:
-    """Each device whose identity differs from that in a file: its name, and both identities."""
+    """The devices whose identity differs from that in a file: name and both identities of each."""
     for device, description in ready.info.devices.items():
         group = datasets.resolve(stored["/entry/instrument/devices"], device.replace("/", "_")) or {}
         earlier = {key: datasets.text(group[key][()]) for key in group}
@@ -281,9 +276,9 @@ def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[st
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
-    """Recover every part of a run, and join several parts; the joined file comes last.
+    """Recover every part of a run, and join the parts if there are several. The joined file comes last.
 
-    The record of a run whose process was killed then gets the state of its newest file.
+    If the process of the run was killed, the record of the run gets the state of the newest file.
 
     Args:
         say: function that gets a sentence on the disk space that each file needs, before anything is written.
@@ -293,9 +288,9 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
 
     Raises:
         ConfigError: a process is taking, recovering or continuing the run.
-        DataError: the folder is not a run, or a part cannot be recovered; the parts before it are recovered.
+        DataError: the folder is not a run, or a part cannot be recovered. Earlier parts are recovered.
     """
-    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on copies of its files
+    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on the copies of the files
         files, left_out = _files(run)
         if not files:
             why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."

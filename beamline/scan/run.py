@@ -1,4 +1,5 @@
-"""Run: one scan from configuration to file, in a folder of its own, reported by events, and closed in any case."""
+"""Run: one scan, from the configuration to the file, in a separate folder. Events report its progress, and the file is
+closed in every case."""
 
 from __future__ import annotations
 
@@ -72,8 +73,8 @@ def run_scan(
             moved.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
-        DataError: frames are missing (LedgerError), or the disk failed. In all these cases the frames taken so far are
-            in the file; the event `scan_done` says how many, and `failed` why.
+        DataError: frames are missing (LedgerError), or the disk failed. In all of these cases the frames taken so far
+            are in the file. The event `scan_done` gives their number, and `failed` gives the reason.
     """
     if config.series:
         one, several = ("energy", "energies") if config.scan.states is None else ("state", "states")
@@ -103,14 +104,14 @@ def run_scan(
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series, first_state=first)
             measurement = measurement if turn is None else replace(measurement, turn=turn)
             stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
-            guarded = stack.enter_context(_watched(measurement))  # until the instrument is free for another scan
+            guarded = stack.enter_context(_watched(measurement))  # held until the instrument is free for another scan
             guarded.callback(connected.close)
             how = live if isinstance(live, Commands) else Commands(live=live)
             return _to_its_end(measurement, how, guarded.close)
 
 
 def _watched(measurement: Measurement) -> ExitStack:
-    """A watchdog for the scan of a real instrument; it ends when the stack is closed."""
+    """Start a watchdog for the scan of a real instrument. The watchdog ends when the stack is closed."""
     config, guarded = measurement.config, ExitStack()
     if config.simulation is None:
         without = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
@@ -128,22 +129,22 @@ def record_scan(
     *,
     live: Standby | None,
 ) -> RunResult:
-    """Record a scan that another program controls, in a run folder of its own, as `run_scan` records one of this
+    """Record a scan that another program controls, in the folder of a new run, as `run_scan` records a scan of this
     program.
 
-    Nothing waits for the live reconstruction, no watchdog runs, and no device is operated.
+    The scan does not wait for the live reconstruction, no watchdog runs, and no device is operated.
 
     Args:
-        config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor are used.
-        source_of: makes the object that delivers the frames, from the measurement that takes them.
-        runs: the folder in which the run gets its own.
-        live: starts a live reconstruction; None: there is none.
+        config: configuration, of which the sections sample, storage, monitor, references, recon, scan and
+            devices.beam_monitor are used. source_of: function that makes the object that delivers the frames, given the
+            measurement that receives them. runs: folder in which the folder of the run is created. live: function that
+            returns the command line of a live reconstruction; None: no live reconstruction.
 
     Raises:
         LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
     """
     began = time.monotonic()
-    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # whose devices are never used
+    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # its devices are never used
     with ExitStack() as stack:
         folder = create_run_folder(runs, config.sample.name, others.clock.now())
         sink = _announcing(config, ready, folder, others.clock, sinks, stack)
@@ -158,10 +159,10 @@ def record_scan(
 def _announcing(
     config: Config, ready: ReadyScan, folder: Path, clock: Clock, sinks: Sequence[Sink], stack: ExitStack
 ) -> Sink:
-    """One sink for the run's record, its logs and `sinks`, each reached by a thread until the stack closes; it begins
-    with the settings that the devices had before they were opened."""
+    """One sink for the record of the run, its logs and `sinks`. A thread passes events on to each, until the stack
+    closes. The first events state the settings that the devices had before they were opened."""
     record, *logs = _logs(config, ready, folder, stack)
-    # The record has a thread of its own, so that a blocked terminal does not delay it.
+    # The record has a separate thread, so that a blocked terminal does not delay it.
     announcers = [Announcer(each, clock) for each in ([record], [*logs, *sinks])]
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
@@ -171,10 +172,10 @@ def _announcing(
 
 
 def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
-    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written next to
-    them.
+    """The record of the run, events.jsonl and user.log. They are open until the stack closes. The configuration is
+    written next to them.
 
-    events.jsonl is created last: with it the folder counts as a run.
+    events.jsonl is created last, because a folder with this file counts as a run.
     """
     try:
         (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -194,7 +195,7 @@ def _named(config: Config) -> str:
 
 
 def _refuse_stop(stop: StopRequest) -> None:
-    """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
+    """Raise ScanAborted if a stop was requested. (Before anything moves, a stop counts as an abort.)"""
     if stop.stopping:
         raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
@@ -232,8 +233,8 @@ def _to_its_end(measurement: Measurement, how: Commands, release: Callable[[], N
 
 
 def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sink) -> None:
-    """Rename volume and report of the projections before this part of a run, because the volume of all parts gets their
-    names.
+    """Rename the volume and the report that were made from earlier parts of a run, because the volume of all parts gets
+    their names.
     """
     for path in filter(os.path.lexists, files):
         aside = path.with_stem(f"{path.stem}.before-{part}")
@@ -244,7 +245,7 @@ def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sin
                     states.state, f"{path.name}, the volume of the earlier projections, was renamed to {aside.name}"
                 )
             )
-        except OSError as error:  # on Windows, if a viewer has it open
+        except OSError as error:  # happens on Windows if a viewer has the file open
             sink(
                 Warned(
                     f"There is no volume of all parts of the run, because {path} could not be renamed "

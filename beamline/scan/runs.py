@@ -1,5 +1,5 @@
-"""The runs in a folder: sample and state of each, from the records of its parts, or from its files if an earlier
-version of this program made it."""
+"""The runs in a folder: sample and state of each run, from the records of its parts. If an earlier version of this
+program made the run, they come from its files."""
 
 from __future__ import annotations
 
@@ -31,17 +31,14 @@ class Run:
     """A run, with all its parts.
 
     Attributes:
-        folder: of the run.
-        sample: its name.
-        time: s since the Unix epoch, when it began.
-        frames: in its files; None: not known.
-        planned: frames of the parts before the newest one, plus the planned frames of the newest; None: not known.
-        ended: who ended the scan before the end of its plan, and why; "" if nobody did.
-        flags: frames that the monitor flagged: their number by check, then by level.
-        state: of its newest part, see docs/states.md; `died` if its process ended without writing its final state.
-        bytes: of all files in the folder.
-        parts: 1, plus one for each time that it was resumed.
-        next_step: what the user can do if its process was killed or its state is not known; "" otherwise.
+        folder: folder of the run. sample: name of the sample. time: time at which the run began, s since the Unix
+            epoch. frames: number of frames in its files; None: not known. planned: number of frames of earlier parts,
+            plus the planned frames of the newest part; None: not known. ended: who ended the scan before the end of its
+            plan, and why; "" if nobody ended it. flags: number of frames that the monitor flagged, by check and level.
+            state: state of the newest part, see docs/states.md; `died` if the process ended without writing its final
+            state. bytes: size of all files in the folder. parts: number of parts: 1, plus one for each time that the
+            run was resumed. next_step: what the user can do if the process was killed or the state is not known; ""
+            otherwise.
     """
 
     folder: Path
@@ -58,7 +55,7 @@ class Run:
 
     @property
     def over(self) -> bool:
-        """True if the run has ended; it may be resumed."""
+        """True if the run has ended. (It may still be resumed.)"""
         return self.state not in [state for state in State if not state.ended]
 
 
@@ -69,7 +66,8 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def newest(folder: Path) -> Path:
-    """The folder of the running scan, or else of the newest run. Raises ConfigError if there is no run."""
+    """The folder of the running scan; if no scan is running, that of the newest run. Raises ConfigError if there is no
+    run."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
         raise ConfigError(f"{folder} contains no run. Name the folder of a run, or a scan file.")
@@ -77,10 +75,10 @@ def newest(folder: Path) -> Path:
 
 
 def describe(run: Path) -> Run:
-    """What the records of a run's parts state about it. Reads no pixel."""
-    # asked first, because a new part exists before this lock is released
+    """The summary of a run from the records of its parts. No pixel is read."""
+    # read first, because a new part exists before this lock is released
     taken_up = held(run / EVENTS, exclusively=True)
-    parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # which comes after its record
+    parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # it is created after the record
     records = [record_of(part) for part in parts]
     frames: int | None = 0
     earlier = frames  # of the parts before the newest one
@@ -110,7 +108,7 @@ HEAD = ("time (UTC)", "sample", "frames", "state", "size", "flags", "folder")
 
 
 def cells(run: Run) -> tuple[str, ...]:
-    """The row of a run in the table with header HEAD, one line of printable text for each cell."""
+    """The row of a run in the table with the header HEAD. Each cell is one line of printable text."""
     from beamline.storage.flag_legend import counted
 
     frames = "not known" if run.frames is None else str(run.frames)
@@ -126,7 +124,7 @@ def cells(run: Run) -> tuple[str, ...]:
 
 
 def record_sink(file: RecordFile) -> Sink:
-    """A sink that keeps the record of a part, by the events of its scan."""
+    """A sink that keeps the record of a part up to date with the events of its scan."""
 
     def keep(event: Event) -> None:
         record = file.record
@@ -148,8 +146,9 @@ def record_sink(file: RecordFile) -> Sink:
 def record_of(part: Path) -> RunRecord:
     """The record of a part. If its process was killed, or if it has no record, the file is read.
 
-    If the file cannot be read, for example after a kill while it was created, the number of frames is the record's last
-    one. Flags come from the record if it has any, because the file does not contain those of level `info`.
+    If the file cannot be read, for example because the process was killed while it created the file, the number of
+    frames is the last one in the record. If the record has flags, they are used, because the file does not contain
+    flags of the level `info`.
     """
     record = read_record(part)
     if record is not None and record.state != DIED:
@@ -168,7 +167,7 @@ def end_record(part: Path) -> None:
 
 
 def _by_file(scan: Path) -> RunRecord:
-    """What the beginning of a scan file states."""
+    """Values from the beginning of a scan file."""
     from beamline.storage import hdf5
     from beamline.storage.flag_legend import read_flags
     from beamline.storage.writers import layout
@@ -183,14 +182,15 @@ def _by_file(scan: Path) -> RunRecord:
 
 
 def _began(run: Path) -> float:
-    """When the run began: by the folder's name, which a simulated clock does not change, or else by its first file."""
+    """The time at which the run began. It comes from the name of the folder, which a simulated clock does not change;
+    otherwise from the first file."""
     with suppress(ValueError):
         return timegm(time.strptime(run.name.partition("_")[0], STAMP))
     return (run / CONFIG).stat().st_mtime if (run / CONFIG).exists() else 0.0
 
 
 def _numbered(run: Path) -> tuple[int, str]:
-    """Sort key of runs: the number that distinguishes runs of the same second and sample, then the name."""
+    """Sort key for runs of the same second and sample: the number that distinguishes them, then the name."""
     number = run.name.rpartition("-")[2]
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
 

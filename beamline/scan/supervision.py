@@ -1,4 +1,4 @@
-"""Supervision: hooks of an acquisition into the scan around it, and the beam monitor, whose readings may pause the
+"""Supervision: callbacks from an acquisition to the scan around it; and the beam monitor, whose readings may pause the
 scan.
 """
 
@@ -69,11 +69,11 @@ class Supervision:
 
 
 class BeamGuard:
-    """Pauses a scan while the beam monitor reads too little beam.
+    """Pauses a scan as long as the beam monitor reads too little beam.
 
     Args:
-        pause_below: a reading below it pauses the scan, in the monitor's unit.
-        resume_above: readings of at least this value mean that the beam is back.
+        pause_below: the scan pauses if a reading is below this value (in the unit of the monitor). resume_above: a
+            reading of at least this value means that the beam is back.
         settle: time in s for which readings must stay above this value before the scan continues.
     """
 
@@ -82,11 +82,11 @@ class BeamGuard:
         self._good = -math.inf
         """Time of the last reading with beam."""
         self._back: float | None = None
-        """While paused: the time since which the beam is back."""
+        """During a pause: the time since which the beam is back."""
         self._paused = False
 
     def __call__(self, reading: BeamReading) -> None:
-        """Record the next reading, and act."""
+        """Process the next reading: pause or continue the scan if necessary."""
         if not self._paused:
             if reading.value >= self._pause_below:
                 self._good = reading.time
@@ -107,19 +107,17 @@ class BeamGuard:
             self._pause.release(Cause.BEAM)
 
 
-LAST_WAIT = 3.0  # Longest wait in s for a reading in progress at the end of a scan
+LAST_WAIT = 3.0  # Longest wait in s, at the end of a scan, for a reading that is in progress
 
 
 class BeamLog:
-    """Context manager that logs the beam. Each reading is an event `beam`; consecutive failed readings give one
-    warning.
+    """Context manager that logs the readings of the beam monitor. Each reading is an event `beam`. Consecutive failed
+    readings give one warning.
 
     Args:
-        monitor: None: nothing is read.
-        period: s of real time between readings.
-        sink: takes (event, data) of `beam` and `warning`, called in the log's thread.
-        react: function that gets each reading; if it is given, the first reading is taken before the context is
-            entered.
+        monitor: the beam monitor; None: nothing is read. period: real time in s between readings. sink: receives the
+            events `beam` and `warning`, in the thread of the log. react: function that gets each reading. If it is
+            given, the first reading is taken before the context is entered.
     """
 
     def __init__(
@@ -138,7 +136,8 @@ class BeamLog:
         return tuple(self._readings)
 
     def wait_for_reading(self, stop: Callable[[], bool]) -> None:
-        """If readings control the scan, wait for one that begins after this call, or until `stop` returns True."""
+        """If readings control the scan, wait for a reading that begins after this call, or until `stop` returns
+        True."""
         due = self._begun + 1
         while self._react is not None and self._ended < due and self._thread.is_alive() and not stop():
             time.sleep(PAUSE_POLL)
@@ -165,14 +164,14 @@ class BeamLog:
         self._begun += 1
         try:
             reading = monitor.reading()
-        except BaseException as error:  # no failure of the beam monitor ends the scan
+        except BaseException as error:  # a failure of the beam monitor never ends the scan
             self._fail(monitor.name, error)
         else:
             self._enter(monitor.name, reading)
         self._ended = self._begun
 
     def _enter(self, name: str, reading: BeamReading) -> None:
-        if self._over.is_set():  # too late to be written
+        if self._over.is_set():  # this reading comes too late to be written
             return
         if self._failed:
             self._sink(Warned(f"{name}: it answers again after {count(self._failed, 'failed reading')}."))
@@ -183,7 +182,7 @@ class BeamLog:
             self._react(reading)
 
     def _fail(self, name: str, error: BaseException) -> None:
-        self._failed += 1  # and nothing else: a failing beam monitor never stops a scan
+        self._failed += 1  # only a warning, because a failing beam monitor never stops a scan
         if self._failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
@@ -191,7 +190,7 @@ class BeamLog:
 
 
 def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink, pause: PauseRequest) -> BeamLog:
-    """The log of the configured beam monitor, which pauses the scan if so configured."""
+    """The log of the configured beam monitor. If pause_below is set, it pauses the scan."""
     if isinstance(config, NoBeamMonitor):
         return BeamLog(None, math.inf, sink)
     guard = None

@@ -1,4 +1,4 @@
-"""Tally: counts the frames of each block of a scan, and describes missing and extra ones in sentences."""
+"""Tally: counts the frames of each block of a scan, and describes missing and extra frames in sentences."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from beamline.scan.ledger import Ledger
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame
 
-NAMED = 5  # projections that a sentence names
-DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
-TRIES = 3  # exposures of a projection whose stage is not at its angle, after which the projection counts as missing
+NAMED = 5  # largest number of projections that a sentence names
+DOUBTFUL = 0.2  # steps; a larger possible error of an angle is reported
+TRIES = 3  # number of exposures with the stage at a wrong angle, after which the projection counts as missing
 ASTRAY_ADVICE = (
     "A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to "
     f"{TRIES} times in total. Possible causes are another program or person that moves the stage, its manual "
@@ -24,24 +24,22 @@ ASTRAY_ADVICE = (
 )
 
 Exposed = tuple[CameraFrame, int, float, bool]
-"""A frame, its trigger within the block or EXTRA, where the stage was (rad), and whether that was its angle."""
+"""A frame, its trigger within the block (or EXTRA), the position of the stage in rad, and whether the position was the
+planned angle."""
 
 
 @dataclass
 class BlockTally:
-    """A block with its frames and missing triggers; filled while the block is recorded.
+    """A block with its frames and missing triggers. It is filled while the block is taken.
 
     Attributes:
-        again: True if the block repeats projections; losing them is then not a failure.
-        frames: delivered, with and without a trigger.
-        rows: by trigger, counted within the block, the row and the time of its last frame.
-        missing: triggers, counted within the block, whose expected frame did not come.
-        lost, ignored: numbers of missing frames that were exposed but not delivered, and that were not exposed, if
-        known.
-        extra: frames that no trigger exposed.
-        unconfirmed: of the extra ones, those exposed while the stage braked.
-        shift, off: the largest values of all passes, see `Ledger`.
-        astray: for frames exposed while the stage was not at its planned angle: by trigger, the row and the actual
+        again: True if the block takes projections again. Missing frames in this block are then not a failure. frames:
+            number of delivered frames, with and without a trigger. rows: for each trigger (counted within the block),
+            the row and the time of its last frame. missing: triggers (counted within the block) whose frame did not
+            come. lost, ignored: number of missing frames that were exposed but not delivered, and number that were not
+            exposed, if known. extra: number of frames that no trigger exposed. unconfirmed: number of extra frames that
+            were exposed while the stage braked. shift, off: largest values of all passes, see `Ledger`. astray: frames
+            that were exposed while the stage was not at its planned angle: for each trigger, the row and the actual
             angle in rad.
     """
 
@@ -59,7 +57,8 @@ class BlockTally:
     astray: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
 
     def miss(self, triggers: Iterable[int]) -> None:
-        """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
+        """Record triggers without a frame. If a trigger has an earlier frame (perhaps without beam), it keeps this
+        frame."""
         self.missing += [trigger for trigger in triggers if trigger not in self.rows]
 
     def enter(self, settled: Ledger, first: int) -> None:
@@ -74,7 +73,7 @@ class BlockTally:
 
 
 def first_taken(done: Iterable[BlockTally]) -> list[BlockTally]:
-    """Tallies of the projections, without those that repeat projections."""
+    """The tallies of blocks of projections, without blocks that take projections again."""
     return [taken for taken in done if taken.block.kind is FrameKind.PROJECTION and not taken.again]
 
 
@@ -93,7 +92,7 @@ def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
 
 
 def astray_views(taken: BlockTally) -> str:
-    """A sentence on frames exposed while the stage was not at its angle, and where it was."""
+    """A sentence on frames that were exposed while the stage was not at its planned angle, with the actual angles."""
     where = [
         f"projection {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: "
         f"{math.degrees(places[-1][1]):.4f}°"
@@ -107,12 +106,13 @@ def astray_views(taken: BlockTally) -> str:
 
 
 def discrepancies(done: Sequence[BlockTally]) -> str:
-    """Sentences on missing, extra and doubtful frames of these blocks, each after a space."""
+    """Sentences on missing, extra and doubtful frames of these blocks. Each sentence begins with a space."""
     return "".join(f" {text}" for taken in done if (text := _of_block(taken)))
 
 
 def _of_block(taken: BlockTally) -> str:
-    """Sentences on missing, extra and doubtful frames of a block; a projection that was repeated misses none."""
+    """Sentences on missing, extra and doubtful frames of a block. A projection that was taken again does not count as
+    missing."""
     block, noun = taken.block, taken.block.kind.name.lower()
     text = ""
     if taken.missing and not taken.again:

@@ -3,9 +3,9 @@
 `python -m beamline.scan.watchdog RUN PID` reads its stdin. The scan holds this pipe open as long as it lives, and
 writes a byte to it every BEAT seconds. The watchdog acts if the pipe closes (kill -9), or if no byte comes for FROZEN s
 (SIGSTOP, a hung disk). It prints a line when it is ready. If a watchdog ends, the scan starts another one. A frozen
-scan holds the port of the stage, so the watchdog kills it first. Then the port is free, and the watchdog opens it; the
-camera stops when its program ends. A scan that ends normally kills the watchdog first. As long as the scan lives, the
-watchdog ignores the termination signals that a shutdown sends to every process.
+scan keeps the port of the stage open, so the watchdog first kills the process of the scan. Then the port is free, and
+the watchdog opens it. The camera stops when its program ends. A scan that ends normally kills the watchdog first. As
+long as the scan lives, the watchdog ignores the termination signals that a shutdown sends to every process.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ from beamline.instrument.connect import shutter_of
 from drivers.base.clock import Clock, SystemClock
 from drivers.stages.shared import FOUND
 
-PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
+PATIENCE = 60.0  # s for each step; a stage cannot be opened while it slows down
 BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
-BEAT = 0.2  # real s between signs of life; about as long nobody watches after a watchdog has died
-FROZEN = 60.0  # s without one, after which a scan counts as dead
-AGAIN = 3  # most watchdogs that are started as replacements
+# real time in s between signs of life; after a watchdog has died, about this time passes until another one runs
+BEAT = 0.2
+FROZEN = 60.0  # s without a sign of life after which a scan counts as dead
+AGAIN = 3  # largest number of watchdogs that are started as replacements
 ACTED = 70  # exit code of a watchdog that has made the instrument safe
 STDOUT = 1  # written without a buffer, which could not be flushed at the end of the process
 COMMAND = (sys.executable, "-m", "beamline.scan.watchdog")
@@ -52,13 +53,14 @@ INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=be
 def watched(
     folder: Path, sink: Sink, stop: StopRequest | None = None, pause: PauseRequest | None = None
 ) -> Iterator[None]:
-    """A context in which a watchdog process guards the run in this folder; warns if it cannot be started.
+    """A context in which a watchdog process guards the run in this folder. If the watchdog cannot be started, there is
+    a warning.
 
     If the watchdog ends before the scan, this is reported and another watchdog is started.
 
     Args:
-        stop: request that is set to abort if a watchdog took the scan for dead and acted.
-        pause: a pause is requested after the last watchdog has ended; None: the scan continues without a watchdog.
+        stop: request that is set to abort if a watchdog assumed that the scan is dead, and acted. pause: request with
+            which the scan is paused after the last watchdog has ended; None: the scan continues without a watchdog.
     """
     with Path(os.devnull).open("w") as nowhere, inhibited():
         keeper = _Keeper(folder, sink, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
@@ -69,7 +71,7 @@ def watched(
 
 @contextmanager
 def inhibited() -> Iterator[None]:
-    """Ask systemd, if present, to inhibit shutdown and sleep, without waiting for its answer."""
+    """Ask systemd (if the system has it) to prevent shutdown and sleep. The function does not wait for an answer."""
     with ExitStack() as ending:
         if (program := shutil.which(INHIBIT[0])) is not None:
             with suppress(OSError):
@@ -81,9 +83,9 @@ def inhibited() -> Iterator[None]:
 
 
 class _Keeper:
-    """Signals a watchdog, from a separate thread, that the scan lives, and replaces one that has died.
+    """Sends a watchdog signs of life of the scan, from a separate thread, and replaces a watchdog that has died.
 
-    `start`: starts a command; the function is called with each line that it writes."""
+    `start`: function that starts a command. A second function is called with each line that the command writes."""
 
     def __init__(
         self, folder: Path, sink: Sink, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
@@ -95,7 +97,7 @@ class _Keeper:
         self._thread: threading.Thread | None = None
 
     def begin(self, stop: StopRequest, pause: PauseRequest | None) -> None:
-        """Wait until the first one is ready, and keep it from then on."""
+        """Wait until the first watchdog is ready. From then on, send it signs of life."""
         deadline = time.monotonic() + READY_WITHIN
         while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
             self._process.tell()
@@ -145,8 +147,8 @@ class _Keeper:
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
-    """Stop the stage, disarm its trigger output and close the shutter; True if all succeeded. `say` gets a sentence on
-    each step.
+    """Stop the stage, disarm its trigger output and close the shutter. Returns True if all steps succeeded. `say` gets
+    a sentence on each step.
     """
     stage, shutter = config.devices.stage, config.devices.shutter
     apart = shutter if isinstance(shutter, FoundShutter) else None
@@ -161,7 +163,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
             connected.disarm()
             if apart is None:
                 shutter_of(config, connected, clock, say).close()
-            deadline = clock.now() + PATIENCE  # a stage that slows down takes no settings back
+            deadline = clock.now() + PATIENCE  # a stage that slows down does not accept its original settings
             while connected.moving() and clock.now() < deadline:
                 clock.sleep(BETWEEN)
 
@@ -180,12 +182,12 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
 
 
 def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], done: str) -> bool:
-    """Try until it works or PATIENCE is over; returns whether it worked."""
+    """Try the step until it works or PATIENCE is over. Returns True if it worked."""
     deadline = clock.now() + PATIENCE
     while True:
         try:
             step()
-        except BaseException as error:  # after any error, also SystemExit of a plug-in, the next step must be tried
+        except BaseException as error:  # after any error (even SystemExit from a plug-in) the next step must be tried
             if clock.now() > deadline:
                 say(f"DANGER: {error} Check the instrument before anybody goes near the beam.")
                 return False
@@ -196,7 +198,7 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
 
 
 class _Life:
-    """Signs of life from a stream, counted in a thread: a read of a pipe waits."""
+    """Counts the signs of life from a stream, in a separate thread, because reading a pipe blocks."""
 
     def __init__(self, source: RawIOBase | BytesIO) -> None:
         self._source, self.signs, self.ended = source, 0, False
@@ -210,9 +212,10 @@ class _Life:
 
 
 def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
-    """Wait until the scan process is dead or hangs; returns whether it hangs.
+    """Wait until the scan process is dead or hangs. Returns True if it hangs.
 
-    If this process also did nothing during a step (the computer slept, or was swapping memory), the step counts once.
+    If this process itself was inactive during a step (because the computer slept or was swapping memory), the whole
+    time counts as one step.
 
     Args:
         signs: function that returns the number of signs of life so far; None: the process has ended.
@@ -230,11 +233,10 @@ def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
 
 
 def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
-    """Wait until the scan process is dead, then make the devices safe, and log it; returns the exit code.
+    """Wait until the scan process is dead. Then make the devices safe, and log this. Returns the exit code.
 
     Args:
-        scan: its process.
-        source: ends when it dies.
+        scan: process of the scan. source: stream that ends when the process dies.
     """
     for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGBREAK"):
         if (request := getattr(signal, name, None)) is not None:
@@ -242,12 +244,12 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
     config = load(folder / CONFIG, environment={})
     life, clock = _Life(source), SystemClock()
 
-    with suppress(OSError):  # the scan has died; perhaps before this process was there
+    with suppress(OSError):  # the scan has died, perhaps before this process was started
         os.write(STDOUT, b"watching\n")
     frozen = until_dead(lambda: None if life.ended else life.signs, clock)
 
     def say(text: str) -> None:
-        # A full disk, or a folder that is gone, must not keep the stage turning.
+        # Even if the disk is full or the folder was removed, the stage must be stopped.
         with suppress(OSError), (folder / WATCHDOG_LOG).open("a", encoding="utf-8") as log:
             log.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}  {text}\n")
 
@@ -257,7 +259,7 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
             "the process to free the port of the devices."
         )
         try:
-            psutil.Process(scan).kill()  # the number still belongs to that process: the pipe is open
+            psutil.Process(scan).kill()  # the number still belongs to the process of the scan, because the pipe is open
         except psutil.Error as error:
             say(f"It could not be killed: {error}.")
     else:
@@ -267,6 +269,6 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
 
 if __name__ == "__main__":
-    # Without a buffer, whose lock a reading thread would hold at the end of the process.
+    # Written without a buffer, because a reading thread would hold the lock of the buffer at the end of the process.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as signs_of_life:
         sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), signs_of_life))

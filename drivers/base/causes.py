@@ -1,7 +1,6 @@
 """Causes of failures: why a library does not load, why a port does not open, and which other service answers on a line.
 
-This is the only place where drivers turn messages of others (loaders, operating systems, servers) into a sentence and
-advice.
+Drivers convert messages of other software (loaders, operating systems, servers) to a sentence and advice only here.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _LOADERS = (
 
 
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
-    """Why a library cannot be loaded, and what to do; both are empty if the library does not exist."""
+    """The reason why a library cannot be loaded, and what to do. Both texts are empty if the library does not exist."""
     for pattern, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
         if match := re.search(pattern, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
@@ -47,9 +46,10 @@ def of_library(name: str, problem: OSError) -> tuple[str, str]:
 
 
 def of_port(url: str, problem: BaseException) -> str:
-    """What to do if a port does not open."""
+    """Advice for a port that does not open."""
     number, group = getattr(problem, "errno", None) or getattr(problem.__context__, "errno", None), "root"
-    with suppress(OSError, ValueError, KeyError, NotImplementedError):  # no file, a group without a name, Windows
+    # there is no file, the group has no name, or the system is Windows
+    with suppress(OSError, ValueError, KeyError, NotImplementedError):
         group = Path(url).group() if Path(url).stat().st_mode & 0o060 == 0o060 else group
     rows = (
         (
@@ -70,7 +70,10 @@ def of_port(url: str, problem: BaseException) -> str:
             "No server answers at this port, or the server accepts no further client: check the port "
             "number, and close other clients",
         ),
-        (True, "Check the cable, the name of the port in the configuration, and that no other program uses it"),
+        (
+            True,
+            "Check the cable and the name of the port in the configuration, and close other programs that use the port",
+        ),
     )
     return next(advice for holds, advice in rows if holds)
 
@@ -79,7 +82,7 @@ NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that does not occur in text
 TELNET = re.compile("\xff[\xf0-\xfe]")  # the beginning of its negotiation
 _FOREIGN = (  # searched in the URL, a line end, and the received text
     (
-        f"^socket:.*{TELNET.pattern}",  # on a serial line it is noise
+        f"^socket:.*{TELNET.pattern}",  # on a serial line, such bytes are noise
         "the server uses Telnet (it sent FF, which starts the negotiation)",
         "Set this port of the terminal server to raw TCP, without Telnet and RFC 2217",
     ),
@@ -107,6 +110,6 @@ _FOREIGN = (  # searched in the URL, a line end, and the received text
 
 
 def of_bytes(url: str, heard: str) -> tuple[str, str]:
-    """Which other service answers on a line instead of the device, from the received text (a character per byte), and
-    advice."""
+    """The other service that answers on a line instead of the device, recognised by the received text (one character
+    per byte), and advice."""
     return next((row[1:] for row in _FOREIGN if re.search(f"(?is){row[0]}", f"{url}\n{heard}")), ("", ""))

@@ -1,5 +1,5 @@
-"""Clock: the time that devices and waits use. Every driver takes it as an argument, so that a simulation can use its
-own.
+"""Clock: the time for devices and waits. Every driver takes the clock as an argument, so that a simulation can use its
+own clock.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Protocol
 
 class Clock(Protocol):
     def now(self) -> float:
-        """Seconds since the Unix epoch; never decreases."""
+        """Time in seconds since the Unix epoch. It never decreases."""
 
     def sleep(self, seconds: float) -> None: ...
 

@@ -1,4 +1,5 @@
-"""DeviceError: an error of a device with request, reply, what was expected, what to do, and the state of the device."""
+"""DeviceError: an error of a device. It contains the request, the reply, the expected reply, advice, and the state of
+the device."""
 
 from __future__ import annotations
 
@@ -16,9 +17,7 @@ class DeviceError(Exception):
         problem: what happened.
         request: what was sent to the device.
         reply: what it answered.
-        expected: what a good reply would have been.
-        advice: what to do.
-        state: what was changed or moved, and what was not.
+        expected: the reply that was expected. advice: what to do. state: what was changed or moved, and what was not.
         wire: the last lines sent and received.
     """
 
@@ -48,11 +47,12 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Worker processes send the error with its parts, and the message is not composed again.
+        # Worker processes send the error with its parts, so that the message is not composed again.
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error, reported by `device`, which uses the device that failed. `changed`: parts to replace."""
+        """The same error, reported by `device`, which uses the device that failed. `changed` contains the parts of the
+        error to replace."""
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 

@@ -22,10 +22,11 @@ class FrameKind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image with its metadata. It owns its memory, which is the only copy of the camera's ring buffer.
+    """One image with its metadata. The frame owns its memory: the pixels were copied once, out of the ring buffer of
+    the camera.
 
     Attributes:
-        counts: [row, col], uint16 of a camera; those of a file may be of another type.
+        counts: [row, col], uint16 from a camera; counts from a file may have another type.
         kind: projection, flat, dark, ...
         index: row in the file, counted over all frames of the scan from 0.
         trigger: number of the trigger pulse that exposed it, counted from 0 within its block of frames.
@@ -33,8 +34,8 @@ class Frame:
         angle: radians, the stage position at the trigger; NaN if the position does not matter (a dark).
         time: s since the Unix epoch, at the trigger.
         exposure: s.
-        replaces: row of the projection that this frame repeats; -1: it repeats none.
-        aside: mm by which the sample was moved perpendicular to the beam, towards higher columns.
+        replaces: row of the projection that this frame replaces; -1: it replaces none. aside: distance in mm by which
+            the sample was moved perpendicular to the beam, towards higher columns.
     """
 
     counts: NDArray[np.uint16]

@@ -16,7 +16,7 @@ class StageLimits:
     """The limits of a stage.
 
     Attributes:
-        counts_per_turn: encoder counts (or motor pulses) for 2π; triggers fall on whole counts.
+        counts_per_turn: encoder counts (or motor pulses) for 2π. Triggers are possible only at whole counts.
         max_speed, acceleration: rad/s, rad/s².
         low, high: soft limits in radians.
         trigger_output: True if the stage can emit position-synchronised trigger pulses.
@@ -70,7 +70,8 @@ class DigitalOutput(Protocol):
 
 
 class RotationStage(Protocol):
-    """A rotation stage with position-synchronised trigger pulses: angles in radians outside, whole counts inside."""
+    """A rotation stage with position-synchronised trigger pulses. Callers use angles in radians; trains use whole
+    counts."""
 
     name: str
 
@@ -89,7 +90,7 @@ class RotationStage(Protocol):
         """Begin a move at `speed` (rad/s) and return at once. Raises DeviceRefused for a target outside the limits."""
 
     def start_home(self) -> None:
-        """Begin the search for the reference and return at once; `wait` returns when the search has ended.
+        """Begin the search for the reference mark and return at once. `wait` returns when the search has ended.
 
         Raises:
             DeviceRefused: the stage has no reference, or it is moving.
@@ -110,15 +111,15 @@ class RotationStage(Protocol):
         """Stop at once, without deceleration. Allowed in every state."""
 
     def arm(self, train: TriggerTrain) -> None:
-        """Prepare the pulses.
+        """Prepare a train of pulses.
 
-        The stage must be at rest before the position of the first pulse; pulses come when it moves.
+        The stage must be at rest, before the position of the first pulse. It sends the pulses when it moves.
         """
 
     def disarm(self) -> None: ...
 
     def digital_output(self, number: int) -> DigitalOutput:
-        """Another output of the stage's controller, such as one that opens a shutter.
+        """Another output of the controller of the stage, for example one that opens a shutter.
 
         Raises:
             DeviceRefused: the controller has no such output, or the output is used for the trigger pulses.
@@ -138,7 +139,7 @@ class TriggerSource(StrEnum):
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Requested settings of a camera; as the return value of `configure`, the accepted ones.
+    """The requested settings of a camera. The return value of `configure` has the settings that the camera accepted.
 
     Attributes:
         exposure: exposure time in s.
@@ -157,7 +158,7 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """The camera's timing with its present settings; it is read from the camera and never computed by the caller.
+    """The timing of the camera with its present settings. It is read from the camera and never computed by the caller.
 
     Attributes:
         shape: (rows, cols) of the next frames.
@@ -204,7 +205,7 @@ class Camera(Protocol):
         """The oldest frame that was not returned yet. Raises DeviceTimeout if no frame arrives within `timeout` s."""
 
     def disarm(self) -> None:
-        """Stop, and free the ring buffer. Allowed in every state."""
+        """Stop the camera and free the ring buffer. This is allowed in every state."""
 
     def describe(self) -> dict[str, str | int | float]: ...
 
@@ -213,14 +214,14 @@ class Camera(Protocol):
 
 class CooledCamera(Camera, Protocol):
     def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> float:
-        """Wait at most `timeout` s until the sensor is cold; returns its temperature in °C.
+        """Wait until the sensor is cold, but at most `timeout` s. Returns the temperature of the sensor in °C.
 
         `progress` is called with the temperature and the status of the cooler. Raises DeviceError if the sensor does
         not get cold, or if the cooler is off or reports a fault."""
 
 
 class Shutter(Protocol):
-    """Beam shutter. It must be closed for darks. `by_hand`: the operator is asked to move it."""
+    """Beam shutter. It must be closed for darks. `by_hand`: True if the operator is asked to move it."""
 
     name: str
     by_hand: bool
@@ -299,7 +300,7 @@ class Watchable(Protocol):
     """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """From now on, call `check` repeatedly while the device moves. An exception from `check` ends the wait."""
+        """From now on, the device calls `check` repeatedly while it moves. An exception from `check` ends the wait."""
 
 
 @runtime_checkable
@@ -307,7 +308,8 @@ class Rechecked(Protocol):
     """A device whose position counts as known after a move, and can be checked again later."""
 
     def remember_place(self) -> Callable[[], str]:
-        """Store the present position. The returned function says where the device is now; "" if it is still there.
+        """Store the present position. Returns a function that returns a sentence with the new position if the device
+        has moved, or "" if it has not.
 
         Both raise DeviceError."""
 

@@ -106,7 +106,8 @@ _STATE: Mapping[str, str] = MappingProxyType(
         "dcamcap_firetrigger": "No frame was exposed",
     }
 )
-"""The state after a call that failed. Calls that are not in this list only read."""
+"""For each call, a sentence on the state after the call has failed. Calls that are not in this list only read
+values."""
 
 
 class DcamError(DeviceError):
@@ -130,7 +131,7 @@ def installed_library(platform: str) -> str:
     return "dcamapi.dll" if platform == "win32" else "libdcamapi.so"
 
 
-STARTS_WITHIN = 20.0  # s for the library to look for cameras; some seconds are usual
+STARTS_WITHIN = 20.0  # s; time for the library to look for cameras, which usually takes some seconds
 _SURVIVED = 86  # exit code of a test process whose library has started, or has reported an error
 _TRIAL = f"""
 import ctypes, os, sys
@@ -146,7 +147,8 @@ os._exit({_SURVIVED})
 
 @cache
 def try_out(name: str, device: str) -> None:
-    """Load and start a library in a separate process first, where it may hang or crash; once per process.
+    """Test a library before use: load and start it in a separate process, in which it may hang or crash. The test is
+    made once per process.
 
     A program with a built-in Python cannot start another Python, and skips this test.
 
@@ -245,7 +247,7 @@ class Dcam:
         self._call("dcamdev_close", camera)
 
     def dev_getcapability(self, camera: int) -> Capability:
-        """Which stamps (count, time) frames carry, according to the library."""
+        """The stamps (count, time) of frames, according to the library."""
         capability = DevCapability(size=sizeof(DevCapability))  # domain 0: functions
         self._call("dcamdev_getcapability", camera, byref(capability))
         return Capability(capability.flags)
@@ -271,7 +273,7 @@ class Dcam:
         self._call("dcamprop_setvalue", camera, prop, value, detail=f"{prop.name} = {value:g}")
 
     def prop_queryvalue(self, camera: int, prop: Property, value: float, option: int) -> float:
-        """The allowed value next to `value` in the direction `option`; an error if there is none."""
+        """The allowed value next to `value` in the direction `option`. Raises an error if there is none."""
         answer = c_double(value)
         self._call("dcamprop_queryvalue", camera, prop, byref(answer), option, detail=prop.name)
         return answer.value
@@ -287,7 +289,8 @@ class Dcam:
         self._call("dcambuf_release", camera, 0)
 
     def buf_lockframe(self, camera: int, slot: int) -> BufFrame:
-        """Address and stamps of a slot's frame, valid until the ring overwrites it; DCAM has no unlock call."""
+        """Address and stamps of the frame in a slot. They are valid until the ring overwrites the frame, because DCAM
+        has no call to unlock it."""
         frame = BufFrame(size=sizeof(BufFrame), index=slot)
         self._call("dcambuf_lockframe", camera, byref(frame), detail=f"slot {slot}")
         return frame
@@ -335,14 +338,15 @@ class Dcam:
         self._call("dcamwait_close", wait)
 
     def wait_abort(self, wait: int) -> None:
-        """End the wait of another thread; does nothing if none waits."""
+        """End the wait of another thread. Does nothing if no thread waits."""
         self._call("dcamwait_abort", wait)
 
     def wait_start(self, wait: int, mask: int, timeout_ms: int) -> None:
-        """Wait for an event in `mask`. Events may be merged, so use the transfer count to find how many frames arrived.
+        """Wait for an event in `mask`. Several events may arrive as one, so use the transfer count to find how many
+        frames arrived.
 
-        Raises:
-            DcamError: also TIMEOUT, ABORT, LOSTFRAME and MISSINGFRAME_TROUBLE.
+        Raises: DcamError: the call failed; the codes TIMEOUT, ABORT, LOSTFRAME and MISSINGFRAME_TROUBLE are possible,
+        too.
         """
         start = WaitStart(size=sizeof(WaitStart), mask=mask, timeout_ms=timeout_ms)
         self._call("dcamwait_start", wait, byref(start), detail=f"for {timeout_ms} ms")

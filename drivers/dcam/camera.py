@@ -29,11 +29,12 @@ _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 class DcamCamera:
     """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.base.protocols.Camera.
 
-    The camera counts the framestamps, so a frame that is lost anywhere leaves a gap. An overrun of the ring buffer is
-    an error. `describe` also returns how many frames were overwritten and how many losses the transport reported. Two
-    kinds of loss leave no gap and are visible only in the times: a trigger that comes too early, and the first frame of
-    a run if the camera continues its framestamps over captures (the constructor tests for this). One thread takes the
-    frames. Another thread may call `disarm` or `close`, which end the wait of the first one.
+    The camera counts the framestamps, so a frame that is lost anywhere leaves a gap in them. An overrun of the ring
+    buffer is an error. `describe` also returns the number of frames that were overwritten, and the number of losses
+    that the transport reported. Two kinds of loss leave no gap and are visible only in the times: a trigger that comes
+    too early; and the first frame of a run, if the camera does not restart its framestamps at each capture (the
+    constructor tests this). One thread takes the frames. Another thread may call `disarm` or `close`, which end the
+    wait of the first thread.
 
     Args:
         library: path of the DCAM-API library; None: the installed one. A process can have one session with it.
@@ -72,7 +73,7 @@ class DcamCamera:
         try:
             self._dcam, self._camera = self._session.dcam, self._session.camera
             self._properties = Properties(self._dcam, self._camera, name)
-            self._apply(_TEST_SETTINGS)  # another program may have changed any setting
+            self._apply(_TEST_SETTINGS)  # because another program may have changed any setting
             stamps = self._first_framestamp(), self._first_framestamp()
             self._first_stamp = stamps[0] if stamps[0] == stamps[1] else None
         except BaseException:
@@ -84,7 +85,7 @@ class DcamCamera:
         """Apply settings and read them back. Only the exposure may differ, because the camera rounds it.
 
         Raises:
-            DeviceRefused: the camera rejects a setting, or is armed; then the earlier settings remain.
+            DeviceRefused: the camera rejects a setting, or is armed. In the second case the earlier settings remain.
         """
         self._require_open()
         if self._ring is not None:
@@ -159,8 +160,8 @@ class DcamCamera:
                 self._await_event(min(left, _WAIT_SLICE))
 
     def disarm(self) -> None:
-        """Stop the capture and free the ring buffer; allowed in every state. This ends the wait of another thread for a
-        frame.
+        """Stop the capture and free the ring buffer. This is allowed in every state, and ends the wait of another
+        thread for a frame.
 
         Raises:
             DcamError: the library failed; a second call tries again.
@@ -184,7 +185,7 @@ class DcamCamera:
         }
 
     def close(self) -> None:
-        """Free all resources, also after a failure. Calling it again does nothing.
+        """Free all resources, even after a failure. A second call does nothing.
 
         Raises:
             DcamError: the first failure. An unplugged camera is not a failure.
@@ -227,7 +228,7 @@ class DcamCamera:
     def _first_framestamp(self) -> int:
         """Framestamp of the first frame of a capture (0 or 1, depending on the model).
 
-        It reveals a lost first frame of a run.
+        With this number, a lost first frame of a run is noticed.
         """
         ring = self._start(2, CaptureMode.SNAP)
         deadline = self._clock.now() + START_TIMEOUT

@@ -21,7 +21,8 @@ _REFUSALS = frozenset(
         *(Error.NOTWRITABLE, Error.ACCESSDENY, Error.NOTSTABLE, Error.BUSY),
     )
 )
-"""Errors for a value that a camera rejects, always or at the moment; the vendor's manuals disagree on their use."""
+"""Errors for a value that a camera never accepts, or does not accept at the moment. (The manuals of the vendor disagree
+on which error means what.)"""
 _STATE = "No frame was taken with this setting; earlier frames are good"
 
 
@@ -72,18 +73,19 @@ class Properties:
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:
-        """Set and read back; DeviceRefused if the camera rounded or ignored the value."""
+        """Set a value and read it back. Raises DeviceRefused if the camera rounded or ignored the value."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > 1e-9 * abs(value):
             raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
 
     def set_if_available(self, prop: Property, value: float) -> None:
-        """Call `set_exactly` if the camera has the property. A camera without it behaves as if it had this value."""
+        """Call `set_exactly` if the camera has the property. A camera without the property behaves as if it had this
+        value."""
         if self.find(prop) is not None:
             self.set_exactly(prop, value)
 
     def set_nearly(self, prop: Property, value: float, tolerance: float) -> None:
-        """Set and read back; DeviceRefused if the result differs by more than `tolerance`."""
+        """Set a value and read it back. Raises DeviceRefused if the result differs by more than `tolerance`."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > tolerance:
             raise DeviceRefused(
@@ -147,7 +149,8 @@ POLL = 1.0  # s
 STEADY_BAND, STEADY_FOR = 0.5, 60.0
 """Band in °C and time in s.
 
-If a cooler does not report READY, a temperature that stays within this band for this time is final.
+If a cooler does not report READY, the sensor counts as cold when its temperature has stayed within this band for this
+time.
 """
 
 

@@ -32,8 +32,8 @@ def description(
     """Identity and settings that this camera model reports, by name.
 
     Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
-    missing for a camera that does not report them. `row_period` (s): how much later each row starts than the one
-    above. It is missing if all rows start together.
+    missing for a camera that does not report them. `row_period`: time in s by which each row starts later than the row
+    above. The entry is missing if all rows start together.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON
@@ -70,7 +70,7 @@ def description(
 
 
 def _answer_or(ask: Callable[[], str], otherwise: str) -> str:
-    """The camera's answer, or `otherwise` if it does not answer."""
+    """The answer of the camera, or `otherwise` if it does not answer."""
     try:
         return ask()
     except DcamError as error:
@@ -190,10 +190,10 @@ def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSetti
 def read_timing(properties: Properties, trigger: TriggerSource, options: DcamOptions) -> CameraTiming:
     """Frame shape and timing that the camera reports, with the shortest trigger period.
 
-    For external triggers it is the vendor's rule (DCAM property reference). With exposure Tx, cyclic trigger period Tc
-    and minimum blanking Tb, triggers must be at least max(Tc, Tx + Tb) apart. They must also be at least the minimum
-    trigger interval apart. Tx is left out if the pulses set the exposure. If n pulses give one frame, pulses may be n
-    times as close.
+    For external triggers, the shortest period follows the vendor's rule (DCAM property reference). With exposure Tx,
+    cyclic trigger period Tc and minimum blanking Tb, triggers must be at least max(Tc, Tx + Tb) apart. They must also
+    be at least the minimum trigger interval apart. Tx is left out if the pulses set the exposure. If n pulses give one
+    frame, pulses may be n times as close.
 
     Frames with a set exposure are also not closer than in free run, because the camera's period in free run includes
     the transfer. A full frame takes 56 ms over USB and 8 ms on the sensor.

@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 
 INVALID = 3
-"""The severity of a value that the IOC does not guarantee, because its hardware does not answer or it was never set."""
+"""The severity of a value that the IOC does not guarantee: its hardware does not answer, or the value was never set."""
 UNREACHABLE = (
     "Check the name, that its IOC is running, and which hosts are searched (EPICS_PVA_ADDR_LIST for pva://, "
     "EPICS_CA_ADDR_LIST for ca://)"
@@ -46,7 +46,7 @@ class ProcessVariable(Protocol):
     name: str
 
     def read(self, *suffixes: str) -> list[PvValue]:
-        """The present values.
+        """The present values of the fields.
 
         Raises DeviceTimeout if one does not answer in time, DeviceError if one cannot be read.
         """
@@ -88,7 +88,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
 
 
 def url_problem(url: str) -> str:
-    """Why a URL does not name a process variable; "" if it does."""
+    """The reason why a URL is not the address of a process variable; "" if it is one."""
     scheme, _, name = url.partition("://")
     legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
     return "" if legal else f"{url!r} does not name a process variable; expected pva://NAME (PVAccess) or ca://NAME"

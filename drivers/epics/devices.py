@@ -29,13 +29,13 @@ class _PvDevice:
     def watch(self, check: Callable[[], None]) -> None:
         """From now on, call `check` repeatedly during a move.
 
-        Its exception ends the wait and stops the device, if possible.
+        An exception from `check` ends the wait, and stops the device if possible.
         """
         self._check = check
 
     @contextmanager
     def _opening(self, *urls: str) -> Iterator[list[ProcessVariable]]:
-        """The process variables at these addresses; an error in the context closes them again."""
+        """Open the process variables at these addresses. An error in the context closes them again."""
         with ExitStack() as opened:
             channels = [open_channel(url, self.name, self._timeout) for url in urls]
             for channel in channels:
@@ -44,7 +44,7 @@ class _PvDevice:
             self.disconnect = opened.pop_all().close
 
     def _waited(self, arrived: Callable[[], bool], travel: float, check: Callable[[], None] | None = None) -> bool:
-        """Wait at most `travel` s; returns whether the device has arrived."""
+        """Wait until the device has arrived, but at most `travel` s. Returns True if it has arrived."""
         deadline = self._clock.now() + travel
         while not (there := arrived()) and self._clock.now() < deadline:
             (check or self._check)()
@@ -287,7 +287,7 @@ class PvMonochromator(_PvDevice):
     def remember_place(self) -> Callable[[], str]:
         """See `drivers.base.protocols.Rechecked`.
 
-        A deviation of the energy that lasts less than `settle` does not count, as after a move.
+        As after a move, a deviation of the energy counts only if it lasts at least `settle`.
         """
         before = self.energy()
 

@@ -1,9 +1,9 @@
 """SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or sim:// of a simulator.
 
 Three rules keep requests and replies synchronised: there is one request at a time, every wait has a timeout, and every
-reply must match the expected form. After a timeout or a reply of another form, received data are discarded until the
-device has answered a probe without side effects and the line is silent. Commands without a reply are sent at once, so
-that a stop does not wait.
+reply must match the expected form. After a timeout, or a reply of another form, the line sends a probe: a query without
+side effects. It discards received data until the device has answered the probe and the line is silent. Commands without
+a reply are sent at once, so that a stop does not wait.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drivers.serial.line_reader import CRLF, RECENT_LINES, Damaged, Framing, Lin
 
 
 def serial_ports() -> str:
-    """The ports that pyserial lists, by device name with the ids of their adapters; none is opened."""
+    """The serial ports of this computer, by device name, with the ids of their adapters. No port is opened."""
     ports = sorted(list_ports.comports(), key=lambda port: str(port.device))
     return "; ".join(f"{port.device} ({port.description}, {port.hwid})" for port in ports) or "none"
 
@@ -37,8 +37,7 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
     """Open a port by its pyserial URL: 8 data bits, no parity, 1 stop bit, exclusive access.
 
     Args:
-        quiet: s without a byte after which a read ends.
-        write_timeout: s after which a write fails.
+        quiet: time in s without a byte after which a read ends. write_timeout: time in s after which a write fails.
 
     Raises:
         OSError, ValueError: the port does not open.
@@ -54,7 +53,7 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
 
 _SILENT = "Check power, cable and baud rate; the next request first synchronises the line again"
 _SERVER = ". Many terminal servers allow only one client: another program may use this port"
-NEVER = r"(?!)"  # a pattern that matches no line
+NEVER = r"(?!)"  # a pattern that does not match any line
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
 
@@ -71,14 +70,12 @@ class LineRules:
     """Framing, probe and timing of a device's dialogue.
 
     Attributes:
-        unsolicited: regular expression of lines that the device may send without a request; they are skipped and
-            recorded.
-        identified: True if each reply contains the number of its request, so that a second reply comes from another
-            device.
-        check: function that returns the fault of a received line, "" if it is good; for checksums.
-        text: True if no reply contains control characters or bytes above 7F; a reply that contains them is rejected in
-            any form.
-        unanswered: further advice if the device has never answered.
+        unsolicited: regular expression of lines that the device may send without a request. Such lines are skipped and
+            recorded. identified: True if each reply contains the number of its request. A second reply with this number
+            then comes from another device. check: function that returns the fault of a received line (such as a wrong
+            checksum), or "" if the line is good. text: True if no reply contains control characters or bytes above 7F.
+            A reply with such bytes is then always rejected. unanswered: further advice for the case that the device has
+            never answered.
     """
 
     probe: Probe
@@ -234,7 +231,8 @@ class SerialLine:
         return command.encode("ascii") + self._rules.framing.command_end, command or "an empty line"
 
     def _resynchronise(self, request: str, state: str) -> None:
-        """Discard received data, send the probe, skip late replies until that of the probe, and wait for silence."""
+        """Synchronise the line: discard received data, send the probe, skip late replies until the reply to the probe,
+        and wait for silence."""
         self._transcript.add_line("!", "out of step: probing")
         self._wait_for_quiet(request, state)
         self._write(*self._worded(self._probe.request))
@@ -291,7 +289,7 @@ class SerialLine:
 
     @contextlib.contextmanager
     def _port_errors(self, request: str) -> Iterator[None]:
-        """Turn errors of the port into errors of the device."""
+        """Convert errors of the port to errors of the device."""
         state = "The device may still be carrying out the earlier request"
         try:
             yield
@@ -327,7 +325,7 @@ class SerialLine:
 
     def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
         """The error, with a cause if the bytes since the last good reply show one."""
-        line_end = self._rules.framing.line_end.decode("latin-1")  # the reply may not be text
+        line_end = self._rules.framing.line_end.decode("latin-1")  # because the reply may not be text
         cause, todo = of_bytes(self._url, self._reader.heard.replace(line_end, "\n"))
         advice = (todo or advice) + ("" if self._has_answered else self._rules.unanswered)
         wire = self._transcript.recent()

@@ -23,9 +23,9 @@ RECENT_CHARACTERS = 40  # largest number of characters of each of these lines
 class Transcript:
     """Record of one serial line. It can be used from several threads.
 
-    The last lines are for error messages; a log file contains every byte. A log file that fails later is closed,
-    because a full disk must not end a scan. Each line of the log file contains the time in s since the epoch, a mark
-    and the bytes as a Python literal. Marks: ">" sent, "<" received, "!" done by the driver.
+    Error messages quote the last lines; a log file contains every byte. If writing to the log file fails later, the
+    file is closed, because a full disk must not end a scan. Each line of the log file contains the time in s since the
+    epoch, a mark and the bytes as a Python literal. Marks: ">" sent, "<" received, "!" done by the driver.
 
     Args:
         path: log file to which lines are appended; None: no file.
@@ -140,7 +140,7 @@ class LineReader:
         return readable(self._received)
 
     def reply(self, deadline: float) -> str | Damaged | None:
-        """The lines of a reply, joined; None if it is not complete by `deadline` or is too long."""
+        """The lines of a reply, joined. None if the reply is not complete by `deadline`, or is too long."""
         continued = self._framing.continued
         lines: list[str] = []
         while sum(map(len, lines)) <= LONGEST_REPLY:
@@ -169,7 +169,7 @@ class LineReader:
             self._received += self._read()
 
     def drain(self, deadline: float) -> bool:
-        """Discard bytes until the line is silent; returns True if it was silent by `deadline`."""
+        """Discard bytes until the line is silent. Returns True if the line was silent by `deadline`."""
         while (junk := self._read()) or self._received:
             self._transcript.add_line("!", f"discarded {readable(self._received + junk)}")
             self._received.clear()

@@ -20,7 +20,8 @@ MOST = 2.0**53  # counts; the largest whole number that a float represents exact
 
 
 def with_settings(name: str, driver: Any) -> Any:
-    """A driver of another package. Raises AttributeError or TypeError if it has no dataclass of settings."""
+    """Check the driver of another package, and return it. Raises AttributeError or TypeError if it has no dataclass of
+    settings."""
     settings_of(driver.Settings)
     return driver
 
@@ -119,7 +120,8 @@ class Wiring(CheckedSettings):
 
 
 class StageSettings(Protocol):
-    """Settings of a driver, and the limits that follow from them: a dataclass that derives from `StageFigures`."""
+    """Settings of a driver, and the limits that are computed from them: a dataclass that derives from
+    `StageFigures`."""
 
     stand_in: ClassVar[str]
 

@@ -67,7 +67,7 @@ def _settings_in(file: Path) -> dict[str, str]:
 
 
 class Stops:
-    """Stops of a stage, so that no stop is lost while a move begins; `count`: number of stops so far.
+    """Sends the stops of a stage, so that no stop is lost while a move begins. `count` is the number of stops so far.
 
     A stop is sent at once, perhaps just before the move command that another thread is about to send. So after its
     command, the thread that starts a move checks whether a stop came meanwhile, and sends the stop again.
@@ -87,7 +87,8 @@ class Stops:
         return self.count != self._before
 
     def came(self, *, hard: bool) -> None:
-        """Call this before the stop is sent. Then the stop is counted in time, or it is sent after the move command."""
+        """Call this before the stop is sent. Then either the stop is counted in time, or it is sent after the move
+        command."""
         self._hard = hard
         self.count += 1
 
@@ -130,8 +131,8 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
     """Wait at most `timeout` s until the stage has stopped; returns the last status.
 
     Args:
-        look: function that reads the status; called at least once.
-        moves: function that says whether the stage moves according to a status.
+        look: function that reads the status. It is called at least once. moves: function that returns True if the stage
+            moves according to a status.
     """
     deadline = clock.now() + timeout
     while moves(status := look()) and (left := deadline - clock.now()) > 0:

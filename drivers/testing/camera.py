@@ -22,7 +22,7 @@ CLOCK_ERROR = 2e-4  # s
 
 @dataclass(frozen=True)
 class CameraBench:
-    """A camera and the tools to test it.
+    """A camera with the tools to test it.
 
     Attributes:
         pulse: function that puts rising edges on the camera's trigger input at these times of the clock.

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 _WINDOW, _SIGMA = 11, 1.5
-_SAMPLE = 100_000  # voxels from which the two cluster centres are computed
-_BLURRED = 1.0  # voxels; blur of a reference, so that its noise does not decide which voxels are dense
+_SAMPLE = 100_000  # number of voxels from which the two cluster centres are computed
+_BLURRED = 1.0  # blur of a reference in voxels, so that its noise does not decide which voxels are dense
 _SLAB = 32  # number of slices at a time
 _MOST = 2**21  # largest number of voxels from which regions and their noise are computed
 SUMMED_VALUES = 2**22  # number of values whose errors are summed at a time
-_RIM = 2  # voxels at the edge of a region, into which the surroundings are blurred
+_RIM = 2  # width in voxels of the rim of a region, into which the surroundings are blurred
 
 Array = NDArray[np.floating]
 
@@ -31,7 +31,7 @@ def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
 
     Args:
         truth, volume: the same shape, any number of dimensions.
-        peak: None: the maximum of the ground truth.
+        peak: the value of peak in the formula; None: the maximum of the ground truth.
     """
     _same_shape(truth, volume)
     top = float(truth.max()) if peak is None else peak
@@ -66,7 +66,7 @@ def _data_range(truth: Array, data_range: float | None) -> float:
 
 
 def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[float, int]:
-    """Sum of the local SSIM over windows in the plane (two axes), and their number."""
+    """Sum of the local SSIM over windows in the plane (two axes), and the number of windows."""
 
     def blur(image: Array) -> Array:
         for axis in plane:
@@ -110,11 +110,11 @@ def ssim2d(truth: Array, image: Array, data_range: float | None = None) -> float
 
 
 def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> float:
-    """Mean over the three directions of the mean `ssim2d` of the slices across it.
+    """Mean `ssim2d` of the slices across each of the three axes, averaged over the axes.
 
     Args:
         truth, volume: [z, y, x].
-        data_range: the same for all slices; None: maximum - minimum of the whole ground truth.
+        data_range: one value for all slices; None: maximum - minimum of the whole ground truth.
     """
     _same_shape(truth, volume)
     if truth.ndim != 3:
@@ -165,8 +165,8 @@ def sampled(volume: Array) -> Array:
 def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
     """The largest box inside the cylinder that every projection sees, minus a margin: (z, y, x) slices.
 
-    The side is 2 r cos 45° for a circle with the radius r, half the smaller of ny and nx. The margin is a fraction of
-    the side, and of the height, that is removed at each end.
+    The side is 2 r cos 45°, with r half the smaller of ny and nx. The margin is the fraction of the side, and of the
+    height, that is removed at each end.
     """
     if not 0 <= margin < 0.5:
         raise ValueError(f"the margin must be a fraction of the side length, 0 to 0.5, got {margin}")
@@ -182,8 +182,8 @@ def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[
 def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
 
-    It divides the values into the two parts with the smallest sum of squares within the parts (Otsu 1979, IEEE Trans.
-    Syst. Man Cybern. 9, 62). Lloyd's iterations might end in another division.
+    The values are divided into two parts so that the sum of squares within the parts is smallest (Otsu 1979, IEEE
+    Trans. Syst. Man Cybern. 9, 62). Lloyd's iterations, the usual algorithm for k-means, might end in another division.
 
     Args:
         volume: [z, y, x], with enough contrast to separate the two regions. The mask also serves for other volumes of
@@ -214,9 +214,10 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
 
 
 def _between_two_means(values: NDArray[np.float64]) -> float:
-    """The threshold: the middle between the means of the two parts with the smallest sum of squares within them."""
+    """The threshold: the values are divided into two parts so that the sum of squares within the parts is smallest; the
+    threshold is the middle between the means of the two parts."""
     rising = np.sort(values)
-    lower = np.arange(1, rising.size)  # number of values in the lower part, for each position of the cut
+    lower = np.arange(1, rising.size)  # number of values in the lower part, for each possible threshold
     below = np.cumsum(rising)[:-1] / lower
     above = (rising.sum() - below * lower) / (rising.size - lower)
     best = int(np.argmax(lower * (rising.size - lower) * (above - below) ** 2))
@@ -224,19 +225,21 @@ def _between_two_means(values: NDArray[np.float64]) -> float:
 
 
 def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a volume, without their rims, for assessing any volume of the same sample.
+    """Dense and empty regions of a volume, without their rims. They can be used to assess any volume of the same
+    sample.
 
-    They are those of `kmeans_mask` for the reference blurred by a voxel, without two voxels at each edge between them.
-    So neither the noise of the reference nor the exact position of its edges matters. References of one sample with
-    noise, streaks or an axis that is wrong by a pixel give the same SNR and CNR within about 0.3 dB. Regions that are
-    too thin for two voxels lose one voxel.
+    The reference is blurred by a voxel and divided by `kmeans_mask`. Then two voxels are removed at each edge between
+    the regions; a region that is too thin for that loses one voxel. So the result depends neither on the noise of the
+    reference nor on the exact position of its edges. References with noise, with streaks, or with an axis that is wrong
+    by a pixel give the same SNR and CNR within about 0.3 dB.
 
     Args:
         reference: [z, y, x].
         seed: as in `kmeans_mask`.
 
     Returns:
-        As `kmeans_mask`, with -1 also at rims; None if a region has no interior, or the reference has no contrast.
+        The values of `kmeans_mask`, with -1 also at rims. None if a region has no interior, or if the reference has no
+        contrast.
     """
     try:
         mask = kmeans_mask(ndimage.gaussian_filter(np.asarray(reference, np.float32), _BLURRED), seed)
@@ -257,8 +260,8 @@ def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None
 def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[float, float]:
     """Signal-to-noise and contrast-to-noise ratio in dB: 20 log₁₀(μ / σ_b) and 20 log₁₀(|μ - μ_b| / σ_b).
 
-    μ is the mean of the dense region; μ_b and σ_b are mean and standard deviation of the empty region. The result is
-    inf if σ_b is 0, and -inf if the numerator is not positive.
+    μ is the mean of the dense region; μ_b and σ_b are mean and standard deviation of the empty region. A ratio is inf
+    if σ_b is 0, and -inf if its numerator is not positive.
 
     Args:
         volume: [z, y, x].

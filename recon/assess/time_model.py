@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from recon.base.choices import Quality
 
 MOST_STEPS = 1000
-"""Largest number of steps of a fit with a time limit. In four measured and simulated scans, more steps fit the
+"""Largest number of steps of a fit with a time limit. In four scans, measured and simulated, more steps fitted the
 noise."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of a fit for one quality preset.
+    """Settings of a Gaussian fit for one quality preset.
 
     Attributes:
         share: number of Gaussians at the start, relative to the default number for the volume.

@@ -35,16 +35,17 @@ def frozen(values: F64) -> F64:
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of the normal distribution with this median of absolute values; 0 if no value is finite."""
+    """Standard deviation of a normal distribution, computed from the median of the absolute values; 0 if no value is
+    finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
 
 
 def some_values(values: NDArray[Any], about: int) -> NDArray[Any]:
-    """About `about` of the values, taken from all positions along the last axis.
+    """A sample of roughly `about` of the values, from all positions along the last axis.
 
-    The step shares no factor with the length of that axis. With a shared factor, a sample of 183³ voxels came from only
-    three of the 183 slices.
+    The step between sampled values has no common factor with the length of the last axis. With a common factor, a
+    sample of 183³ voxels came from only three of the 183 slices.
     """
     step = max(1, values.size // about)
     while math.gcd(step, values.shape[-1]) > 1 and values.shape[-1] < values.size:

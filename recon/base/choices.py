@@ -1,4 +1,5 @@
-"""Names and defaults that command-line options show. No module that computes is imported, so that help is quick."""
+"""Names and defaults that command-line options show. This module imports no numerical code, so that help appears
+fast."""
 
 from __future__ import annotations
 
@@ -20,10 +21,12 @@ Start = Literal["fbp", "tv", "published"]
 KERNEL = Kernel.COMPACT  # default radial profile of the Gaussians of a fit
 
 FEW_PHOTONS = 100
-"""Photons per pixel in the open beam. With fewer, fitting the counts is better than fitting their logarithm."""
+"""Photons per pixel in the open beam. Below this number, a fit to the counts is better than a fit to their
+logarithm."""
 
 SPOT_ERRORS = 8.0
-"""Default threshold for zingers, in standard deviations above the neighbours. Noise exceeds it once in 10¹⁵ pixels."""
+"""Default threshold for zingers, in standard deviations above the neighbouring pixels. Noise alone exceeds this
+threshold in one of 10¹⁵ pixels."""
 
 
 def refuse_unknown_device(device: str) -> None:

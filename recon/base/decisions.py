@@ -11,14 +11,15 @@ T = TypeVar("T")
 
 
 class MaterialPrior(NamedTuple):
-    """Discrete levels of the sample, and how strongly voxels are pulled towards them (discrete tomography).
+    """Discrete grey levels of the sample, and the strength with which voxels are pulled towards them (discrete
+    tomography).
 
     Attributes:
-        levels: densities of the materials, ascending; empty: voxels are not pulled.
+        levels: densities of the materials, ascending. If the list is empty, voxels are not pulled.
         weights: shares of the materials in the sample.
-        tv_share: weight of total variation together with the pull, divided by the weight without it.
-        pull: the factor c of the step c (z - x) towards the levels z; the step that fits the projections has the factor
-            1.
+        tv_share: weight of total variation if voxels are pulled, divided by the weight without a pull.
+        pull: factor c of the step c (z - x) from the voxels x towards the levels z. The step that fits the projections
+            has the factor 1.
     """
 
     levels: tuple[float, ...] = ()
@@ -27,7 +28,7 @@ class MaterialPrior(NamedTuple):
     pull: float = 0.0
 
     def scaled(self, power: int) -> MaterialPrior:
-        """The same in units in which densities are 2^power times as large."""
+        """The same levels in units in which all densities are 2^power times as large."""
         return self._replace(levels=tuple(math.ldexp(level, power) for level in self.levels))
 
 
@@ -54,16 +55,17 @@ class Prior(NamedTuple):
 
 
 class Decisions:
-    """The decisions that a run makes from its data, by name and in order.
+    """The decisions that a run derives from its data, by name, in the order in which they were made.
 
-    A weight of total variation, a step or a restart depends on sums over a whole volume. If each slab computed its own,
-    they would differ and the volume would show a seam. So one slab decides, and the others follow: `Decisions(seed,
-    first.made)`. A decision that is missing in `made` is made then.
+    A weight of total variation, a step length or a restart depends on sums over the whole volume. If each slab derived
+    these values from its own data, the values would differ and the volume would show a seam. Therefore one slab
+    decides, and the other slabs reuse its decisions: `Decisions(seed, first.made)`. If `made` does not contain a
+    decision, it is made when a method asks for it.
 
     Attributes:
         made: the decisions so far, by name: plain numbers and lists of numbers.
         prior: the prior of the volume in the units of the scan, if it was chosen before; None: the method chooses it.
-        settings: values for the record of the volume, in addition to the settings of its method.
+        settings: values that are recorded with the volume, in addition to the settings of its method.
     """
 
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
@@ -82,16 +84,17 @@ class Decisions:
 
 
 class Stop:
-    """Tells a run whether to end early and keep its result so far. The run calls it between steps.
+    """Tells a run whether to end early and keep the result reached so far. The run calls this object between steps.
 
     Args:
-        asks: function that returns True to end the work; after that it is not called again.
-        deadline: time at which the work ends by itself, in s of the clock `now`; inf: never.
+        asks: function that returns True to end the work. After it has returned True, it is not called again.
+        deadline: time at which the work ends by itself, in s of the clock `now`; inf: there is no deadline.
         now: the clock.
 
     Attributes:
-        stopped: True if somebody asked for the end. A run that ends at its own deadline is not stopped, because this
-            end was planned. For a request made with `by`, the deadline of the first request counts as asked for.
+        stopped: True if `asks` has requested the end. A run that ends at its own deadline counts as not stopped,
+            because this end was planned. In a request made with `by`, the deadline of the request it was made from
+            counts as a requested end.
     """
 
     def __init__(
@@ -117,7 +120,8 @@ class Stop:
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether a stop left some of the `planned` steps or iterations undone; `planned` 0: no number was planned."""
+        """Whether the run was stopped before all `planned` steps or iterations were done. `planned` is 0 if no number
+        was planned."""
         return self.stopped and not 0 < planned <= done
 
 

@@ -1,4 +1,4 @@
-"""Declared types: checks that a value has the type its field or argument declares, and the message if it has not.
+"""Declared types: checks that a value has the type that its field or argument declares, and words the error message.
 
 For an array only the type is checked. The functions that take the array check its shape and its values.
 """
@@ -39,7 +39,7 @@ _WORDS: Mapping[Any, str] = {
 
 
 class _Unresolved:
-    """Stands for a type that only the type checker imports; every value passes."""
+    """Placeholder for a type that only the type checker imports. Every value passes the check."""
 
     def __class_getitem__(cls, parameters: object) -> type[_Unresolved]:
         return cls
@@ -61,7 +61,8 @@ def types_of(owner: Any) -> Mapping[str, Any]:
 
 
 def is_number(value: object) -> bool:
-    """Whether the value is a real number, or an array without axes that contains one (numpy reads it so from .npz).
+    """Whether the value is a real number, or an array without axes that contains one. (numpy reads numbers from .npz
+    files as arrays without axes.)
 
     True and False do not count as numbers.
     """
@@ -70,7 +71,8 @@ def is_number(value: object) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """The plain Python number or bool in a numpy scalar or an array without axes; other values unchanged."""
+    """The plain Python number or bool in a numpy scalar or in an array without axes. Other values are returned
+    unchanged."""
     return value.item() if isinstance(value, np.ndarray | np.bool_) and value.shape == () else value
 
 
@@ -157,7 +159,7 @@ def _word(kind: Any) -> str:
 
 
 def refusal(name: str, value: Any, kind: Any) -> str:
-    """The message for a value of the wrong type; without a full stop."""
+    """The error message for a value of the wrong type, without a full stop."""
     alternatives = _alternatives(kind)
     names = [member for each in alternatives if get_origin(each) is Literal for member in get_args(each)]
     names += [
@@ -182,8 +184,8 @@ def shown(value: object) -> str:
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
     """Raise ValueError if an argument has another type than the function declares, or a number is out of bounds.
 
-    It also raises for masked values, because numpy computes with the numbers below a mask. A function that can leave
-    masked values out calls `without_mask` first.
+    It also raises ValueError for masked values, because numpy would compute with the numbers under the mask. A function
+    that can leave masked values out calls `without_mask` first.
 
     Args:
         values: by name, such as `locals()` in the function's first line.
@@ -209,9 +211,11 @@ class Checked:
 def check_settings(settings: Any) -> None:
     """Raise ValueError if a value of a dataclass does not match the declaration of its field.
 
-    That is a value of another type, a name that its Literal does not contain, or a number out of the field's bounds.
+    A value does not match if it has another type, if it is a name that the field's Literal does not contain, or if it
+    is a number outside the field's bounds.
 
-    An array without axes becomes the number in it; numpy reads a number from .npz as such an array.
+    An array without axes is replaced by the number in it, because numpy reads a number from an .npz file as such an
+    array.
     """
     values = {each.name: plain(getattr(settings, each.name)) for each in fields(settings) if each.init}
     check_arguments(type(settings), values)

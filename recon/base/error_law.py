@@ -1,9 +1,10 @@
 """Error model: how the error of a volume falls with more projections, and the expected improvement in PSNR (dB).
 
 The mean square error of a volume from n projections has three parts, given as shares of it. `offset` is a constant
-error in the middle of the volume. It comes from unknown density outside the field of view, and only laterally offset
-projections reduce it. `noise` falls with the number of photons, also at the same angles. The remaining share comes from
-gaps between the angles. With projections at new angles, the last two parts together fall as n^-exponent.
+error in the middle of the volume. The cause of this offset is unknown density outside the field of view. Only laterally
+offset projections reduce the offset. `noise` falls with the number of photons, also at the same angles. The third part,
+which is the rest, comes from the gaps between the angles. With projections at new angles, the sum of the second and the
+third part falls as n^-exponent.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ import math
 from dataclasses import dataclass
 
 BELOW = 0.5
-"""For the low end of a gain's range, exponent and noise share are lowered by at most this share of themselves.
+"""Limits the range of a predicted gain: for its low end, exponent and noise share are lowered by at most this fraction.
 
-For the high end they may be raised by more. The value is a convention.
+For the high end, exponent and noise share may be raised by more. The value is a convention; it was not measured.
 """
 
 
@@ -28,23 +29,25 @@ class Gain:
 
     @property
     def at_most(self) -> float:
-        """The gain to assume before further projections are given up.
+        """The gain (dB) to compare with the wanted gain before a scan decides against further projections.
 
-        It is the mean, or the high end if the exponent is uncertain by half or more.
+        It is the mean gain. If the uncertainty of the exponent is half of the exponent or more, it is the high end of
+        the range.
         """
         return self.mean if self.high <= (1 + BELOW) * self.mean * (1 + 1e-9) else self.high
 
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """Error model of a volume from `n_views` projections, measured without ground truth; see the module.
+    """Error model of a volume from `n_views` projections, measured without ground truth. The docstring of the module
+    defines the model.
 
     Attributes:
         n_views: number of projections of the volume.
         exponent: exponent with which the mean square error falls with the number of projections.
-        exponent_error: uncertainty of the exponent, which gives the range of a gain. The exponent is assumed to lie
-            within twice this value, but not below half of the exponent. Both shares are assumed to have the same
-            relative uncertainty. See `recon.voxels.measured_law`.
+        exponent_error: uncertainty of the exponent, from which the range of a gain is computed. The range assumes that
+            the exponent is wrong by at most twice this uncertainty, and is not below half of its value. It also assumes
+            that both shares have the same relative uncertainty. See `recon.voxels.measured_law`.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
@@ -63,7 +66,7 @@ class ErrorLaw:
             wide: also laterally offset projections.
         """
 
-        def decibels(factor: float) -> float:  # with the exponent and the shares multiplied by this factor
+        def decibels(factor: float) -> float:  # the gain if the exponent and the shares are multiplied by this factor
             noise = min(factor * self.noise, 1 - self.offset)
             offset = self.offset * (max(1 - factor, 0) if wide else 1)
             gaps_and_noise = 1 - noise - self.offset + noise * self.n_views / (self.n_views + again)

@@ -1,6 +1,6 @@
 """Findings: turns pydantic's errors about the values of a file into messages with the value and what is legal.
 
-Configurations and scenes have the same messages. The legal keys and values are read from the JSON schema.
+The messages are the same for configurations and for scenes. The legal keys and values come from the JSON schema.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BOUNDS = {
     "lt": "exclusiveMaximum",
     "le": "maximum",
 }  # names in JSON schemas
-_MANY = 2  # with more unknown keys than this in a group, the keys are taken to belong to another kind
+_MANY = 2  # if a group has more unknown keys than this, the keys are assumed to belong to another kind of device
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ def faults_of(
         findings: the list from `pydantic.ValidationError.errors`.
         data: the plain values.
         schema: JSON schema of the legal values.
-        where: path that is put before the path of each key; "" at the top of a file.
-        former: by path of a removed key, a sentence that says what replaces it.
+        where: prefix for the path of each key; "" at the top of a file.
+        former: the path of each removed key, with a sentence that names the replacement.
         advice: sentence for a group that has the keys of another kind.
     """
     faults: dict[KeyPath, Fault] = {}
@@ -150,7 +150,8 @@ def _in_yaml(value: Any) -> str:
 
 
 def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
-    """The schemas for the value at `path`, for the kinds and schemes that the data select."""
+    """The schemas of the value at `path`. If a schema has alternatives, the data select them by their kind or
+    scheme."""
     branches = _branches(schema, data, schema)
     for part in path:
         data = data[part] if _has(data, part) else None
@@ -160,7 +161,8 @@ def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
 
 
 def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
-    """The alternatives of a node, with references resolved. If the data name a tag, only the alternative with it."""
+    """The alternatives of a node, with references resolved. If the data name a tag, only the alternative with this
+    tag."""
     while "$ref" in node:
         node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
     alternatives = node.get("anyOf") or node.get("oneOf")
@@ -186,7 +188,7 @@ def _choices(branch: Schema) -> list[Any]:
 
 
 def _words(branch: Schema) -> str:
-    """The legal values, if they are not a short list of choices."""
+    """A description of the legal values that are not a short list of choices."""
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"

@@ -45,7 +45,7 @@ from recon.base.ray_width import NO_WIDTH, RayWidth
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field of view is on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod; the corners of a box with this half width do not reach the source
 _MAGNIFIED = 1e6  # far above any real one; a voxel stays in the range of float32
-_OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each projection
+_OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes that have one value for each projection
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +55,21 @@ class Geometry:
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: size of a detector pixel in mm. For a parallel beam, it is measured at the sample; for a cone, on
-            the detector. 1.0 for a parallel beam: all lengths are in pixels.
-        axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector (for a cone: of
-            the central ray). In pixels, 0 at the centre of the first column or row.
+        pixel_pitch: size of a detector pixel in mm. For a parallel beam, the size is measured at the sample; for a cone
+            beam, on the detector. If the pitch of a parallel beam is 1.0, all lengths are in pixels.
+        axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector. For a cone beam,
+            the row is that of the central ray. Both are in pixels, 0 at the centre of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
-        roll: float64 [view], radians; rotation of the detector about the beam. Its columns then run along u cos(roll) +
-            v sin(roll).
-        tilt: float64 [view], radians; tilt of the rotation axis along the beam. Rows then run along v cos(tilt) + d
-            sin(tilt), with d the direction of the beam.
+        roll: float64 [view], radians; rotation of the detector about the beam. The column number of the rolled detector
+            grows along u cos(roll) + v sin(roll).
+        tilt: float64 [view], radians; tilt of the rotation axis along the beam. The row number of a tilted projection
+            grows along v cos(tilt) + d sin(tilt), with d the direction of the beam.
         width: width of all rays; see `seen_with`.
-        skew: radians from one row to the next (parallel beam only); `angles` are those of the first row.
-        centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point at the distance `sod` from the source
-            along the beam of the projection. Left out: the origin.
+        skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
+            `angles` are the angles of the first row.
+        centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
+            source, along the beam of the projection. If left out, this point is the origin.
     """
 
     angles: F64
@@ -131,7 +132,8 @@ class Geometry:
         sdd: float,
         **where: Unpack[Where],
     ) -> Geometry:
-        """Cone beam from a point source to a flat detector: `sod` mm to the rotation axis, `sdd` mm to the detector.
+        """Cone beam from a point source to a flat detector. The source is `sod` mm from the rotation axis and `sdd` mm
+        from the detector.
 
         Args:
             pixel_pitch: mm, in the plane of the detector; at the rotation axis a pixel is smaller by the factor sod /
@@ -189,18 +191,21 @@ class Geometry:
 
     @cached_property
     def is_fan(self) -> bool:
-        """Whether the beam is a fan: one straight row, whose rays lie in the plane of the source across the axis."""
+        """Whether the beam is a fan: one straight detector row in the plane that contains the source and is
+        perpendicular to the axis."""
         level = self.detector_shape[0] == 1 and not (self.axis_row + self.shifts[:, 1]).any()
         return self.is_cone and self.is_straight and level
 
     @cached_property
     def is_straight(self) -> bool:
-        """Whether there is no roll, tilt or centre: rows run along u, columns along the axis (shifts are allowed)."""
+        """Whether roll, tilt and centres are all 0: detector rows run along u, and columns along the axis. (Shifts are
+        allowed.)"""
         return not (self.roll.any() or self.tilt.any() or self.centres.any())
 
     @property
     def rows_show_slices(self) -> bool:
-        """Whether each detector row shows one slice in all projections: parallel, straight, no shift along the axis."""
+        """Whether each detector row shows the same slice in all projections: parallel beam, no roll or tilt, no shift
+        along the axis."""
         return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
 
     @property
@@ -208,15 +213,16 @@ class Geometry:
         """Whether the sample moves along the rotation axis by half the height of the detector or more, as in a helical
         scan.
 
-        Single displaced projections do not count, because only the middle half of all displacements is looked at. In a
-        helix this half is half as long as the whole.
+        Only the middle half of all displacements is measured, so that single displaced projections do not count. In a
+        helical scan, the middle half spans half of the full displacement.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
 
     @property
     def lean(self) -> float:
-        """Largest displacement of a point of the field from row to row by roll and tilt, in mm at the rotation axis."""
+        """Largest displacement along the rotation axis that roll and tilt give a point in the field of view, in mm at
+        the rotation axis."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
         return self.reach * float(across.max())
 
@@ -225,9 +231,9 @@ class Geometry:
         """Angle in radians after which projections repeat the same rays: π for a parallel beam with the axis in the
         middle, otherwise 2π.
 
-        It is 2π for a cone. It is 2π if the axis is tilted along the beam so much that the edge of the field of view
-        moves by more than half a pixel. It is also 2π if the axis is off the detector's middle by more than a twentieth
-        of the detector's width, because opposite projections then see different parts of the sample.
+        The period is 2π in three cases: for a cone beam; if the axis is tilted along the beam so much that the edge of
+        the field of view moves by more than half a pixel; and if the axis is off the detector's middle by more than a
+        twentieth of the detector's width, because opposite projections then see different parts of the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
@@ -236,8 +242,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        The half angle is the smallest tilt of the axis along the beam. It is 0 if that tilt moves the edge of the field
-        of view by at most half a pixel.
+        The half angle is the smallest tilt of the axis along the beam. The half angle is 0 if this tilt moves the edge
+        of the field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
@@ -251,7 +257,8 @@ class Geometry:
 
     @property
     def is_centred(self) -> NDArray[np.bool_]:
-        """[view] True for ordinary projections, False if offset laterally by more than half the detector width."""
+        """[view] False for a projection that is offset laterally by more than half the detector width, True for all
+        others."""
         aside = self.shifts[:, 0]
         usual = np.sort(aside)[(aside.size - 1) // 2]
         return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)
@@ -284,11 +291,9 @@ class Geometry:
 
     @property
     def reach(self) -> float:
-        """Distance in mm from the rotation axis to the farthest edge of the detector in any projection, measured at the
-        axis.
+        """Distance in mm, at the rotation axis, from the axis to the farthest detector edge of any projection.
 
-        Rolled projections count as if they were straight; laterally offset ones do not count. For a wide cone the value
-        is limited to 0.7 sod.
+        Roll is ignored, and so are laterally offset projections. For a wide cone the value is limited to 0.7 sod.
         """
         cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.is_centred]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
@@ -296,7 +301,7 @@ class Geometry:
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest point of the rotation axis that any projection sees, as z in mm; tilt is ignored."""
+        """Lowest and highest z in mm of the points on the rotation axis that any projection sees; tilt is ignored."""
         rows, axis = self.detector_shape[0], self.axis_row + self.offsets[:, 1]
         low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
         return float(low * self.sample_pitch), float(high * self.sample_pitch)
@@ -337,7 +342,7 @@ class Geometry:
         return html("Geometry", fan(self.angles, centre), {"views": repr(self)[9:-1]})
 
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
-        """The same geometry with only `views`, in that order.
+        """The same geometry with only the projections `views`, in the order of `views`.
 
         Raises:
             ValueError: `views` is empty.
@@ -349,12 +354,12 @@ class Geometry:
         return replace(self, **some)
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same set-up at other angles (radians). Shift, roll and tilt must be the same in all projections, and are
-        kept.
+        """The same set-up at other angles (radians). Shift, roll and tilt are kept; each must be the same in all
+        projections.
 
         Raises:
-            ValueError: the angles are not valid, or shift, roll, tilt or centre differ between projections; their
-                values at new angles are then unknown.
+            ValueError: the angles are not valid. Or shift, roll, tilt or centre differ between projections, so that the
+                values at the new angles are unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -385,16 +390,16 @@ class Geometry:
         return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same projections with a ray width, and a skew from row to row (rolling shutter).
+        """The same projections, with a ray width and with a skew: the angle from one row to the next (rolling shutter).
 
         Raises:
-            ValueError: the skew is not finite, or it is not 0 for a cone beam or for rolled or tilted projections,
-                because a slice of the volume then does not belong to one row.
+            ValueError: the skew is not finite. Or the skew is not 0 and the beam is a cone, or projections are rolled
+                or tilted: a slice of the volume then does not belong to one row.
         """
         return replace(self, width=width, skew=float(skew))
 
     def about(self, centres: ArrayLike) -> Geometry:
-        """The same projections of a cone beam with other centres, [view, 3] in mm; see `centres`.
+        """The same projections of a cone beam with other `centres`, [view, 3] in mm (see the attribute).
 
         Raises:
             ValueError: the centres are not finite or have another shape, or the beam is parallel.
@@ -407,14 +412,15 @@ class Geometry:
         return replace(self, centres=frozen(points))
 
     def at_row(self, row: float) -> Geometry:
-        """The same geometry without skew: all rows have the angle of row `row`."""
+        """The same geometry without skew: every row has the angle of row `row`."""
         return replace(self, angles=frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
 
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam, z = 0 moves to the middle of these rows, so that a slab is a scan of its own. The central
-        ray of a cone stays at its position, and so does the point about which projections are rolled and tilted.
+        For a parallel beam, z = 0 moves to the middle of these rows, so that a slab can be treated as a separate scan.
+        For a cone beam, the central ray stays at its position, and so does the point about which projections are rolled
+        and tilted.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
@@ -450,7 +456,8 @@ class Geometry:
 
 
 def unseen_axis(axis_cols: ArrayLike, cols: int) -> str:
-    """The message about a rotation axis outside the detector in all projections; empty if a projection shows the axis.
+    """A message if the rotation axis is outside the detector in all projections; empty text if a projection shows the
+    axis.
 
     If no projection shows the axis, the region around it is not measured, and the field of view is a ring.
     """

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from recon.base.arrays import F64, some_values
 
 _SAMPLE = 200_000  # number of values in the sample
-_SPLIT = (
-    0.7  # share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
-)
+# share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
+_SPLIT = 0.7
 _LEAST = 2e-4  # smallest share of the values in a class
 _MOST = 8  # classes
-_FREQUENT = 0.03  # share of all material
-# A class that is this many times as dense as the class below it, and this much rarer, is shown white. Otherwise the
-# class below would be black.
+_FREQUENT = 0.03  # share of all voxels that are not air
+# A class that is this many times as dense as the class below it, and this many times rarer, is shown white. Otherwise
+# the class below would appear black.
 _METAL, _RARER = 4.0, 0.75
 _WEAK = 0.6  # share of the upper end of the material window
 _BEYOND = 0.1  # share of the window, added below air and above the densest class shown
@@ -30,7 +29,7 @@ _ALL = (0.05, 99.95)
 
 
 def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
-    """A sample of the finite values, ascending, split into classes by thresholds.
+    """An ascending sample of the finite values, split into classes by thresholds.
 
     A class is divided if two parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man Cybern. 9, 62). Each
     part is divided in the same way.
@@ -48,7 +47,8 @@ def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
 
 
 def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
-    """The sum of squares that two classes explain, and the number of values in the lower class; 0: one class."""
+    """The sum of squares that a division into two classes explains, and the number of values in the lower class (0: no
+    division)."""
     n = ascending.size
     places = least + np.flatnonzero(ascending[least : n - least + 1] > ascending[least - 1 : n - least])
     if n < 2 * least or not places.size:
@@ -64,9 +64,9 @@ def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
 def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]:
     """Grey windows (low, high) of a volume by name, the preferred one first.
 
-    "matter" reaches from air to the densest class with which the class below it is still bright enough to be seen.
-    "weak" reaches to the least dense class (or, if that class is only a metal pin, to the rest of the values); it is
-    left out if it equals "matter". "all" contains all values except half a per mille at each end.
+    "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen. "weak"
+    reaches from air to the least dense class, or, if that class is only a metal pin, to the rest of the values. "weak"
+    is left out if it equals "matter". "all" contains all values except half a per mille at each end.
     """
     classes = [each for each in class_levels(values) if each.size]
     if not classes:
@@ -96,7 +96,7 @@ def material_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def apart(low: float, high: float) -> tuple[float, float]:
-    """The ends of a range, moved apart if all values are equal."""
+    """The two ends of a range. If all values are equal, the ends are moved apart."""
     return low, max(high, low + 1e-6 * max(abs(low), 1e-3))
 
 
@@ -143,8 +143,8 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
 
 
 def grey(image: NDArray[Any]) -> tuple[U8, tuple[float, float]]:
-    """An image [row, col] thinned out to at most 256 pixels a side, and the values of black and white: all but half a
-    per mille at each end. Values that are not finite are black.
+    """An image [row, col] thinned out to at most 256 pixels a side, and its values of black and white. Half a per mille
+    of the pixels is below black, and half a per mille above white. Values that are not finite are black.
     """
     step = -(-max(image.shape) // _SIDE)
     thin = np.asarray(image[::step, ::step], np.float64)

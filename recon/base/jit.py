@@ -1,4 +1,5 @@
-"""njit: numba's decorator, which imports numba at the first call of a kernel, so that other commands start sooner."""
+"""njit: replaces numba's decorator and imports numba only at the first call of a kernel, so that other commands start
+faster."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ class _Kernel:
     @cached_property
     def _dispatcher(self) -> Any:
         numba, around = loaded("numba"), self._function.__globals__
-        for name in self._function.__code__.co_names:  # from a kernel, numba calls only its own kernels
+        for name in self._function.__code__.co_names:  # inside a kernel, numba can call only its own kernels
             if isinstance(kernel := around.get(name), _Kernel) and kernel is not self:
                 around[name] = kernel._dispatcher
         return numba.njit(**self._options)(self._function)

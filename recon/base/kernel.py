@@ -18,8 +18,8 @@ class Kernel(StrEnum):
         compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
 
     R is chosen so that both kernels have the same second moment. Therefore a covariance describes the same width for
-    both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for
-    m = 3/2. The compact kernel ends by itself, so nothing has to be cut off. ∫ (1
+    both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for m =
+    3/2. The compact kernel ends by itself, so it need not be cut off. ∫ (1
     - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The projection of the compact kernel is steeper at
     the edge and has no tail. This suits samples with sharp edges.
     """
@@ -58,12 +58,12 @@ class Kernel(StrEnum):
 
     @property
     def radius(self) -> float:
-        """Radius R at which the kernel ends, in standard deviations."""
+        """Radius R, in standard deviations, at which the kernel ends."""
         return math.sqrt(2 * self.exponent + 5)
 
     @property
     def length(self) -> float:
-        """Integral along a line through the centre, in standard deviations."""
+        """Integral along a line through the centre, with the length in standard deviations."""
         if not self.is_compact:
             return math.sqrt(2 * math.pi)
         m = self.exponent
@@ -81,11 +81,12 @@ class Kernel(StrEnum):
 
 @dataclass(frozen=True)
 class Truncation:
-    """Where a Gaussian is cut off: the smaller of two distances from its centre.
+    """Rule for the distance from its centre at which a Gaussian is cut off: the smaller of two distances.
 
     Attributes:
         sigmas: number of standard deviations (with 3.5, 0.2 % of a projected Gaussian is outside).
-        faint: it is cut off below this fraction of the density unit (in a projection: times the field of view).
+        faint: fraction of the density unit below which the Gaussian is cut off. In a projection, the limit is this
+            fraction times the density unit times the width of the field of view.
     """
 
     sigmas: float = 3.5
@@ -103,12 +104,13 @@ class RayModel:
     """How the line integral of a Gaussian along a ray is computed.
 
     Attributes:
-        exact_above: in a cone, a Gaussian is integrated exactly along each ray if the error of its affine footprint is
-            larger than this. The error is an estimated relative L2 error, see recon.kernels.cpu.footprints. inf: no
-            Gaussian, 0: all. In a parallel beam, footprints are exact.
+        exact_above: limit for cone beams. If the error of the affine footprint of a Gaussian is larger, the Gaussian is
+            integrated exactly along each ray. The error is an estimated relative L2 error, see
+            recon.kernels.cpu.footprints. inf: no Gaussian is integrated exactly; 0: all are. In a parallel beam, all
+            footprints are exact.
         rectified: False gives the uncorrected footprints of 3DGS, as in X-Gaussian (see Zha et al. 2024, section 4.2).
-            The weight is then density times the same length for all (half the width of the field), independent of the
-            length of the ray in the Gaussian. It is for demonstrating the bias.
+            The weight of a Gaussian is then its density times half the width of the field of view, whatever the length
+            of the ray in the Gaussian. Use False only to demonstrate the bias.
     """
 
     exact_above: float = math.inf
@@ -124,10 +126,11 @@ class RayModel:
             )
 
     def length(self, geometry: Geometry) -> float:
-        """Length in mm that is used for every ray in a Gaussian; 0: the true length.
+        """Length in mm that replaces the length of a ray in a Gaussian; 0: the true length is used.
 
         Raises:
-            ValueError: the rays have a width and `rectified` is False; the mass of a Gaussian would not be conserved.
+            ValueError: the rays have a width and `rectified` is False. Then the mass of a Gaussian would not be
+                conserved.
         """
         if self.rectified:
             return 0.0

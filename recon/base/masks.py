@@ -13,11 +13,13 @@ from recon.base.jit import njit
 
 Image = NDArray[np.float32]
 Fill = tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.intp]]
-"""For each pixel [row, col] its ring, counted from outside (0: not masked); rows and columns in the order of rings."""
+"""The number of the ring of each pixel [row, col], counted from outside (0: not masked), and the rows and columns of
+the masked pixels in the order of their rings."""
 
 
 def plan_fill(mask: Mask) -> Fill:
-    """Order in which to fill masked pixels: in rings from outside, each from neighbours that are filled earlier.
+    """Order in which to fill masked pixels: ring by ring from outside, each pixel from neighbours that are filled
+    earlier.
 
     Raises:
         ValueError: all pixels [row, col] are masked.
@@ -31,7 +33,7 @@ def plan_fill(mask: Mask) -> Fill:
 
 
 def areas(mask: Mask) -> Mask:
-    """Masked pixels [row, col] in areas of 3 x 3 or more; outside the detector everything counts as masked.
+    """Masked pixels [row, col] in areas of 3 x 3 pixels or more. Pixels outside the detector count as masked.
 
     Their fill values are guesses, whereas a single pixel or a line is interpolated well.
     """
@@ -73,7 +75,7 @@ def masked(
     """Projections in which all values are finite, and their weights.
 
     Pixels that are not finite, or have weight 0, get the mean of their neighbours in the same projection. Direct
-    methods and first volumes use this value. Their weight is 0, so that a fit ignores them.
+    methods and first volumes use this mean. A fit ignores these pixels, because their weight is set to 0.
 
     Args:
         projections: [view, row, col]; not changed.
@@ -81,7 +83,8 @@ def masked(
         largest: values beyond ± this count as not finite.
 
     Returns:
-        Projections (the array given, if nothing is filled) and weights (None if all are 1).
+        Projections and weights. If no pixel was filled, the projections are the given array. The weights are None if
+        all are 1.
 
     Raises:
         ValueError: weights are negative, not finite or have another shape, or a projection has no usable value.
@@ -105,8 +108,8 @@ def masked(
     if empty.size:
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"{empty.size} of {len(projections)} projections contain no usable value: none that is {within} and has a "
-            f"weight (projections {empty[:8].tolist()} ...). Leave these projections out"
+            f"leave out {empty.size} of {len(projections)} projections (numbers {empty[:8].tolist()} ...): they "
+            f"contain no usable value ({within}, with a weight above 0)"
         )
     filled = np.array(projections, np.float32)
     known = np.ones(projections.shape, np.float32) if weight is None else np.array(weight, np.float32)

@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 
 Plain = str | int | float
 Clock = Callable[[], float]
-_ENDLESS = 10**6  # steps or iterations; a time limit ends the run long before
+_ENDLESS = 10**6  # number of steps or iterations that a run never reaches, because its time limit ends it before
 
 
 @dataclass(frozen=True)
 class Progress:
-    """State of a running reconstruction, as `RunControl` reports it.
+    """State of a running reconstruction, as the function `RunControl.on_progress` gets it.
 
     Attributes:
         step, steps: number of steps or iterations done and planned (planned 0: unknown, for example in a fit during a
             scan).
         seconds: time since the start, by the caller's clock.
         loss: running mean of the loss, in normalised units.
-        residual: running mean of |rendered - measured| / |measured| (root mean squares) over the projections just used.
+        residual: running mean of |rendered - measured| / |measured| (root mean squares) over the projections that the
+            latest steps used.
         n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
         held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
-        unit: what is counted by a direct method, or in a part of the work, such as "slices"; empty: fitting steps or
-        iterations. If it is not empty, loss and residual are
-            NaN.
+        unit: what `step` counts in a direct method, or in a part of the work, such as "slices". Empty: `step` counts
+            fitting steps or iterations. If `unit` is not empty, loss and residual are NaN.
     """
 
     step: int
@@ -67,7 +67,8 @@ class Progress:
 SWEEPS_OF_TRIALS = "sweeps of trials"
 """Beginning of `Progress.unit` during test reconstructions.
 
-The planned number is the usual one. A search continues as long as necessary, and few scans take the largest number.
+The planned number of iterations is the usual number. A search continues as long as necessary, and only few scans need
+the largest number.
 """
 
 
@@ -77,10 +78,10 @@ class DataUse(Checked):
 
     Attributes:
         weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere. FBP interpolates rays of weight 0
-            from their neighbours and treats all other rays equally.
+            from their neighbours, and gives all other rays the same weight.
         held_out: numbers of the projections that are not fitted; their residual is in the history.
-        times: [view] time of each exposure in s, for a method that makes volumes in time; None: evenly spaced, in the
-            order of the projections.
+        times: [view] time of each exposure in s, for a method that makes volumes at several times. None: the exposures
+            are evenly spaced in time, in the order of the projections.
         sample_radius: mm from the rotation axis to the edge of a sample that is wider than the field of view; None: it
             is measured.
     """
@@ -96,16 +97,17 @@ class RunControl(Checked):
     """How a caller follows, stops and resumes a reconstruction.
 
     Attributes:
-        should_stop: function that is called between steps or iterations; True ends the reconstruction with the volume
-            so far. Direct methods do not call `should_stop`. It may be any function or a `Stop`. Methods call the
-            property `stop`, which exists also if this is None.
-        on_progress: called about ten times a second, after each iteration, or after every sixteen slices of FBP.
-        on_checkpoint: called with the checkpoint of a fit every `checkpoint_every` s.
+        should_stop: function (or a `Stop`) that is called between steps or iterations. If it returns True, the
+            reconstruction ends with the volume reached so far. Direct methods do not call `should_stop`. Methods call
+            it through the property `stop`, which exists even if `should_stop` is None.
+        on_progress: function that gets the progress: about ten times a second in a fit, after each iteration, or after
+            every sixteen slices of FBP.
+        on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: keeps the decisions that the method derives from its data, and can make the method repeat the decisions
-            of another run; None: the method decides by itself.
+        decide: records the decisions that the method derives from its data. With the decisions of an earlier run, the
+            method repeats them. None: the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
-            total variation; True ends only these. None: same as `should_stop`.
+            total variation. If it returns True, only the test reconstructions end. None: same as `should_stop`.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -119,7 +121,8 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The `Stop` that methods call between steps. It returns True if the run must end with the volume so far."""
+        """The `Stop` that methods call between steps. It returns True if the run must end with the volume reached so
+        far."""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
@@ -133,7 +136,8 @@ class RunControl(Checked):
             self.on_progress(progress)
 
     def report_progress(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
-        """Report progress without a residual, for a direct method or a part of the work that began at `begin`."""
+        """Report progress without a residual, for a direct method or for a part of the work. `begin` is the time at
+        which this work began."""
         if self.on_progress is not None:
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
@@ -182,11 +186,12 @@ class ReconProblem:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a reconstruction ended, and the step from which it was resumed.
+    """How a reconstruction ended, and which earlier run it continued.
 
     Attributes:
-        early: True if it was stopped; the volume is the one reached by then.
-        resumed_from: file of the earlier run that it continued; empty: it started from the beginning.
+        early: True if the reconstruction was stopped before its end. The volume is then the one reached when it
+            stopped.
+        resumed_from: file of the earlier run that the reconstruction continued; empty: it started from the beginning.
         lost_checkpoint: why the last checkpoint could not be written; empty: none was lost.
     """
 
@@ -227,17 +232,19 @@ class Reconstruction:
             fill in.
         seconds: wall time of the reconstruction. `run` may leave it 0 for the caller to fill in.
         deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
-        series: all volumes of a method that makes several; the first one is `volume`. None: the method makes one.
-        at: function that returns the volume [z, y, x] for the time of a projection (as in `DataUse.times`) or the
-            number of its energy; None: the method makes one volume.
+        series: all volumes of a method that makes several, of which the first is also `volume`. None: the method makes
+            one volume.
+        at: function that returns the volume [z, y, x] at a time (as in `DataUse.times`), or for the number of an
+            energy. None: the method makes one volume.
         chosen: how an automatic choice or a preset found the settings; empty if they were given.
         started_from: number of Gaussians at the start of a fit; 0 for other methods.
-        ending: how the run ended; the caller fills it in.
+        ending: how the run ended. The caller of `run` fills in this value.
         outside: function that returns the contribution of the sample outside the volume to the projections of a
             geometry, [view, row, col]; None: no such contribution is known.
-        change: the volume minus a reference that was moved to it; None: no reference was used.
-        displacement: [3, z, y, x] in mm along z, y, x: the place in the reference minus that in the volume; None: as
-            `change`.
+        change: the volume minus the reference, after the reference was moved to the position of the volume. None: no
+            reference was used.
+        displacement: [3, z, y, x] in mm along z, y, x: the position of a point in the reference minus its position in
+            the volume. None: no reference was used.
     """
 
     volume: Volume
@@ -318,15 +325,20 @@ class Method(Checked, ABC):
         label: name in reports.
         takes: what it accepts in addition to projections, grid and seed: device, held_out, times, checkpoints, quality,
             budget, reference.
-        halo: number of slices around a slab that it also reconstructs, so that the edges of the slab are not visible.
-        error_bars: factors for the difference of the refits and for the gradient, see `recon.error_bars`; None: not
-            calibrated.
-        fitted: True if it fits the volume to the projections step by step; then it has a history and can be stopped.
-        weighs: True if it uses the weights of rays. If False, rays of weight 0 are interpolated and all others count
-            equally.
-        needs_matter: True if it raises an error for projections without material, such as those of a slab of air.
-        knows_outside: True if it can use a box that contains all of a sample wider than the field of view.
-        makes_boxes: True if a box of voxels that it makes is identical to that part of the whole volume.
+        halo: number of additional slices that the method reconstructs on each side of a slab, so that the edges of the
+            slab are not visible.
+        error_bars: factors for the difference of the refits and for the gradient, see `recon.error_bars`. None: the
+            error bars of this method are not calibrated.
+        fitted: True if the method fits the volume to the projections step by step. Such a method has a history and can
+            be stopped.
+        weighs: True if the method uses the weights of rays. False: the method interpolates rays of weight 0, and gives
+            all other rays the same weight.
+        needs_matter: True if the method raises an error for projections without material, for example for a slab of
+            air.
+        knows_outside: True if the method can reconstruct the full width of a sample that is wider than the field of
+            view.
+        makes_boxes: True if the method can reconstruct a box of voxels alone, and the voxels are identical to those of
+            the whole volume.
         volumes: number of volumes it makes.
         least_views: smallest number of projections for each of several volumes.
         allow_negative: True if voxels below zero are kept.
@@ -360,23 +372,22 @@ class Method(Checked, ABC):
 
     @abstractmethod
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Peak memory of `run` in bytes, without the projections and (if `weighted`) without their weights."""
+        """Peak memory of `run` in bytes. It does not include the projections, nor (if `weighted`) their weights."""
 
     def preview(self, views: Views) -> Preview | None:
         """What the method can show of a scan that still runs, from the projections so far; None: nothing."""
         return None
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """[view] True for the projections it uses.
+        """[view] True for each projection that the method uses.
 
-        Raises:
-            ValueError: it cannot use such projections.
+        Raises: ValueError: the method cannot use such projections.
         """
         return np.ones(geometry.n_views, bool)
 
     @property
     def time_limit(self) -> float | None:
-        """Time limit of a run in seconds; None: it ends when its work is done."""
+        """Time limit of a run in seconds; None: the run ends when its work is done."""
         return None
 
     @property
@@ -386,28 +397,31 @@ class Method(Checked, ABC):
 
     @property
     def trial_sweeps(self) -> int:
-        """Usual number of iterations, over all test reconstructions that choose its regularisation weight."""
+        """Usual number of iterations of all test reconstructions that choose the regularisation weight of the
+        method."""
         return 0
 
     @property
     def alternatives(self) -> tuple[Method, ...]:
-        """The methods from which it chooses, the preferred one first; the method itself if it does not choose."""
+        """The methods from which this method chooses, the preferred one first. A method that does not choose returns
+        only itself."""
         return (self,)
 
     def device_of(self, problem: ReconProblem) -> str:
-        """The device on which it solves this problem."""
+        """The device on which the method solves this problem."""
         return problem.device if "device" in self.takes else "cpu"
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for a part of a volume: `share` of the volume in `of_time` of its seconds."""
+        """The method for a part of a volume. `share` is the fraction of the volume, `of_time` the fraction of the time
+        limit."""
         return self
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The method with the settings of a preset, for a grid with `default_count` Gaussians by default."""
+        """The method with the settings of a preset. `default_count` is the default number of Gaussians for the grid."""
         return self
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Settings with which only a time limit of `seconds` ends a run; empty if the method ends by itself."""
+        """Settings that make only a time limit of `seconds` end a run. Empty if the method ends by itself."""
         lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
         return {name: value for name, value in lengths.items() if name in types_of(cls)}

@@ -16,7 +16,8 @@ from recon.base.method import Method
 
 
 class Direct(Method):
-    """One pass over the projections, such as filtered back-projection. It extrapolates truncated projections."""
+    """A method that makes one pass over the projections, such as filtered back-projection. It extrapolates truncated
+    projections."""
 
     fitted: ClassVar[bool] = False
     weighs: ClassVar[bool] = False
@@ -29,11 +30,13 @@ class Direct(Method):
 
 
 class Iterative(Method):
-    """Iterations that bring the volume nearer to the projections; it can be stopped after each iteration."""
+    """A method that improves the agreement of the volume with the projections by iterations. It can be stopped after
+    each iteration."""
 
 
 class Series(Method):
-    """Several volumes at different times of the scan, reconstructed together from all projections, all in memory.
+    """A method that reconstructs several volumes at different times of the scan, together from all projections, all in
+    memory.
 
     Attributes:
         volumes: number of volumes; `Reconstruction.series` contains all of them.

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, median_deviation, some_values
 from recon.base.geometry import Geometry
 
-NOISE_VIEWS = 16  # number of projections in which the noise is measured
+NOISE_VIEWS = 16  # number of projections from which the noise is measured
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher order contains finer structure
 _LARGEST_BLUR = 1.5  # pixels
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
-_EVEN = 0.02  # tolerance, as a share of the step between projections
-# values and bins of a histogram; least height of a peak, as a share of the highest
+_EVEN = 0.02  # tolerance of the angles, as a share of the step between projections
+# number of values and of bins of a histogram; smallest height of a peak, as a share of the highest
 _SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1
-_CLIPPED, _ROUNDS = 4.0, 20  # clipping in standard deviations of air; most rounds
+_CLIPPED, _ROUNDS = 4.0, 20  # clipping limit in standard deviations of air; largest number of rounds
 _GROWTH = 4.0  # largest standard deviation of air, divided by that of the values below its most frequent value
 
 
@@ -28,18 +28,20 @@ def noise_level(images: F32) -> float:
     """Standard deviation of the noise in a typical pixel, for white noise or noise that was blurred afterwards.
 
     The sample changes slowly from pixel to pixel, noise does not. So differences of order n along both axes contain
-    mostly noise. For white noise, they have C(2n, n) times its standard deviation. Noise that was blurred, by
-    interpolation or in a scintillator, has less at high frequencies. So the fourth differences, divided by C(8, 4), are
-    smaller than the third ones, divided by C(6, 3). Their ratio gives the width of the blur, taken as Gaussian, and so
-    the noise at all frequencies. Constant offsets of a pixel (rings) do not count. [our own method; median of
-    differences: Immerkær 1996, Comput. Vis. Image Underst. 64, 300]
+    mostly noise. For white noise, the standard deviation of these differences is C(2n, n) times that of the noise.
+    Noise that was blurred, by interpolation or in a scintillator, is weaker at high frequencies. So the fourth
+    differences, divided by C(8, 4), are smaller than the third differences, divided by C(6, 3). Their ratio gives the
+    width of the blur, which is assumed to be Gaussian. The width gives the noise at all frequencies. Constant offsets
+    of a pixel (rings) do not count. [our own method; median of differences: Immerkær 1996, Comput. Vis. Image Underst.
+    64, 300]
 
-    On real samples, the result is within a third of the true value for white noise, and within a half for noise blurred
-    by up to 0.7 pixel (tests/recon/base/test_noise.py). In almost noiseless projections, fine texture counts as noise.
+    On real samples, the result differs from the true value by at most a third for white noise, and by at most a half
+    for noise blurred by up to 0.7 pixel (tests/recon/base/test_noise.py). In almost noiseless projections, fine texture
+    counts as noise.
 
     Args:
         images: [view, a, b], line integrals; NaN marks pixels that do not count. An axis is used only if at least five
-            successive pixels along it count. About 16 projections are read.
+            successive pixels along it are not NaN. About 16 projections are read.
 
     Returns:
         The standard deviation; 0 if no axis is used.
@@ -56,15 +58,16 @@ def noise_level(images: F32) -> float:
 
 
 def deviation_between_neighbours(values: NDArray[np.floating[Any]], order: int = 1, axis: int = -1) -> float:
-    """Standard deviation of white noise with the same differences of this order along an axis; 0 if none is finite."""
+    """Standard deviation of the white noise that would have the same differences of this order along an axis; 0 if no
+    difference is finite."""
     return median_deviation(np.diff(values, order, axis=axis)) / math.sqrt(math.comb(2 * order, order))
 
 
 def deviation_between_frames(frames: NDArray[np.floating[Any]]) -> float:
     """Standard deviation of a pixel between successive frames [frame, row, col], without changes of the whole frame.
 
-    Differences of successive frames contain no slow drift and no fixed pattern. For a single frame, neighbouring pixels
-    are compared instead.
+    Differences of successive frames contain no slow drift and no fixed pattern. If there is only one frame, its
+    neighbouring pixels are compared instead.
     """
     if len(frames) == 1:
         return median_deviation(frames - np.nanmedian(frames))
@@ -73,13 +76,15 @@ def deviation_between_frames(frames: NDArray[np.floating[Any]]) -> float:
 
 
 def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
-    """The smaller of `noise_level` and the noise at frequencies above those of the sample's structure.
+    """Noise of the projections: the smaller of `noise_level` and the noise measured at frequencies that the sample
+    cannot have.
 
     If the stage turns by an angle, a point that is at most R pixels from the axis moves by at most R times this angle.
     So a sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
     Rattey & Lindgren 1981, IEEE Trans. Acoust. 29, 994; of a fan: Mazin & Pelc 2010, Med. Phys. 37, 2674). Noise has
-    these harmonics, however fine the sample is. The projections must be straight and evenly spread over 360°, or over
-    180° for a parallel beam. Their number must exceed about a third of the number of columns (half of that for 180°).
+    these harmonics, so they measure the noise even if the sample has fine structure. The projections must be straight
+    and evenly spread over 360°, or over 180° for a parallel beam. Their number must exceed about a third of the number
+    of columns (half of that for 180°).
 
     Args:
         lines: [view, col, row]; rows with NaN are not used.
@@ -88,7 +93,8 @@ def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
 
 
 def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
-    """Standard deviation of white noise with the same power at these frequencies; infinite if it cannot be measured."""
+    """Standard deviation of the white noise that would have the same power at these frequencies; infinite if it cannot
+    be measured."""
     order = _evenly_spread(geometry)
     cols, bins = geometry.detector_shape[1], np.arange(2, 2 + _BOW_TIE_BINS)
     axis = geometry.axis_col + geometry.shifts[:, 0]
@@ -105,7 +111,7 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     spectrum = np.einsum("vcr,cm->vmr", lines[order][:, chosen][:, :, rows], waves, optimize=True)
     spectrum *= np.exp(1j * omega * (axis[order, None] - middle))[:, :, None]
     theta = np.unwrap(geometry.angles[order])
-    if np.ptp(theta) < 1.01 * np.pi:  # the projections of the other 180° are these, mirrored
+    if np.ptp(theta) < 1.01 * np.pi:  # the projections of the other 180° are the mirror images of these
         spectrum = np.concatenate((spectrum, spectrum.conj()))
     count = len(spectrum)
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
@@ -136,9 +142,9 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
 def air_level(values: F32) -> tuple[float, float]:
     """The air level of a volume and its standard deviation.
 
-    It starts at the lowest value that many voxels have, and repeatedly takes the median of the values within four
-    standard deviations. If air is uneven, its standard deviation is limited to four times that of the values below the
-    first level.
+    The search starts at the lowest value that many voxels have. It then repeatedly takes the median of the values
+    within four standard deviations of the level. If air is uneven, its standard deviation is limited to four times that
+    of the values below the first level.
     """
     values = some_values(values, _SAMPLED)
     low, high = np.percentile(values, (0.05, 99.95))
@@ -183,7 +189,7 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
 
 
 def _long_axes(images: F32) -> list[int]:
-    """Axes along which five successive pixels are valid, also after the differences along the previous axes."""
+    """Axes along which five successive pixels are valid, even after differences were taken along the previous axes."""
     field, axes = images, list[int]()
     for axis in (1, 2):
         further = np.diff(field, _HIGH, axis=axis)
@@ -194,7 +200,8 @@ def _long_axes(images: F32) -> list[int]:
 
 
 def _differences(images: F32, axes: list[int], order: int) -> float:
-    """Standard deviation of white noise with the same differences of this order; NaN marks pixels that do not count."""
+    """Standard deviation of the white noise that would have the same differences of this order; NaN marks pixels that
+    do not count."""
     if not axes:
         return 0.0
     field: NDArray[np.floating[Any]] = images
@@ -208,8 +215,8 @@ def _differences(images: F32, axes: list[int], order: int) -> float:
 
 @cache
 def _blurs() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variance of differences of order `_HIGH`, and of undifferenced pixels, over that of order `_LOW`, for Gaussian
-    blurs of rising width.
+    """For Gaussian blurs of rising width: the variance of differences of order `_HIGH`, and the variance of the pixels
+    themselves, each divided by the variance of differences of order `_LOW`.
     """
     widths = np.linspace(0, _LARGEST_BLUR, 301)
     f = (np.arange(4096) + 0.5) / 8192  # cycles a pixel

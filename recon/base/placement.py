@@ -16,11 +16,12 @@ _SHORTEST, LONGEST = 1e-12, 1e9
 
 
 class Where(TypedDict, total=False):
-    """Position of the rotation axis on the detector, and pose of each projection; as the attributes of a `Geometry`.
+    """Position of the rotation axis on the detector, and pose of each projection. The names are those of the attributes
+    of `Geometry`.
 
     Attributes:
         axis_col, axis_row: None or left out: the middle of the detector, (cols - 1) / 2 and (rows - 1) / 2.
-        shifts: [view, 2] pixels; None or left out: none.
+        shifts: [view, 2] pixels; None or left out: no projection is shifted.
         roll, tilt: radians, one value for all projections or [view]; left out: 0.
     """
 
@@ -70,7 +71,7 @@ def placed_views(
 
 
 def checked_angles(angles: ArrayLike) -> F64:
-    """Angles [view] in radians. ValueError if there are none or one is not finite."""
+    """Angles [view] in radians. Raises ValueError if there are no angles, or if an angle is not finite."""
     theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
     if theta.ndim != 1 or theta.size == 0:
         raise ValueError(f"angles must be a list of at least one angle in radians, got shape {theta.shape}")

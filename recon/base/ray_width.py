@@ -10,14 +10,14 @@ from recon.base.setting import NonNegative
 
 @dataclass(frozen=True)
 class RayWidth(Checked):
-    """What makes a ray wide: the area over which a pixel averages, the blur, and the rotation during the exposure. If
-    all are 0, a ray is a line.
+    """The causes that make a ray wide: the area over which a pixel averages, the blur, and the rotation during the
+    exposure. If all are 0, a ray is a line.
 
     Attributes:
         pixel: side, in pixels, of the square over which a pixel averages; 1: its own area.
         blur: standard deviation in pixels of a Gaussian blur of the detector (scintillator, optics).
-        arc: radians that the stage turns during an exposure; the angle of a projection is that at the middle of its
-            exposure.
+        arc: angle in radians by which the stage turns during an exposure. The angle of a projection is the angle at the
+            middle of its exposure.
     """
 
     pixel: NonNegative = 0.0
@@ -33,7 +33,7 @@ class RayWidth(Checked):
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:
-        """The same width after binning by factor x factor. The area over which a pixel averages then is that of the
+        """The same width after binning by factor x factor. The area over which a pixel averages becomes that of the
         binned pixel."""
         return replace(self, blur=self.blur / factor)
 

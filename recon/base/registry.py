@@ -1,4 +1,4 @@
-"""Registry: all entries of one kind by name: those of splatline, and those of other packages (entry points).
+"""Registry: all entries of one kind by name, from splatline and from other packages (entry points).
 
 The entry points are in the group `splatline.KIND`. KIND is method, correction, reader, volume_format, stage, wire,
 camera, check, effect or command. The name of the entry point is the name of the addition.
@@ -32,7 +32,7 @@ ADD_ONS = {
     **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }
 """Names that our add-on packages provide, and the package of each (the folders in `packages/` of the repository)."""
-_LIKENESS = 0.65  # similarity, 0 to 1, from which on another name is suggested
+_LIKENESS = 0.65  # similarity, 0 to 1, above which another name is suggested
 
 T = TypeVar("T")
 
@@ -50,10 +50,10 @@ def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
 
 
 def add_on_missing(name: str) -> str:
-    """Why an add-on of `ADD_ONS` is missing, and what to do: the end of a sentence, without a full stop."""
+    """The end of a sentence, without a full stop, that says why an add-on of `ADD_ONS` is missing and what to do."""
     for point in entry_points_announced():
         if point.name == name:
-            why = "is installed, but could not be used: a warning gives the reason"
+            why = "is installed, but could not be used: read the warning above, which gives the reason"
             try:
                 point.load()
             except (Exception, SystemExit) as error:
@@ -66,22 +66,24 @@ def add_on_missing(name: str) -> str:
 
 
 def did_you_mean(name: object, legal: Iterable[str]) -> str:
-    """The most similar legal name as the end of a sentence, after a space; "" if none is similar."""
+    """The end of a sentence that suggests the most similar legal name, with a space before it; "" if no name is
+    similar."""
     return f" (did you mean {near}?)" if (near := nearest(name, legal)) else ""
 
 
 def nearest(name: object, legal: Iterable[str]) -> str:
-    """The legal name that was probably meant; "" if none is similar."""
-    from difflib import get_close_matches  # imported here, because only errors need it
+    """The legal name that was probably meant; "" if no name is similar."""
+    from difflib import get_close_matches  # imported here, because only an error message needs it
 
     return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_LIKENESS)), "")
 
 
 @contextmanager
 def signals_waiting() -> Iterator[None]:
-    """Delays signal handlers until the context ends. Python runs them in the main thread, so only that one waits.
+    """Delays signal handlers until the context ends. Only the main thread waits, because Python runs signal handlers
+    there.
 
-    If a handler raises an exception in the middle of an import, the library is only half loaded. numba and torch then
+    If a handler raised an exception during an import, the library would be only half loaded. numba and torch would then
     fail until Python is restarted.
     """
     came = list[tuple[Any, Any]]()
@@ -129,8 +131,8 @@ class Registry(Mapping[str, T], Generic[T]):
     Args:
         kind: kind of its entries, as above.
         ours: the entries of splatline.
-        made: function that makes an entry from the name and the object of an entry point; ValueError if the object does
-            not fit.
+        made: function that makes an entry from the name and the object of an entry point. It raises ValueError if the
+            object is not suitable.
         reserved: further names that no addition may have.
 
     Raises (when a name is looked up):
@@ -181,12 +183,12 @@ def plugins(
 
     Args:
         kind: kind of the registry, as above.
-        taken: names that the registry has itself.
-        made: function that makes the registry's entry from a name and the loaded object; ValueError if the object does
-            not fit.
+        taken: names that the registry already contains. made: function that makes the registry's entry from a name and
+            the loaded object. It raises ValueError if the object is not suitable.
 
     Warns:
-        UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
+        UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or its object is not
+            suitable.
     """
     announced = sorted(point for point in entry_points_announced() if point.group == _PREFIX + kind)
     times, found = Counter(point.name for point in announced), dict[str, Any]()
@@ -209,7 +211,7 @@ def plugins(
 
 
 def _one_line(text: str) -> str:
-    """The text on one line, shortened, without control characters (they could change a terminal or a log)."""
+    """The text on one line, shortened, without control characters, which could change a terminal or a log."""
     line = " ".join(text[:1000].split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
@@ -238,15 +240,16 @@ class Lengths:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """Where to find the settings class of a method, and whether comparisons include it.
+    """Entry of a method: the location of its settings class, and whether comparisons include the method.
 
     Attributes:
         module, cls: module and name of the settings class, see `recon.base.method.Method`.
-        streams: True if it has `stream`, so that it can reconstruct during a scan.
-        compared: True if a trade-off includes it by default; False for methods that take many times as long.
-        several: what distinguishes its volumes, if it makes several.
-        lengths: numbers of iterations or steps that a trade-off tries; None: the default.
-        reference: True if it can use an earlier volume of the same sample.
+        streams: True if the method has `stream`, so that it can reconstruct during a scan.
+        compared: True if a trade-off includes the method by default. False for methods that take many times as long as
+            others.
+        several: for a method that makes several volumes, the quantity in which the volumes differ.
+        lengths: numbers of iterations or steps that a trade-off tries; None: only the default number.
+        reference: True if the method can use an earlier volume of the same sample.
     """
 
     module: str

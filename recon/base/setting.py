@@ -2,9 +2,9 @@
 
     exposure: Annotated[float, Setting("Of a view.", unit="s", gt=0, le=1e6)] = 0.1
 
-The fields of methods, driver settings, checks, scenes and configurations are declared in this way, and so are arguments
-of functions. `recon.base.declared_types` and `CheckedSettings` raise an error for other values. pydantic uses the
-declarations to read a file and to make its schema.
+Methods, driver settings, checks, scenes and configurations declare their fields in this way. Functions declare their
+arguments in the same way. `recon.base.declared_types` and `CheckedSettings` raise an error if a value does not match
+its declaration. pydantic uses the declarations to read a file and to make its schema.
 """
 
 from __future__ import annotations
@@ -27,13 +27,15 @@ class Setting:
     """Declaration of the value of a field or an argument.
 
     Attributes:
-        default: default in the unit of a configuration; `...`, or MISSING of dataclasses: the value is required.
+        default: default in the unit of a configuration. If it is `...`, or MISSING of dataclasses, the value is
+            required.
         doc: meaning of the value, if the name does not say it.
-        unit: unit in a configuration and at the end of its key; "": no unit. Default and bounds are in this unit.
+        unit: unit of the value in a configuration; the key ends in the unit's name. "": no unit. Default and bounds are
+            in this unit.
         gt, ge, lt, le: bounds of a number; a number must be finite.
         min_length, max_length: bounds for the length of a text or a list.
         pattern: regular expression that a text must match.
-        problem: function that returns what is wrong with a value, "" if nothing is. None: no further check.
+        problem: function that returns what is wrong with a value, or "" if the value is right. None: no further check.
     """
 
     doc: str = ""
@@ -50,7 +52,7 @@ class Setting:
 
     @property
     def bounds(self) -> Mapping[str, Any]:
-        """The bounds that are set, by name."""
+        """The bounds that were given, by name."""
         return {name: bound for name in _WITHIN if (bound := getattr(self, name)) is not None}
 
     @property
@@ -64,7 +66,7 @@ class Setting:
         return " and ".join(f"{_WORDS[name]} {each}" for name, each in shown.items())
 
     def fault(self, value: Any) -> str:
-        """What is wrong with the value of a field; "" if nothing is."""
+        """What is wrong with the value of a field; "" if the value is right."""
         if isinstance(value, Real) and not -math.inf < float(value) < math.inf:
             return "expected a finite number"
         if value is None:
@@ -125,7 +127,8 @@ Positive = Annotated[float, Setting(gt=0)]
 
 
 def setting(default: Any = ..., doc: str = "", **rest: Any) -> Any:
-    """A field, with declaration, of a dataclass or of a section of a configuration; `rest` as for `Setting`."""
+    """A field, with its declaration, of a dataclass or of a section of a configuration. `rest` are the arguments of
+    `Setting`."""
     made = Setting(doc, default, **rest)
     inside = dataclasses.MISSING if default is ... else made.inside(default)
     return dataclasses.field(default=inside, metadata={_SETTING: made, "description": doc or None, **made.bounds})

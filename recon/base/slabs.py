@@ -13,7 +13,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 
 _ON_A_ROW = 1e-6  # rows
-# px at the edge of the field of view; a skew may turn a band of slices by this much. Each band repeats the setup work
+# px at the edge of the field of view: largest displacement by the skew within a band of slices. (With more bands, the
+# setup work is repeated more often.)
 _TURN = 0.25
 
 
@@ -22,8 +23,8 @@ class Slab:
     """A slab and its halo.
 
     Attributes:
-        own: slices of the volume that this slab provides.
-        slices: all slices that are reconstructed: `own` and the halo on both sides.
+        own: slices that this slab contributes to the volume. slices: all slices that are reconstructed, which are `own`
+            and the halo on both sides.
         fade: number of slices on either side of the border between two slabs over which one fades into the other.
     """
 
@@ -33,7 +34,8 @@ class Slab:
 
     @property
     def share(self) -> NDArray[np.float32]:
-        """[slice] weight of each reconstructed slice in the volume; the weights of all slabs add up to 1."""
+        """[slice] weight of each reconstructed slice in the volume. At each slice, the weights of all slabs add up to
+        1."""
         middles, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
         share = np.ones(middles.size)
         if self.slices.start < self.own.start:
@@ -51,7 +53,8 @@ def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
 
 
 def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
-    """The detector rows that show these slices of the whole volume, the geometry of the rows, and the slices' grid.
+    """The detector rows that show these slices of the whole volume, the geometry of these rows, and the grid of the
+    slices.
 
     The beam must be parallel, without roll and tilt. Rows at the edge of a shifted projection also show slices outside
     this grid.
@@ -68,7 +71,7 @@ def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geome
 
 
 def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
-    """Bands of slices whose rows have the same angle (within an eighth of a pixel), each with its geometry without
+    """Bands of slices whose rows have the same angle (within an eighth of a pixel), each with its geometry without the
     skew.
 
     Shifts along the axis are ignored.
@@ -84,7 +87,7 @@ def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
 
 
 def slices_of(grid: Grid, slices: slice) -> Grid:
-    """The grid of these slices, at their position in the whole grid."""
+    """The grid of these slices, at their position in the grid of the whole volume."""
     off = ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
     centre = (grid.centre[0] + off, *grid.centre[1:])
     return replace(

@@ -14,14 +14,16 @@ from recon.base.geometry import Geometry
 
 _BLOCKS, _BLOCK = 8, 5
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # projections; pixels along a row
-# two limits in standard deviations; least number of columns that have a mirrored one
+# two limits in standard deviations; smallest number of columns that have a mirrored column
 _SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40
-NARROWEST = 64  # columns; with 40 columns, the methods that remove stripes add larger errors than they remove
+NARROWEST = 64  # least columns; with 40 columns, the methods that remove stripes add larger errors than they remove
 # `Steadiness.score` from which on there are stripes. Scans without stripes have 0.3 to 2.7, two real scans 4.4 and 5.3
 _SEEN = 3.5
-# least ratio of the odd to the even part. For pixel sensitivities both are equal; sample layers have hardly an odd part
+# smallest ratio of the odd to the even part. For pixel sensitivities both parts are equal; for layers of the sample the
+# odd part is almost 0
 _ONE_SIDED = 0.5
-_STEADY_BLOCKS, _STEADY_BLOCK = 8, 8  # contiguous blocks of projections; projections of the smallest block
+# number of contiguous blocks of projections; number of projections in the smallest block
+_STEADY_BLOCKS, _STEADY_BLOCK = 8, 8
 AT_AXIS = 4.0  # columns on either side of the axis; a body this small on the axis looks like a ring
 _FEWEST_MIRRORED = 20  # mirrored columns
 
@@ -29,15 +31,15 @@ _FEWEST_MIRRORED = 20  # mirrored columns
 def ring_offsets(residual: F32, geometry: Geometry) -> F32:
     """Offsets of single pixels [row, col] that are constant over all projections and cause rings in a volume.
 
-    An offset is the median of the residual over the projections, minus its neighbourhood along the row. The wall of a
-    can around the axis is also constant over all projections, but it is the same in all rows and on both sides of the
-    axis. Counting it as an offset costs 1.1 dB on a battery. So a part that all rows share counts only if the other
-    side of the axis does not show it, see `without_layers`. Offsets below three standard errors (from the scatter
-    between blocks of neighbouring angles) are multiplied by the share of pixel sensitivity in them, estimated by
-    comparing columns with those on the other side (Wiener filter). With few projections, noise cannot be separated from
-    the sample; then all offsets are 0. The part of the sample that a model does not explain changes with the angle. The
-    blocks must be contiguous in angle, because blocks in another order would agree on that part, and it would count as
-    rings (-0.5 dB).
+    An offset is the median of the residual over the projections, minus the median of its neighbours along the row. The
+    wall of a can around the axis is also constant over all projections, but it is the same in all rows and on both
+    sides of the axis. Counting it as an offset costs 1.1 dB on a battery. So an offset that all rows share counts only
+    if the columns on the other side of the axis do not show it, see `without_layers`. Offsets below three standard
+    errors (from the scatter between blocks of neighbouring angles) are multiplied by the share of pixel sensitivity in
+    them, estimated by comparing columns with those on the other side (Wiener filter). With few projections, noise
+    cannot be separated from the sample; then all offsets are 0. The part of the sample that a model does not explain
+    changes with the angle. Blocks that are contiguous in angle see it differently. Blocks in another order would all
+    see the same mean, which would count as rings (-0.5 dB).
 
     Args:
         residual: projections minus the projections of a model, [view, row, col].
@@ -80,9 +82,9 @@ def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floati
 def without_layers(stripes: F32, axis_col: float) -> F32:
     """Stripes [row, col] minus the part that the columns on the other side of the axis also show.
 
-    If the part that both sides share is more than twice the standard deviation of the one-sided part, it belongs to
-    layers of the sample around the axis. By chance this happens for one in 800 pairs of independent columns. Columns
-    without a mirrored one are not changed.
+    If the part that both sides share is more than twice the standard deviation of the one-sided part, the shared part
+    belongs to layers of the sample around the axis. By chance this happens for one in 800 pairs of independent columns.
+    Columns without a mirrored column are not changed.
     """
     across = mirrored(stripes, axis_col)
     seen = np.isfinite(across[0])
@@ -97,12 +99,13 @@ def without_layers(stripes: F32, axis_col: float) -> F32:
 
 @dataclass(frozen=True)
 class Steadiness:
-    """The part of a sinogram's columns that is constant over all projections, as standard deviations.
+    """How much the columns of a sinogram differ from each other in all projections in the same way, as standard
+    deviations.
 
-    The standard deviations are of fine differences between columns. A layer of the sample around the axis is also
-    constant in its columns, but it is the same on both sides of the axis. The sensitivity of a pixel is independent of
-    the pixel on the other side. So stripes from pixels have an odd part (about the axis) as large as their even part.
-    Stripes from the sample have only an even part.
+    The standard deviations are of fine differences between columns. A layer of the sample around the axis also makes
+    columns that are constant over all projections, but equally on both sides of the axis. The sensitivity of a pixel is
+    independent of the pixel on the other side. So stripes from pixels have an odd part (about the axis) as large as
+    their even part. Stripes from the sample have only an even part.
 
     Attributes:
         odd, even: odd and even part of the mean over blocks of projections.
@@ -125,7 +128,8 @@ class Steadiness:
 
 
 def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
-    """How constant and how asymmetric the columns of sinograms are; None if too few columns have a mirrored column.
+    """The `Steadiness` of sinograms: how constant and how asymmetric their columns are. None if too few columns have a
+    mirrored column.
 
     Args:
         sinograms: [view, row, col] in the order of the angles.

@@ -13,21 +13,23 @@ from recon.base.views import spread
 HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
 _TURNS = 10  # fewer turns are plausible in radians, unless all angles are whole numbers
 _FEWEST = 5  # with fewer projections there is no warning
-_ROUND = 0.01  # tolerance, as a share of the turn or half turn
-_OPAQUE = 15.0  # line integral; exp(-15) of the intensity is less than any detector measures in nine of ten pixels
+_ROUND = 0.01  # tolerance, as a share of 360° or 180°
+_OPAQUE = 15.0  # line integral; no detector measures a transmission of exp(-15) in nine of ten pixels
 _LOOKED_AT = 2**16  # number of values in the sample
 _VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # size of the sample in which transmission is searched for
-_LEVEL = 0.15  # tolerance of the beam level in transmission: from 1, and between projections
+# tolerance of the beam level in transmission: its difference from 1, and its difference between projections
+_LEVEL = 0.15
 _NOT_ABOVE = 0.03  # share of the beam; nine values in ten are at most this much above it
-_EDGE = 32  # an edge is one in this many columns
+_EDGE = 32  # one of this many columns belongs to an edge
 _SIGMAS = 3.0
 
 
 def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
     """Whether angles [view] given as radians look like degrees.
 
-    They do if all are whole numbers, or if they span 180 or 360. They also do if they span more than ten turns and are
-    rounded to two digits. Before a scan has `ended`, the span is not used, because a scan of many turns passes 180 rad.
+    Angles look like degrees in three cases: all are whole numbers; they span 180 or 360; or they span more than ten
+    turns (in radians) and are rounded to two digits. Before a scan has `ended`, the span is not used, because a scan of
+    many turns passes 180 rad.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -44,14 +46,15 @@ def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
 
 
 def gone_round(angles: NDArray[np.floating], turn: float) -> float:
-    """Half a `turn` or a `turn`, if distinct angles [view] cover it (with or without the last angle); otherwise 0."""
+    """Half a `turn` or a whole `turn`, whichever the distinct angles [view] cover (with or without the last angle); 0
+    if they cover neither."""
     span = float(np.ptp(angles)) if angles.size >= _FEWEST else 0.0
     spans = span, span + span / max(angles.size - 1, 1)
     return next((part for part in (turn / 2, turn) if min(abs(each / part - 1) for each in spans) < _ROUND), 0.0)
 
 
 def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:
-    """Give a UserWarning if angles look like degrees. It names the line that called the calling function."""
+    """Give a UserWarning if angles look like degrees. The warning names the line that called the calling function."""
     if look_like_degrees(angles, ended):
         warnings.warn(
             f"angles must be in radians. These reach {np.abs(angles).max():.5g} and look like degrees: give "
@@ -63,8 +66,8 @@ def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:
 def look_like_counts(projections: NDArray[np.floating]) -> bool:
     """Whether values [view, row, col] given as line integrals look like counts. A sample of the values is tested.
 
-    They do if nine in ten values are so large that no detector could measure the remaining intensity. If all values are
-    whole numbers, half of them suffice.
+    Values look like counts if nine in ten of them are so large that no detector could measure the remaining intensity.
+    If all values are whole numbers, half of them being so large is enough.
     """
     some = some_values(projections, _LOOKED_AT)
     some = some[np.isfinite(some)]
@@ -80,8 +83,8 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     lower. So the values are transmission if five conditions hold: half of the left and right edges have a level near 1;
     these edges are flat; nine values in ten are not above that level; no value is much below 0; and the middle is below
     the level. Line integrals of a sample within the field of view never meet these conditions. If a sample fills the
-    field of view, edges of about 1 with less material between them belong to a tube seen from inside. Its profile falls
-    all the way from the edge, so it is not flat.
+    field of view, line integrals of about 1 at the edges and lower ones between them come from a tube seen from inside.
+    The profile of a tube falls from the edge on, so its edges are not flat.
     """
     if projections.ndim != 3 or projections.shape[0] < 2 or not projections.shape[1] or projections.shape[2] < 16:
         return False
@@ -115,7 +118,7 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
 
 
 def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:
-    """Give a UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
+    """Give a UserWarning if values [view, row, col] that should be line integrals look like counts or transmission.
 
     Args:
         stacklevel: stacklevel of the warning; 3 names the line that called the calling function.

@@ -1,14 +1,14 @@
 """Vectors for each projection (source or ray, detector, columns, rows), as ASTRA and programs based on it use them.
 
-Each projection is one row. All lengths have the same unit; (x, y, z) count from the middle of the volume (ASTRA
-Toolbox, 3D geometries, `parallel3d_vec` and `cone_vec`):
+Each projection has one row of vectors. All lengths have the same unit; the origin of (x, y, z) is the middle of the
+volume (ASTRA Toolbox, 3D geometries, `parallel3d_vec` and `cone_vec`):
 
     ray or source   direction of the parallel beam, or place of the source
     d               middle of the detector
     u, v            from one pixel to the next one of its row, and of its column
 
 So the middle of pixel (row, col) is d + (col - (cols - 1) / 2) u + (row - (rows - 1) / 2) v. A volume [z, y, x] is the
-same array in both. ASTRA has projections as [row, view, col]; tomosipo writes vectors as (z, y, x).
+same array here and in ASTRA. ASTRA has projections as [row, view, col]; tomosipo writes vectors as (z, y, x).
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from recon.base.geometry import Geometry
 from recon.base.placement import Where
 
 TOLERANCE = 0.1
-"""Largest distance, in pixels, of a detector corner from the corner that the vectors state."""
+"""Largest distance, in pixels, that a detector corner of the geometry may have from the corner that the vectors
+give."""
 
-_PARALLEL = 1e-6  # share of u or v that remains of the other vector; below it, the two count as parallel
+_PARALLEL = 1e-6  # u and v count as parallel if the perpendicular part of one is below this share of its length
 _CLEAN = 1e-9  # rad, pixels, or share of the distance to the source; smaller values are rounding errors
 
 
 def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, cone: bool) -> Geometry:
-    """The geometry of projections that are given as vectors, as in ASTRA: parallel beams in any direction, or cones
-    from any source.
+    """The geometry of projections that are given as vectors, as in ASTRA. The beam may be parallel in any direction, or
+    a cone from any source.
 
     The detector pixels are squares of one size. For a parallel beam, the detector is perpendicular to the beam. For a
-    cone, the distance from the source to the detector is the same in all projections. The centre of the detector need
-    not lie opposite the origin.
+    cone, the distance from the source to the detector is the same in all projections. The origin need not be projected
+    to the centre of the detector.
 
     Args:
         vectors: float [view, 12], in mm; see the module.
@@ -61,7 +62,7 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     sizes = (_dot(u, along_cols) + _dot(v, along_rows)) / 2
     distances = _distances(middle - first, beam) if cone else np.ones(len(given))
     sdd = float(np.median(distances))
-    apart = (sdd / distances)[:, None]  # factor to a detector at the common distance
+    apart = (sdd / distances)[:, None]  # factor that scales to a detector at the common distance
     pitch = float(np.median(sizes * apart[:, 0]))
     _require_pixels(u * apart, v * apart, frame, pitch, (rows, cols))
     foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # the origin is projected to this point
@@ -86,10 +87,11 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
 
 
 def vectors_of(geometry: Geometry) -> F64:
-    """The vectors [view, 12] of a geometry in mm; for a parallel beam the first three are the direction.
+    """The vectors [view, 12] of a geometry in mm. For a parallel beam the first three numbers are the direction of the
+    beam.
 
     Raises:
-        ValueError: the geometry has a skew (rolling shutter), so that each row has its own angle.
+        ValueError: the geometry has a skew (rolling shutter), so that rows have different angles.
     """
     check_arguments(vectors_of, locals())
     if geometry.skew:
@@ -153,7 +155,8 @@ def _distances(to_detector: F64, beam: F64) -> F64:
 
 
 def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, shape: tuple[int, int]) -> None:
-    """ValueError if the corners of a detector differ by more than `TOLERANCE` from those of square pixels of `size`."""
+    """Raise ValueError if the corners of a detector differ by more than `TOLERANCE` from those of a detector with
+    square pixels of `size`."""
     by_col, by_row = ((vector - size * unit) / size for vector, unit in zip((u, v), frame, strict=False))
     rows, cols = shape
     corners = [by_col * cols / 2 + sign * by_row * rows / 2 for sign in (1, -1)]

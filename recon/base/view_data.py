@@ -137,7 +137,7 @@ class Views:
         return replace(self, data=means, geometry=views, weights=known)
 
     def split(self, one_in: int = ONE_IN) -> tuple[Views, Views]:
-        """The projections to reconstruct from, and one in `one_in` held out, see `split_views`."""
+        """The projections to reconstruct from, and the held-out ones: one in `one_in`, see `split_views`."""
         seen, unseen = split_views(self.geometry, one_in)
         return self.select(seen), self.select(unseen)
 
@@ -145,10 +145,12 @@ class Views:
 def split_views(
     geometry: Geometry, one_in: int = ONE_IN, period: float | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of the projections to reconstruct from, and of one in `one_in` held out, evenly spread in angle.
+    """Numbers of the projections to reconstruct from, and of the held-out ones: one in `one_in`, evenly spread in
+    angle.
 
     Args:
-        period: radians after which projections repeat; None: the period of the geometry, which depends on the axis.
+        period: angle in radians after which projections repeat; None: the period of the geometry, which depends on the
+            position of the axis.
     """
     order = np.argsort(np.mod(geometry.angles, period or geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])

@@ -94,7 +94,8 @@ def _sector(
 
 
 def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
-    """n of the projections, evenly spread over the distinct angles in a period, or over all if these are too few."""
+    """n of the projections, evenly spread over the distinct angles in a period, or over all projections if the distinct
+    angles are too few."""
     once = np.sort(np.mod(theta[views], period))
     gaps = np.diff(once, append=once[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
@@ -107,7 +108,7 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: 
 
 
 def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most `n` of the frames, evenly spread. For a 360° scan, half as many, each with its opposite projection.
+    """At most `n` of the frames, evenly spread. For a 360° scan, n / 2 frames, each with its opposite projection.
 
     Args:
         angles: [frame], radians.

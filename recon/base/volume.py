@@ -74,9 +74,10 @@ class Grid:
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
         """A box around the rotation axis that contains everything that any projection sees, for any axis position.
 
-        It includes what shifted projections see, also if the axis is outside the detector. Roll and tilt are ignored.
-        The field of view of a cone is measured at the rotation axis. Outside it, material is in the beam only while it
-        is far from the source, so few projections see it. The box of a wide cone ends before its source.
+        The box includes everything that shifted projections see, and it exists even if the axis is outside the
+        detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Material
+        outside this field of view is in the beam only at angles at which it is far from the source, so few projections
+        see it. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
@@ -89,7 +90,7 @@ class Grid:
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field of view, in voxels of the requested size.
 
-        `wider`: the box is as wide as the requested box, which is wider than the field of view because the sample is.
+        `wider`: True for a sample that is wider than the field of view. The box is then as wide as the requested box.
 
         The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
         start from a volume coarser than four pixels.
@@ -102,7 +103,7 @@ class Grid:
     def widened(self, by: float, geometry: Geometry) -> Grid:
         """The box of the field of view, widened by the factor `by`.
 
-        For a cone beam it is limited to the width at which its corners reach the source.
+        For a cone beam, the width is limited so that the corners of the box do not reach the source.
         """
         nz, nx, _ = self.shape
         most = math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6
@@ -129,7 +130,7 @@ class Grid:
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
         """The box with whole slices added until it contains all rays of a cone, which rise or fall to its corners."""
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
-        # how far a row's rays rise on this distance
+        # how far the rays of a row rise over this distance
         row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch
         (low, high), (bottom, top) = geometry.heights, self.edges[:, 2]
         axis = geometry.axis_row + geometry.shifts[:, 1]  # rays rise from their source, which moves with `centres`
@@ -176,11 +177,12 @@ class Grid:
 
 
 def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
-    """Extent in pixels of shifted projections along columns (0) or rows (1), and the distance of its middle.
+    """Extent in pixels that shifted projections see along columns (0) or rows (1), and the distance of the middle of
+    this extent.
 
-    The distance is from the middle of an unshifted projection. Positions that fewer than half as many projections see
-    as the most frequently seen position are left out. If projections move along the axis by half the detector's rows or
-    more, all positions are kept.
+    The distance is from the middle of an unshifted projection. Positions count only if at least half as many
+    projections see them as see the most frequently seen position. If projections move along the axis by half the
+    detector's rows or more, all positions are kept.
     """
     size = geometry.detector_shape[1 - axis]
     first = -geometry.offsets[:, axis]
@@ -258,8 +260,9 @@ class VolumeSeries:
     Attributes:
         seconds: float64 [volume], time from the first projection in s.
         data: float32 [volume, z, y, x], or a dataset of a file.
-        residual: residual of the projections, each compared with its mixture of volumes, divided by the projections
-            (root mean squares); NaN if read from a file, whose metrics contain it.
+        residual: each projection is compared with the projection of its mixture of volumes; the difference is divided
+            by the projections (root mean squares). NaN if the series was read from a file; the metrics in the file then
+            contain the residual.
     """
 
     seconds: NDArray[np.float64]
@@ -277,7 +280,7 @@ class VolumeSeries:
         return tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
-        """The volumes; each one reads its voxels only when it is sliced along z."""
+        """The volumes. If the data are in a file, a volume reads its voxels only when it is sliced along z."""
         return [_VolumeAt(self.data, index) for index in range(self.n)]
 
 

@@ -1,8 +1,9 @@
-"""Beam-hardening correction for a sample of one material: line integrals as the attenuation of a thin layer gives them.
+"""Beam-hardening correction for a sample of one material: the corrected line integral is the thickness times the
+attenuation of a thin layer.
 
 A beam of several energies loses the low energies first, so line integrals grow more slowly than thickness. In the
-volume, bodies are darker inside (cupping), and there are streaks between dense parts. For one material the relation is
-a curve, which is inverted (Herman 1979, Phys. Med. Biol. 24, 81).
+volume, bodies are darker inside (cupping), and there are streaks between dense parts. For one material, the relation
+between thickness and line integral is a curve, and the correction inverts it (Herman 1979, Phys. Med. Biol. 24, 81).
 """
 
 from __future__ import annotations
@@ -16,22 +17,22 @@ from recon.base.arrays import F32, F64
 
 _NODES = 2048
 _FEWEST_RAYS, _MOST_RAYS = 100, 5000
-# least share of the variance of line integrals that thickness explains in a sample of one material
+# in a sample of one material, the thickness explains at least this share of the variance of line integrals
 _LEAST_EXPLAINED = 0.9
 
 
 class NoCurveError(ValueError):
-    """The line integrals do not determine a hardening curve; the message gives the reason."""
+    """No hardening curve can be determined from the line integrals. The message gives the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Corrected line integrals as a function of measured ones.
+    """A curve that gives the corrected line integral for each measured one.
 
     Attributes:
         measured: float64 [node], ascending from 0.
-        corrected: float64 [node], ascending from 0. Below 0 the curve continues along its first piece, beyond the end
-            along its last.
+        corrected: float64 [node], ascending from 0. Below 0, the curve continues along its first segment; beyond its
+            end, along its last segment.
     """
 
     measured: F64
@@ -68,9 +69,9 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The two-energy curve that fits line integrals against path lengths in the material best.
+    """The two-energy curve that fits best to line integrals as a function of the path lengths in the material.
 
-    (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) It always rises, with a falling slope.
+    (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) The curve always rises, with a falling slope.
 
     Args:
         measured: line integrals.

@@ -23,18 +23,19 @@ from recon.voxels.held_out import LEAST_VIEWS, predicted_views
 from recon.voxels.methods import EarlyTv
 from recon.voxels.voxel_problem import NORM
 
-_REACH = 4.0  # in units of the length; beyond it, the influence of a pixel is below exp(-4)
+_REACH = 4.0  # distance in units of the length, beyond which the influence of a pixel is below exp(-4)
 TRIAL_ROWS, TRIAL_COPIES = 8, 10
 """Number of rows in a search for the length, and float32 copies of their projections and volumes in memory."""
 LEAST_DROP = 0.1
 """A filter that the user did not ask for must lower the residual in held-out projections by this share.
 
-A filter that lowers it by 8 % removes half the depth of the thin cracks of a tooth. Simulated cathodes that gain 4 to
-11 dB have 14 % and more; two that were examined afterwards have 13.5 and 13.9 %.
+A filter that lowers the residual by 8 % removes half the depth of the thin cracks of a tooth. For simulated cathodes
+that gain 4 to 11 dB, the filter lowers it by 14 % or more. For two cathodes that were examined afterwards, it is 13.5
+and 13.9 %.
 """
-_FIRST, _LONGEST = 1.0, 64.0  # squared lengths in pixels²: start of the search, and largest
+_FIRST, _LONGEST = 1.0, 64.0  # squared lengths in pixels²: at the start of the search, and the largest
 _ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
-_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a test reconstruction with `EarlyTv`
+_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # settings of a test reconstruction with `EarlyTv`
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Paganin:
 
     The Fourier transform of the transmission is divided by 1 + (2 pi f length)², with f in cycles per pixel (Paganin et
     al. 2002, J. Microsc. 206, 33, equation 12). The frame is mirrored at its edges. The filter lowers the noise most if
-    absorption is weak. Detail finer than the length is lost in noise.
+    absorption is weak. Detail that is finer than the length is lost in noise.
 
     Attributes:
         length: sqrt(distance delta / mu), in pixels, see `length_of`.
@@ -62,11 +63,12 @@ class Paganin:
 
     @property
     def reach(self) -> int:
-        """Distance in pixels up to which other pixels influence a pixel."""
+        """Distance in pixels over which pixels influence each other."""
         return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
-        """Replace line integrals [view, row, col] by those of the sample, in place; `floor`: least transmission."""
+        """Replace line integrals [view, row, col] by the filtered ones, in place. `floor` is the lowest
+        transmission."""
         f2 = _squared_frequencies(views)
         gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)
         if self.unsharp is not None:
@@ -111,7 +113,8 @@ class FilterLength:
 
     Attributes:
         length: in pixels.
-        factor: one standard error of the squared length, as a ratio, from the disagreement of held-out projections.
+        factor: one standard error of the squared length, as a ratio. It comes from the disagreement between held-out
+            projections.
         gain: relative decrease of the residual in these projections, compared with no filter.
     """
 
@@ -123,11 +126,12 @@ class FilterLength:
 def length_by_held_out_views(
     views: F32, geometry: Geometry, floor: float, known: NDArray[np.bool_]
 ) -> FilterLength | None:
-    """The length of Paganin's filter from held-out projections; None if no length is better, or they are too few.
+    """The length of Paganin's filter that predicts held-out projections best. None if no length is better than no
+    filter, or if there are too few held-out projections.
 
-    A volume is reconstructed from the other, filtered projections. It is projected, and the fringes are added to its
-    transmission T again, as T - length² laplace T. So every length is compared with the projections as measured.
-    Filtered projections would not be a fair reference, because a longer filter makes any projection smoother.
+    A volume is reconstructed from the other projections after filtering. The volume is projected, and the fringes are
+    added to its transmission T again, as T - length² laplace T. So every length is compared with the projections as
+    measured. Filtered projections would not be a fair reference, because a longer filter makes any projection smoother.
 
     Args:
         views: line integrals [view, row, col]; 8 rows are used: those with most material, for a cone those in the
@@ -170,7 +174,7 @@ def length_by_held_out_views(
     if not exceeds_standard_error(none - least, _ERRORS):
         return None
     weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))
-    # Factors of √2, then the vertex of a parabola, for each projection; factors of 2 would cost 1 dB.
+    # The search uses factors of √2, then the vertex of a parabola, for each projection. Factors of 2 would cost 1 dB.
     to_vertex = (weaker - stronger) / (2 * float((weaker + stronger).mean()))
     factor = 2.0 ** float(to_vertex.std(ddof=1) / (2 * math.sqrt(to_vertex.size)))
     square, gain = at * 2.0 ** float(to_vertex.mean() / 2), 1 - float(least.mean() / none.mean())

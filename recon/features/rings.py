@@ -1,7 +1,7 @@
 """Rings: removes the stripes in sinograms (rings in slices) that come from pixels with a wrong sensitivity.
 
 A sinogram is float32 [view, col]: the line integrals of one detector row in the order of the angles. A stripe is a
-column in it. If the projections cover a small angle, stripes cannot be distinguished from edges of the sample.
+column of a sinogram. If the projections cover a small angle, stripes cannot be distinguished from edges of the sample.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.stripes import AT_AXIS, NARROWEST, steadiness, without_layers
 from recon.base.units import warn_of_other_quantity
 
-_ROBUST = 1.4826  # 1 / MEDIAN, rounded; recorded reference volumes depend on this rounding in `by_sorting`
+_ROBUST = 1.4826  # 1 / MEDIAN, rounded. Reference volumes of the tests depend on this rounding in `by_sorting`
 _FAR = 3.0  # a column that differs from its neighbours by this many standard deviations is a stripe (Vo 2018: snr 3)
 _FEWEST_VIEWS = 8
 _MOST = 0.1  # largest share of columns that may be stripes
@@ -31,9 +31,9 @@ _COPIES = 13  # float32 copies of a sinogram in memory
 
 
 def width_for(cols: int) -> int:
-    """Odd number of columns for a median, wider than small stripes and narrower than the sample.
+    """Number of columns for a median: odd, wider than small stripes, and narrower than the sample.
 
-    31 for 2048 columns, 7 for 160, 3 for 40.
+    Examples: 31 for a detector of 2048 columns, 7 for 160 columns, 3 for 40 columns.
     """
     return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
 
@@ -43,7 +43,8 @@ def by_sorting(sinogram: F32, width: int | None = None) -> F32:
 
     A stripe shifts all values of its column. After sorting, neighbouring columns are similar, so the difference is the
     stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: a stripe adds about the same
-    to all projections, and only this part is removed; otherwise edges of metal leave black streaks across the slice]
+    value to all projections, and only this common part is removed; otherwise edges of metal would leave black streaks
+    across the slice]
     """
     order = np.argsort(sinogram, axis=0, kind="stable")
     ranked = np.take_along_axis(sinogram, order, axis=0)
@@ -56,10 +57,11 @@ def by_sorting(sinogram: F32, width: int | None = None) -> F32:
 
 
 def without_dead_columns(sinogram: F32) -> F32:
-    """Fill columns that hardly respond or fluctuate from their neighbours (Vo et al. 2018, algorithm 6).
+    """Replace columns that hardly respond, or that fluctuate, by interpolated values of their neighbours (Vo et al.
+    2018, algorithm 6).
 
     Such a column varies more, or less, between projections than the median of the columns around it. [our own: the
-    median over projections, because edges of metal cross a column in a few projections]
+    variation is a median over projections, because edges of metal cross a column only in a few projections]
     """
     rough = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
     bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
@@ -70,9 +72,9 @@ def without_large_stripes(sinogram: F32) -> F32:
     """Shift wide or strong stripes to the level of their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
 
     A column is changed only if its sorted values differ from those of the columns around it by three times the noise of
-    a pixel. They must differ over their middle four fifths, by about the same amount everywhere. If a tenth of all
-    columns meet these conditions, no column is changed. [our own: the second condition; without it, metal near the axis
-    counts as a stripe]
+    a pixel. The values must also differ by about the same amount everywhere in their middle four fifths. If a tenth of
+    all columns meet these two conditions, no column is changed. [our own: the second condition; without it, metal near
+    the axis would count as a stripe]
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
@@ -82,7 +84,7 @@ def without_large_stripes(sinogram: F32) -> F32:
     far = np.abs(shift) > _FAR * max(_noise(sinogram), median_deviation(shift))
     far &= off.std(axis=0) < _EVEN * np.abs(shift)
     if far.mean() > _MOST:
-        return sinogram  # so many columns must belong to the sample
+        return sinogram  # a tenth of all columns must belong to the sample
     return sinogram - np.where(far, shift, 0).astype(np.float32)
 
 
@@ -101,10 +103,11 @@ _NAMES: Mapping[Callable[[F32], F32], str] = {
 
 
 def stripe_score(sinogram: F32) -> float:
-    """Typical difference of a column from its four neighbours, divided by its own noise; about 1 without stripes.
+    """Typical difference of a column from its four neighbours, divided by the noise of the column. It is about 1
+    without stripes.
 
-    It is a median over projections, so edges of the sample do not count, because they cross a column in a few
-    projections. A body on the axis stays in its columns and counts as a stripe.
+    The difference is a median over projections. So edges of the sample do not count, because they cross a column only
+    in a few projections. A body on the axis stays in its columns, so it counts as a stripe.
     """
     x = sinogram
     off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
@@ -121,8 +124,8 @@ class WithoutRings:
 
     Attributes:
         data: float32 [view, row, col], line integrals.
-        taken: float32 [row, col], mean of the removed part over the projections.
-        sentence: a sentence about the removal.
+        taken: float32 [row, col], the removed part, averaged over the projections. sentence: a sentence that describes
+            the removal.
     """
 
     data: F32
@@ -136,7 +139,8 @@ def remove_rings(
     rings: Rings = "auto",
     axis_col: float | None = None,
 ) -> WithoutRings:
-    """A copy of line integrals without the stripes that cause rings, for use between `recon.correct` and a method.
+    """A copy of line integrals without the stripes that cause rings. Use it after `recon.correct` and before a
+    reconstruction.
 
     Args:
         projections: [view, row, col], in any order. The data are not changed if there are fewer than 8 projections
@@ -168,23 +172,26 @@ def remove_rings_in_place(
     """Remove stripes from all rows of line integrals [view, row, col], in place.
 
     Args:
-        views: in any order. Fewer than 8 projections, or with fewer than 64 columns, are not changed.
+        views: in any order. Projections are not changed if they are fewer than 8, or if they have fewer than 64
+            columns.
         angles: [view], radians.
-        rings: the method. "auto" examines some rows: it uses "sort" if `steadiness` finds stripes, and removes columns
-            that are dead or far off.
+        rings: the method. "auto" examines some rows: it uses "sort" if `steadiness` finds stripes, and it removes
+            columns that are dead or deviate strongly.
         axis_col: column of the rotation axis; None: the middle. The part that a column shares with the mirrored column
-            stays, see `without_layers`.
+            is not removed, see `without_layers`.
 
     Returns:
-        float32 [row, col], mean of the removed part over the projections, and a sentence about it; "" for "none".
+        float32 [row, col], the removed part averaged over the projections; and a sentence that describes the removal
+        ("" for "none").
     """
     taken = np.zeros(views.shape[1:], np.float32)
     if rings == "none":
         return taken, ""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return taken, (
-            f"Rings: nothing was removed. {len(views)} projections of {views.shape[2]} columns are too few to tell "
-            f"stripes from the sample (at least {_FEWEST_VIEWS} projections of {NARROWEST} columns are needed)."
+            f"Rings: nothing was removed. {len(views)} projections of {views.shape[2]} columns are too few to "
+            f"distinguish stripes from the "
+            f"sample (at least {_FEWEST_VIEWS} projections of {NARROWEST} columns are needed)."
         )
     order = np.argsort(angles, kind="stable")
     axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
@@ -209,7 +216,7 @@ def remove_rings_in_place(
     )
 
 
-_FAINTEST = 1e-5  # share of the largest line integral; fainter stripes can only be seen in projections without noise
+_FAINTEST = 1e-5  # share of the largest line integral; fainter stripes are visible only in projections without noise
 
 
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
@@ -223,8 +230,8 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
         f"Expect ring artefacts: pixel sensitivities differ by {steady.odd:.2g} in line integral, {steady.score:.1f} "
         "times the noise of a column. Nothing was removed. To remove the rings, use --rings auto, which filters the "
         "projections. If the scan is finished, you can use --calibrate gains instead, which measures the sensitivities "
-        "with the volume. If the sample has layers around the rotation axis, compare the volume with rings removed "
-        "with the present one, because layers look like rings."
+        "with the volume. If the sample has layers around the rotation axis, compare the two volumes, with rings "
+        "removed and as they are now, because layers look like rings."
     )
 
 
@@ -259,7 +266,8 @@ def _noise(values: NDArray[np.floating]) -> float:
 
 
 def _far_off(sinogram: F32, axis_col: float) -> bool:
-    """Whether some columns are dead or far off: at most a fifth of all, not near the axis, and not mirrored."""
+    """Whether some columns are dead or deviate strongly. Such columns are at most a fifth of all, are not near the
+    axis, and their mirrored columns do not deviate."""
     cleaned = without_large_stripes(without_dead_columns(sinogram))
     changed = (cleaned != sinogram).any(axis=0).sum()
     strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
@@ -281,7 +289,8 @@ def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
 
 
 def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
-    """Bad columns filled by linear interpolation between good ones; unchanged if more than half are bad."""
+    """The values with bad columns filled by linear interpolation between good columns. They are unchanged if more than
+    half of the columns are bad."""
     if not bad.any() or bad.mean() > 0.5:
         return sinogram
     good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)

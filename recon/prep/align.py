@@ -1,9 +1,10 @@
 """find_axis: the rotation axis (centre of rotation) from the projections, and whether the estimate is reliable.
 
-There are five methods with different requirements. "pair" needs two opposite projections (180° apart) and an axis near
-the middle. "opposite views" needs a 360° scan. "double wedge" needs projections over about 180° and the sample within
-the field of view. "ends of half a turn" also works for a wider sample, but needs small steps. "centre of mass" works
-with any sector, but needs the whole sample in the field of view and an air level of zero.
+There are five methods with different requirements. The method "pair" needs two opposite projections (180° apart) and an
+axis near the middle. "opposite views" needs a 360° scan. "double wedge" needs projections over about 180° and a sample
+within the field of view. "ends of half a turn" also works if the sample is wider than the field of view, but needs
+small steps between projections. "centre of mass" works with any sector, but needs the whole sample in the field of view
+and an air level of zero.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from recon.prep.axis_wedge import AxisError as AxisError
 from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
-_FEWEST = 2  # columns at each edge in which no axis is accepted
-_PAIRINGS = 32  # pairings of projections that are not opposite
+_FEWEST = 2  # number of columns at each edge in which no axis is accepted
+_PAIRINGS = 32  # number of pairings of projections that are not opposite
 _PERFECT = 1 - 1e-9
 _ALL = slice(None)
-_EDGE = 25  # one column in this many, at each edge, is too near to the edge for an axis
+_EDGE = 25  # at each edge, one of this many columns is too near to the edge to be an axis
 
 
 def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> AxisEstimate:
-    """Axis from two opposite projections: p180 is p0 mirrored about the axis.
+    """The rotation axis from two opposite projections. p180 is p0, mirrored about the axis.
 
-    The normalised correlation of p0 with the mirrored p180 is computed at every half column, and a parabola is fitted
-    to its peak. A mirror about a half column maps pixels to pixels, so nothing is interpolated. The sample may be wider
-    than the field of view, because only columns that both projections see are compared.
+    The normalised correlation of p0 with the mirrored p180 is computed for an axis at every half column, and a parabola
+    is fitted to its peak. Mirroring about a half column maps pixels to pixels, so no value is interpolated. The sample
+    may be wider than the field of view, because only columns that both projections see are compared.
 
     Args:
         p0, p180: float32 [row, col], line integrals.
@@ -63,15 +64,16 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> Axis
 
 
 def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
-    """Axis from all pairs of opposite projections of a 360° scan, also if the axis is near an edge of the detector.
+    """The rotation axis from all pairs of opposite projections of a 360° scan. The axis may be near an edge of the
+    detector.
 
-    It works as `axis_from_pair`, but with the slopes of the projections along the columns, because a common trend of
-    the projections would give a false match if the overlap is narrow. The part that all projections share, such as the
-    rim of a round sample, is subtracted. The sum is over up to 64 pairs and over rows (overlap in half acquisition: Vo
-    et al. 2021, Opt. Express 29, 17849). A few columns can agree by chance, so a candidate is scored by Fisher's z =
-    artanh(correlation) √columns. For comparison, projections are paired with those of another pair, which are not
-    opposite, in up to 32 ways. The estimate is confident if its z exceeds the largest z of any candidate in each of
-    these pairings: one false alarm in 33.
+    The method is that of `axis_from_pair`, with the slopes of the projections along the columns in place of their
+    values. If the overlap is narrow, a common trend of the values would give a false match. The part that all
+    projections share, such as the rim of a round sample, is subtracted. The correlation is summed over up to 64 pairs
+    and over rows (overlap in half acquisition: Vo et al. 2021, Opt. Express 29, 17849). A few columns can agree by
+    chance, so a candidate is scored by Fisher's z = artanh(correlation) √columns. For comparison, each projection is
+    paired with a projection of another pair, which is not opposite to it, in up to 32 ways. The estimate is confident
+    if its z exceeds the largest z of any candidate in all of these pairings. By chance this happens in one of 33 scans.
 
     Args:
         projections: float32 [view, row, col], line integrals.
@@ -94,11 +96,11 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
 
     curve = views.mismatch()
     score = score_of(curve)
-    optimum(candidates, score.max() - score)  # raises an error for an axis at the edge
+    optimum(candidates, score.max() - score)  # raises an error if the axis is at the edge
     best = int(score.argmax())
     near = slice(best - 1, best + 2)
     value = lowest(candidates[near], curve[near])[0]
-    middle = pairs // 2 * height  # neighbouring projections are similar, those a quarter of a turn apart are not
+    middle = pairs // 2 * height  # neighbouring projections are similar; projections 90° apart are not
     halves = [score_of(views.mismatch(part)) for part in (slice(middle), slice(middle, None))]
     apart = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
     turned = np.unique(np.linspace(1, pairs - 1, min(pairs - 1, _PAIRINGS)).astype(int))
@@ -109,7 +111,8 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
 
 
 def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
-    """Slopes along the columns [pair, row, col - 1] of some rows of projections, and of their opposites, negated."""
+    """Slopes along the columns [pair, row, col - 1] of some rows of projections, and the negated slopes of the opposite
+    projections."""
     first, opposite = _opposite_pairs(np.asarray(angles, np.float64), projections.shape[2])
     if first.size < _FEWEST_PAIRS:
         raise ValueError(
@@ -126,7 +129,7 @@ def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Float
 
 
 def _opposite_pairs(angles: Floats, cols: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Projections of one half turn, and the ones opposite to them within 2 / cols."""
+    """Projections of one half turn, and the projections that are opposite to them within 2 / cols radians."""
     theta = np.mod(angles, 2 * np.pi)
     away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
     opposite = away.argmax(axis=1)
@@ -143,7 +146,7 @@ def _rows_of(views: Floats) -> Floats:
 def mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     """1 - normalised correlation of a[i] with b[2 axis - i], over all rows and the columns that both have.
 
-    It is 1 if these columns contain too little of the variance, because air alone always matches.
+    The value is 1 if these columns contain too little of the variance, because columns of air always match.
     """
     return _Mirrored.of(a, b, candidates).mismatch()
 
@@ -153,7 +156,7 @@ class _Mirrored:
     """Rows [row, col] of two sets of projections, prepared for their correlation at each candidate.
 
     Attributes:
-        total: i + j of the compared pixels. length: length of the transforms. count: columns that both have.
+        total: i + j of the compared pixels. length: length of the transforms. count: number of columns that both have.
         spectra: spectra of both sets [row, frequency]; sums, variances: of both sets over these columns [row,
             candidate].
         powers: powers of both sets [row].
@@ -188,7 +191,8 @@ class _Mirrored:
         )  # fmt: skip
 
     def mismatch(self, rows: slice = _ALL, others: int = 0) -> Floats:
-        """Mismatch [candidate] of row i of the first set with row i - `others` of the second, over some rows i."""
+        """Mismatch [candidate] of row i of the first set with row i - `others` of the second set, for some rows i
+        together."""
         (fa, fb), (sum_a, sum_b) = self.spectra, self.sums
         if others:
             fb, sum_b = np.roll(fb, others, axis=0), np.roll(sum_b, others, axis=0)
@@ -200,7 +204,7 @@ class _Mirrored:
 
 
 def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """As `wedge_curves`, from pairs of opposite projections.
+    """Candidates and their mismatch in the form of `wedge_curves`, computed from pairs of opposite projections.
 
     Raises:
         ValueError: see `axis_from_opposites`.
@@ -215,17 +219,17 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     """The rotation axis (centre of rotation) of a scan, from all projections.
 
-    If all projections together show no axis and the scan covers 360°, the axis is found from pairs of opposite
-    projections, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a sample wider
-    than the field of view, it is found from the two ends of the scan, or from a pair of opposite projections.
+    First, all projections are used together. If they show no axis and the scan covers 360°, pairs of opposite
+    projections are used, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a
+    sample wider than the field of view, the two ends of the scan are used, or a pair of opposite projections.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
     Returns:
-        The estimate from all projections; or from opposite projections, the ends or the pair if only one of these is
-        confident.
+        The estimate from all projections. If that is not confident and another estimate (opposite projections, ends,
+        pair) is, the other estimate.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -251,8 +255,8 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
 def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
     """The axis from opposite projections if they show it clearly.
 
-    Without them it comes from the ends of the 180° scan (if the sample is wider than the field of view) or from a pair
-    of projections, whichever is confident. Otherwise it comes from the ends, or is None.
+    Otherwise the estimate from the ends of the 180° scan (if the sample is wider than the field of view) or from a pair
+    of projections, whichever is confident. If neither is, the estimate from the ends, or None.
     """
     by_ends = None
     with suppress(ValueError):  # AxisError is a ValueError

@@ -12,14 +12,14 @@ from scipy import fft
 
 Floats = NDArray[np.float64]
 
-MOST_ROWS = 16  # this many rows are enough for 0.1 px
+MOST_ROWS = 16  # this many rows are enough for an accuracy of 0.1 px
 FEWEST_COLS = 8  # fewest columns from which an axis can be found
 FEWEST_BANDS = 4  # fewest bands of rows from which its tilt can be found
-AGREE = 1.0  # two independent estimates that differ by no more than this (px) are the same axis
+AGREE = 1.0  # two independent estimates that differ by no more than this (px) count as the same axis
 
 
 class AxisError(ValueError):
-    """The best axis is at the edge of the candidates or outside them, so there is no estimate."""
+    """There is no estimate of the axis, because the best one is at the edge of the candidates or outside them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class AxisEstimate:
     Attributes:
         value: axis_col in pixels, counted from 0 at the centre of the first column.
         candidates: float64 [n], the columns tested.
-        curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
+        curve: float64 [n], mismatch at each candidate: 0 means perfect agreement, about 1 means no agreement.
         confident: False if the minimum of the curve is shallow, or if parts of the data give different axes.
         method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn", "views held out".
     """
@@ -56,7 +56,7 @@ def few_rows(data: NDArray[np.floating]) -> Floats:
 
 
 def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
-    """Position of the minimum of a curve (parabola through three points), and the index of its lowest point."""
+    """Position of the minimum of a curve (by a parabola through three points), and the index of the lowest point."""
     i = int(curve.argmin())
     if not 0 < i < curve.size - 1:
         return float(candidates[i]), i
@@ -74,7 +74,7 @@ def axis_error(value: float, candidates: Floats, place: str) -> AxisError:
 
 
 def optimum(candidates: Floats, curve: Floats) -> tuple[float, float]:
-    """The minimum of a curve and its depth, from 0 (no better than the typical candidate) to 1 (perfect agreement).
+    """The minimum of a curve, and its depth: from 0 (no better than a typical candidate) to 1 (perfect agreement).
 
     Raises:
         AxisError: the minimum lies at an end of the curve.
@@ -86,26 +86,29 @@ def optimum(candidates: Floats, curve: Floats) -> tuple[float, float]:
     return value, (typical - float(curve[i])) / typical if typical > 0 else 0.0
 
 
-_MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for 0.1 px
+_MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for an accuracy of 0.1 px
 _STEP = 0.25  # px between candidates
-# projections. With 5 projections of samples wider than the field, 45 of 46 confident axes were wrong; of others, some
+# smallest number of projections. With 5 projections of samples wider than the field, 45 of 46 confident axes were
+# wrong; of other samples, some
 _FEWEST = 12
 _ROUNDING = 1e-10  # share of a vector's length
-_WIDEST_GAP = np.deg2rad(20)  # radians; with a wider gap in the half turn, the double wedge does not determine the axis
+_WIDEST_GAP = np.deg2rad(20)  # radians; if the 180° have a wider gap, the double wedge does not determine the axis
 
 
 def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats) -> AxisEstimate:
-    """Axis from all projections, without a pair: for uneven, sparse and noisy scans, sectors and 360° scans.
+    """The rotation axis from all projections together. No opposite pair is needed, so the method is suitable for
+    uneven, sparse and noisy scans, for sectors and for 360° scans.
 
-    For scans of about 180° or more it uses the double wedge. For a sample of radius r, the Fourier transform of a
-    sinogram along the columns contains at frequency ω only the angular harmonics |n| <= ω r (Edholm, Lewitt & Lindholm
-    1986; used for the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis, the projection at θ + π is
-    the mirrored projection at θ. So the real part has only even harmonics and the imaginary part only odd ones. The
-    curve is the residual of a least-squares fit of these harmonics to the projections. Angles may have any spacing. The
-    residual is a sum of cosines of the axis, so nothing is interpolated.
+    For scans of about 180° or more, the function uses the double wedge: if a sample has the radius r, the Fourier
+    transform of a sinogram along the columns has, at the frequency ω, only angular harmonics |n| <= ω r (Edholm, Lewitt
+    & Lindholm 1986; used for the axis by Vo et al. 2014, Opt. Express 22, 19078). If the columns are counted from the
+    right axis, the projection at θ + π is the mirrored projection at θ. So the real part has only even harmonics, and
+    the imaginary part only odd ones. The curve is the residual of a least-squares fit of these harmonics to the
+    projections. Angles may have any spacing. The residual is a sum of cosines of the axis, so nothing is interpolated.
 
-    For less than 180°, or if the wedge is not confident, it uses the centre of mass of the projections, fitted by axis
-    + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
+    If the scan covers less than 180°, or if the estimate of the double wedge is not confident, the function uses the
+    centre of mass: axis + a cos θ + b sin θ is fitted to the centres of mass of the projections (the first of the
+    Helgason-Ludwig conditions).
 
     Args:
         sinogram: float32 [view, col] or [view, row, col], line integrals; a few rows are enough.
@@ -163,7 +166,8 @@ def _axis_from_mass(data: Floats, theta: Floats) -> AxisEstimate:
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
     if not candidates[0] < value < candidates[-1]:
         raise axis_error(value, candidates, "outside them")
-    # Residuals of neighbours are correlated. An air level that is not zero biases the axis without adding scatter.
+    # Residuals of neighbouring projections are correlated. An air level that is not zero shifts the estimate without
+    # adding scatter.
     correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
     error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
     edge = max(2, cols // 40)
@@ -207,7 +211,8 @@ class _Wedge:
         bin: number of columns that were averaged.
         basis: [3, n, frequency], 1, cosine and sine of a candidate.
         omega: [frequency]. fits: [3, row, frequency], coefficients, see `_wedge_residuals`.
-        power: exponent of the frequency in its weight; low frequencies are worse if the sample is wider than the field.
+        power: exponent of the frequency in the weight of a frequency; low frequencies are less reliable if the sample
+            is wider than the field of view.
     """
 
     columns: Floats
@@ -219,7 +224,7 @@ class _Wedge:
 
     @classmethod
     def of(cls, data: Floats, theta: Floats) -> _Wedge:
-        """The residuals from as many projections and columns as are necessary."""
+        """The residuals, computed from only as many projections and columns as are necessary."""
         views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
         bin_ = -(-data.shape[2] // _MOST_COLS)
         cols = data.shape[2] // bin_
@@ -238,7 +243,7 @@ class _Wedge:
 
 def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
     wedge = _Wedge.of(data, theta)
-    # One harmonic more and one less must give the same axis.
+    # With one harmonic more, and with one less, the axis must be the same.
     fewer, curve, more = (wedge.curve(wedge.fits.sum(axis=1), wedge.power + by) for by in (-1, 0, 1))
     value, depth = optimum(wedge.columns, curve)
     bands = abs(lowest(wedge.columns, fewer)[0] - lowest(wedge.columns, more)[0])
@@ -247,11 +252,12 @@ def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
 
 
 def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:
-    """Orthonormal vectors [i, k], and how much each given vector adds. The first m span the first m given ones.
+    """Orthonormal vectors [i, k], and how much each given vector adds. The first m vectors span the first m given
+    vectors.
 
-    There are at most as many as components; a vector that adds nothing becomes zeros. The method is Gram-Schmidt,
-    applied twice because of rounding errors (Giraud et al. 2005). LAPACK is not used, because its threads would take 20
-    times as long while other programs use the cores.
+    There are at most as many vectors as components. A given vector that adds nothing becomes zeros. The method is
+    Gram-Schmidt, applied twice because of rounding errors (Giraud et al. 2005). LAPACK is not used, because its threads
+    would take 20 times as long while other programs use the cores.
     """
     q = vectors[: vectors.shape[1]].copy()
     lengths = np.zeros(len(q))
@@ -278,7 +284,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     data = data - (left + (right - left) * np.linspace(0, 1, cols))
     n = fft.next_fast_len(2 * cols, real=True)
     radius = cols / 2
-    highest = min(np.pi / 2, 0.7 * views / radius)  # so that there are more projections than harmonics
+    highest = min(np.pi / 2, 0.7 * views / radius)  # limited so that there are more projections than harmonics
     k = np.arange(1, max(3, int(highest * n / (2 * np.pi))) + 1)
     omega = 2 * np.pi * k / n
     harmonics = np.ceil(omega * radius + 2)

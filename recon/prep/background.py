@@ -1,8 +1,8 @@
 """Background of the beam: the smooth surface that each projection shows in air (rays that miss the sample).
 
-The open beam during the projections may differ from the flats: it changes its shape, moves or fades. The line integrals
-then contain a smooth surface in addition to the sample. A volume without negative densities cannot represent the
-negative part of this surface, and loses weakly absorbing material instead.
+The open beam may change its shape, move or fade between the flats and the projections. The line integrals then contain
+a smooth surface in addition to the sample. A volume without negative densities cannot represent the negative part of
+this surface, and loses weakly absorbing material instead.
 """
 
 from __future__ import annotations
@@ -17,34 +17,38 @@ from recon.base.noise import air_level
 
 HIGHEST = 3  # highest order of the polynomials in column and row
 
-LEAST_SIZE = 0.005  # root mean square of the surfaces, in line integrals, from which on they are removed by default
+LEAST_SIZE = 0.005  # root mean square of the surfaces, in line integrals, above which they are subtracted by default
 
 _SMOOTH = 1.5  # voxels; smoothing raises weakly absorbing material above the noise
-_SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around material that also count as material
+# limit for material in standard deviations of the smoothed air; number of voxels around material that also count as
+# material
+_SIGMAS, _MARGIN = 5.0, 4
 _CLIPPED = 4.0  # standard deviations
-_BLOCK = 8  # pixels per side of a block; every second block of air is predicted from the others
-_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # least share of the rays of a projection; least share of the projections
+_BLOCK = 8  # pixels per side of a block; every second block of air is predicted from the other blocks
+# smallest share of rays in air that a projection needs; smallest share of such projections
+_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9
 _WINDOWS = (45, 15, 5, 1)  # numbers of projections that share a surface
-# a smaller window, or a higher order, must lower the mean square to this share
+# a smaller window, or a higher order, is used only if it lowers the mean square to this share
 _BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75
-_BETTER = 0.99  # any surface must lower the mean square to this share
-_LEFT = 2.0  # multiple of the noise; if the residual is larger, the rays are not air
-_FARTHEST = 1000.0  # largest variance of a surface, divided by that of a constant; beyond it, the surface extrapolates
+_BETTER = 0.99  # a surface is used only if it lowers the mean square to this share
+_LEFT = 2.0  # multiple of the noise; if the residual is larger, the rays do not show air
+# largest variance of a surface, divided by that of a constant; a larger variance means that the surface extrapolates
+_FARTHEST = 1000.0
 _ROWS_A_POWER = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A polynomial in column and row for each projection.
+    """The background of the beam: a polynomial in column and row for each projection.
 
     Attributes:
         coefficients: float64 [view, term], in the order of `powers`.
         size: root mean square of the surfaces.
         lowest, highest: lowest and highest value of the mean surface.
-        before, after: root mean square of binned air before and after the correction, in blocks that were not used for
-            the fit.
+        before, after: root mean square of binned line integrals in air before and after the correction, in blocks that
+            were not used for the fit.
         air: share of the rays that miss the sample.
-        level: mean of that air before the correction.
+        level: mean line integral of these rays before the correction.
     """
 
     order: int
@@ -59,7 +63,8 @@ class Background:
     level: float
 
     def confirmed(self, noise: float) -> bool:
-        """Whether the surface is significant, and air that was not used for the fit contains little more than noise."""
+        """Whether the correction should be applied: the surface is significant, and the residual in air that was not
+        used for the fit is little more than noise."""
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
@@ -70,7 +75,8 @@ class Background:
 
 
 def surface(terms: F64, shape: tuple[int, int], factor: int = 1) -> F32:
-    """A polynomial [row, col] on a detector of this shape, binned by `factor`; terms [term] as in `powers`."""
+    """A polynomial [row, col] on a detector of this shape, binned by `factor`. Its terms [term] are in the order of
+    `powers`."""
     v, u = (coordinate(n, factor) for n in shape)
     across = np.zeros((HIGHEST + 1, u.size))  # for each power of the row
     for c, (i, j) in zip(terms, powers(HIGHEST), strict=True):
@@ -89,10 +95,11 @@ def powers(order: int) -> list[tuple[int, int]]:
 
 
 def matter(volume: F32, inside: Mask) -> Mask:
-    """Voxels near material, bool [z, y, x]: those whose smoothed value exceeds air by five standard deviations.
+    """Voxels near material, bool [z, y, x]. Material are the voxels whose smoothed value exceeds the air level by five
+    standard deviations.
 
     Args:
-        inside: bool [y, x], voxels that all projections see, without the rim of that circle.
+        inside: bool [y, x], voxels in the circle that all projections see, without the rim of the circle.
     """
     smooth = gaussian_filter(volume, [min(_SMOOTH, n / 8) for n in volume.shape], mode="nearest")
     level, noise = air_level(smooth[:, inside])
@@ -100,7 +107,7 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums over the air in the projections, from which polynomials of any order can be fitted."""
+    """Sums over rays in air, from which polynomials of any order can be fitted."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
         """Start the sums for projections of a detector (rows, cols), binned by `factor`."""
@@ -126,11 +133,11 @@ class AirSums:
         self._totals.append([*totals])
 
     def fit(self, order: int | None = None) -> Background | None:
-        """The surfaces that best predict blocks of air that were not used for their fit; None if there is too little
-        air.
+        """The surfaces that best predict those blocks of air that were not used for the fit; None if there is too
+        little air.
 
-        Neighbouring projections share a surface as long as it predicts equally well. A higher order must predict
-        better.
+        Neighbouring projections share a surface as long as the shared surface predicts equally well. A higher order is
+        used only if it predicts better.
 
         Args:
             order: order of the polynomials; None: up to 3, as long as the order predicts better and extrapolates
@@ -173,7 +180,8 @@ class AirSums:
         )  # fmt: skip
 
     def _farthest(self, squares: F64, some: list[int]) -> float:
-        """Largest variance of a surface with these terms, divided by that of a constant, in a typical projection."""
+        """Largest variance of a surface with these terms in a typical projection, divided by the variance of a
+        constant."""
         g = np.median(squares, axis=0)
         terms = self._terms.reshape(-1, self._terms.shape[-1])[:, some]
         return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])
@@ -189,12 +197,13 @@ class AirSums:
 
 
 def _around(values: F64, width: int) -> F64:
-    """Sums over `width` projections around each one [view, ...]; at both ends over the first and the last ones."""
+    """Sums over the `width` projections around each projection [view, ...]. At both ends, the sums are over the first,
+    or the last, `width` projections."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
     first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
     return np.asarray(total[first + width] - total[first])
 
 
 def _solved(squares: F64, products: F64) -> F64:
-    """Least-squares solution [..., term]; terms that no ray determines are 0."""
+    """Least-squares solution [..., term]. Terms that no ray determines are 0."""
     return np.asarray(np.einsum("...ij,...j", np.linalg.pinv(squares, hermitian=True), products))

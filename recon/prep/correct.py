@@ -27,22 +27,24 @@ def apply(
     progress: Callable[[int], None] = lambda done: None,
     order: NDArray[np.intp] | None = None,
 ) -> tuple[Projections, Plan]:
-    """Line integrals of the next projections (and weights, if photons are counted), and the plan for those after them.
+    """Line integrals of the next projections (with weights, if photons are counted), and the plan for the projections
+    after them.
 
-    The given plan is not changed. With the same plan, the same frames give the same line integrals.
+    The given plan is not changed, so the same plan and the same frames always give the same line integrals.
 
     Args:
-        frames: [view, row, col], any real type, in the order of acquisition; may be empty if `last`. The memory of
-            float32 line integrals is reused for the result.
-        positions: [view], number of the frame in the scan, counted as the positions of the flats.
+        frames: [view, row, col], any real type, in the order of acquisition. They may be empty if `last` is True. The
+            memory of float32 line integrals is reused for the result.
+        positions: [view], number of each frame in the scan, counted in the same way as the positions of the flats.
         view_ids: int64 [view].
-        last: True if no projection comes after these; otherwise the newest one waits for its neighbour.
-        progress: function called with the number of steps done; each projection has two steps.
+        last: True if no projection comes after these. False: the newest projection waits for its neighbour.
+        progress: function called with the number of steps done. Each projection has two steps.
         order: order of neighbours, see `SpotFilter.feed`.
 
     Raises:
         ValueError: as for `CorrectionPlan.transmission`.
-        UnlitViewsError: the air columns of some projections are dark; the error contains their numbers.
+        UnlitViewsError: the air columns of some projections are dark. The error contains the numbers of these
+            projections.
     """
     if not len(view_ids):
         return plan.line_integrals(None, last)
@@ -60,9 +62,9 @@ def correct(
 ) -> Projections:
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of projections.
 
-    All results are finite: dead pixels and single bad values get the mean of their good neighbours and are counted. The
-    function needs the memory of a few frames in addition to the result. Arguments and errors are those of `survey` and
-    of `CorrectionPlan.transmission`.
+    All results are finite: dead pixels and single bad values get the mean of their good neighbours. The result contains
+    their number. In addition to the result, the function needs memory for a few frames. Arguments and errors are those
+    of `survey` and of `CorrectionPlan.transmission`.
     """
     counts = without_mask(counts)
     check_arguments(correct, locals())

@@ -1,4 +1,5 @@
-"""Counts: photon counts behind a sample. Their likelihood becomes line integrals with weights, for any method.
+"""Counts: photon counts behind a sample. Their likelihood is converted to line integrals with weights, which every
+method can use.
 
 The logarithm of few counts is biased (E log n < log E n), and a zero count has no logarithm. The likelihood has neither
 problem.
@@ -15,16 +16,18 @@ from scipy import ndimage
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import check_settings
 
-# Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
-# of the expansion on three samples at 10 to 10 000 photons. The next two values were chosen in the same way.
+# Standard deviation, in pixels, of the smoothing of the counts around which the likelihood is expanded. Chosen from 1,
+# 1.5, 2 and 3 by the error of the expansion on three samples at 10 to 10 000 photons. The next two values were chosen
+# in the same way.
 _SIGMA, _SPREAD = 1.5, 2.0
-_DETAIL = 1.5  # variance divided by that of counting; a larger ratio means detail of the sample
-_FEWEST = 0.25  # photons; smallest expected number for a ray
+# variance of the counts, divided by the variance of counting noise; a larger ratio means detail of the sample
+_DETAIL = 1.5
+_FEWEST = 0.25  # smallest expected number of photons of a ray
 
 
 @dataclass(frozen=True)
 class Photons:
-    """How a detector counts photons, see `photon_transfer`.
+    """Gain and noise of a detector that counts photons, see `photon_transfer`.
 
     Attributes:
         gain: camera gain, counts per photon.
@@ -54,8 +57,8 @@ class Counts:
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: camera gain, counts per photon, see `photon_transfer`.
-        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. It comes from the readout and
-            from photons that carry no information about the sample.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. Its causes are the readout,
+            and photons that carry no information about the sample.
     """
 
     counts: ArrayLike
@@ -89,7 +92,8 @@ class Counts:
     def photons(self, view: int) -> tuple[F64, F64, F64]:
         """Three images [row, col] of a projection: photons counted plus v, photons without the sample plus v, and v.
 
-        Pixels whose flat is not above the dark have 0 photons without the sample. NaN counts stay NaN.
+        If the flat of a pixel is not above its dark, its photons without the sample are 0. Counts that are NaN stay
+        NaN.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)
@@ -101,41 +105,43 @@ class Counts:
 
 
 def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
-    """Line integrals and weights whose weighted squares equal the likelihood to second order, for each pixel.
+    """Line integrals and weights for each pixel. Their weighted squares equal the likelihood to second order.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
-    is Σ λ - n ln λ. At p0 its gradient equals that of ½ w (p - p~)², and the curvature of this square is Fisher's
-    information. p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh
-    & Nelder 1989, section 2.5). Zero counts need no special treatment.
+    is Σ λ - n ln λ. At p0 the gradient of this function equals the gradient of ½ w (p - p~)², and the curvature of that
+    square is Fisher's information. p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least
+    squares: McCullagh & Nelder 1989, section 2.5). Counts of zero need no special treatment.
     """
     seen = beam * np.exp(-around)
     return around - (photons - seen) / seen, seen * seen / (seen + extra)
 
 
 def line_integrals(counts: Counts) -> tuple[F32, F32]:
-    """Line integrals and weights [view, row, col] with which any method uses the likelihood of the counts.
+    """Line integrals and weights [view, row, col]. With them, every method uses the likelihood of the counts.
 
-    Each projection is expanded around its own counts, smoothed in places that show only counting noise (Lee 1980, IEEE
-    Trans. Pattern Anal. Mach. Intell. 2, 165). With many counts the result is the logarithm. The weights are the
-    inverse variances of the line integrals, from the smoothed counts. Pixels that are not finite or have no beam get
-    NaN and weight 0.
+    The likelihood of a projection is expanded around its counts, which are smoothed where they show only counting noise
+    (Lee 1980, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). If the counts are large, the result is the logarithm.
+    The weights are the inverse variances of the line integrals, computed from the smoothed counts. Pixels that are not
+    finite or have no beam get NaN and weight 0.
     """
     shape = np.shape(counts.counts)
     data, weights = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for view in range(shape[0]):
         data[view], weights[view] = of_view(*counts.photons(view))
     if not weights.any():
-        raise ValueError("nothing can be reconstructed: no pixel has both beam in the flat and a finite count")
+        raise ValueError(
+            "nothing can be reconstructed: expected at least one pixel with a finite count and with beam in the flat"
+        )
     return data, weights
 
 
 def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """`line_integrals` of one projection [row, col], from the images of `Counts.photons`."""
+    """Line integrals and weights of one projection [row, col], from the images of `Counts.photons`."""
     good = np.isfinite(photons) & (beam > 0)
     open_beam = np.where(good, beam, 1.0)
     level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
     p, _ = expanded(np.where(good, photons, level), open_beam, extra, -np.log(level / open_beam))
-    # Weights that follow each ray's own noise would hide this noise from methods that whiten with them.
+    # Weights that follow the noise of a single ray would hide this noise from methods that whiten with the weights.
     _, w = expanded(smooth, open_beam, extra, -np.log(smooth / open_beam))
     return np.where(good, p, np.nan), np.where(good, w, 0)
 
@@ -145,11 +151,11 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
 
     The variance of the counts grows with their mean, with slope `gain` (photon transfer: Janesick 2007). Differences of
     successive frames, scaled to equal means, contain no fixed pattern and no drift of the beam. Medians over the pixels
-    are not affected by defects. Blur after the photons are counted (scintillator afterglow, resampling) lowers the
-    variance; then the gain is too small and the number of photons too large.
+    are not affected by defects. If the image is blurred after the photons are counted (scintillator afterglow,
+    resampling), the variance is lower. The gain is then too small, and the number of photons too large.
 
     Args:
-        darks: dark frames; None: the detector gives 0 without beam and adds no noise.
+        darks: dark frames. None: the detector is assumed to give 0 without beam, and to add no noise.
 
     Raises:
         ValueError: there are fewer than two frames, or the variance of the flats does not grow with the intensity.
@@ -172,7 +178,8 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
 
 
 def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """Photons expected in each pixel [row, col], above 0: counts, smoothed where they show no detail, or everywhere."""
+    """Photons expected in each pixel [row, col], above 0. They are the counts, smoothed everywhere or only where they
+    show no detail."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
     left = 1 - 0.75 / (np.pi * _SIGMA**2)  # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
     variance = _smooth((n - mean) ** 2, _SPREAD) / left

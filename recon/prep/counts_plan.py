@@ -1,4 +1,5 @@
-"""CorrectionPlan: converts the counts of one scan to line integrals with its darks and flats; made by `survey`."""
+"""CorrectionPlan: converts the counts of one scan to line integrals, with its darks and flats. `survey` makes the
+plan."""
 
 from __future__ import annotations
 
@@ -40,16 +41,18 @@ class CorrectionSettings:
     """Settings of the correction from counts to line integrals.
 
     Attributes:
-        floor: lowest transmission. For lower values, also zero and negative ones, the line integral is -log(floor).
-        hot_threshold: a pixel is masked if its dark, or its response to the beam, differs from its neighbours by more
-            than this many robust standard deviations; inf: no pixel is masked.
-        zinger_threshold: a pixel counts as a zinger if it is brighter by this many standard deviations than its
-            surroundings and than the neighbouring projections, see `recon.prep.spots.spots`; inf: no zinger is removed.
+        floor: lowest transmission. A lower transmission (also zero or a negative one) is replaced by the floor, so its
+            line integral is -log(floor).
+        hot_threshold: limit in robust standard deviations. A pixel is masked if its dark, or its response to the beam,
+            differs from its neighbours by more. inf: no pixel is masked.
+        zinger_threshold: limit in standard deviations. A pixel counts as a zinger if it is brighter by this than its
+            surroundings and than the same pixel in the neighbouring projections, see `recon.prep.spots.spots`. inf: no
+            zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
-            Each projection is divided by the level of these columns. If both sides have such columns, it is divided
-            by a straight line between the levels of the left and the right side.
-        sample_from: limit of the line integral at the edges of the detector. Above it, "auto" decides that the edges
-            show sample and not air, see `references.edge_depth`.
+            Each projection is divided by the level of its air columns. If both sides have air columns, the projection
+            is divided by a straight line between the levels of the left and the right side.
+        sample_from: limit of the line integral at the edges of the detector. If the line integral is larger, "auto"
+            assumes that the edges show the sample and not air, see `references.edge_depth`.
     """
 
     floor: float = 1e-4
@@ -71,28 +74,31 @@ class CorrectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class CorrectionPlan:
-    """Everything that is needed to convert the counts of one scan to line integrals: `survey` makes it, `apply` uses
-    it.
+    """All that is needed to convert the counts of one scan to line integrals. `survey` makes this plan, and `apply`
+    uses it.
 
-    Projections come in the order they were taken, in batches of any size. A projection depends on the flats and darks,
-    on the air columns found in all projections surveyed so far, and on its two neighbours. So the newest projection
-    waits for the next one. With the same flats, darks and air columns, the line integrals are bit-identical for any
-    split into batches.
+    Give the projections in the order in which they were taken, in batches of any size. The result for a projection
+    depends on four things: the flats, the darks, the air columns found in all projections so far, and its two
+    neighbours. Because of the neighbours, the newest projection waits for the next one. If flats, darks and air columns
+    are the same, the line integrals are bit-identical for any split into batches.
 
     Attributes:
         settings: settings of the correction.
         dark: float32 [row, col].
-        flats: (position, float32 [row, col]) of each group of flats, in order, minus the dark; 1 in masked pixels.
+        flats: (position, float32 [row, col]) of each group of flats, in order. The images are flat minus dark, with 1
+            in masked pixels.
         part_starts, dynamic: as in `References`.
         masked: bool [row, col], pixels that are filled in every projection.
         hidden: bool [row, col], `masks.areas` of `masked`.
         filling: order in which masked pixels are filled, see `masks.plan_fill`.
         photons: how photons are counted; the line integrals and weights then represent the likelihood, see
             `counts.line_integrals`. None: line integrals are logarithms.
-        foreign: bool [row], rows in which dark pixels are not the sample, see `unmeasured`; None: no such rows.
+        foreign: bool [row], rows in which dark pixels do not show the sample, see `unmeasured`. None: there are no such
+            rows.
         light: float64 [frame of the scan], factor on the intensity of each projection; None: 1 for all.
         spots: state of the zinger filter after the projections so far.
-        profiles: `edge_profiles` of the projections so far, by batch, with their numbers int64 [view].
+        profiles: for each batch of projections so far, the `edge_profiles` and the numbers int64 [view] of its
+            projections.
     """
 
     settings: CorrectionSettings
@@ -111,7 +117,7 @@ class CorrectionPlan:
 
     @cached_property
     def air_columns(self) -> tuple[int, int]:
-        """(left, right) number of air columns, from the projections surveyed so far; (0, 0) if there are none."""
+        """(left, right) number of air columns, found from the projections so far; (0, 0) if there are none."""
         air = self.settings.air
         if air != "auto":
             return (0, 0) if air == "none" else air
@@ -184,7 +190,7 @@ class CorrectionPlan:
         return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
 
     def surveyed(self, views: Transmission) -> CorrectionPlan:
-        """The plan after these projections were also used in the search for air columns."""
+        """The plan after the search for air columns has also used these projections."""
         if self.settings.air != "auto":
             return self
         return replace(self, profiles=(*self.profiles, (edge_profiles(views.data), views.view_ids)))
@@ -196,14 +202,14 @@ class CorrectionPlan:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Projections, CorrectionPlan]:
-        """Line integrals of the waiting projection and of these, and the plan for those that follow.
+        """Line integrals of the waiting projection and of the given ones, and the plan for the projections that follow.
 
         Args:
             views: the next projections; their memory is reused for the result. None: the waiting projection was the
                 last one.
-            last: True if no projection comes after these; otherwise the newest one waits.
-            progress: function called with the number of projections whose zingers are removed; the logarithm that
-                follows takes little time.
+            last: True if no projection comes after these. False: the newest projection waits.
+            progress: function called with the number of projections whose zingers are removed. (The logarithm, which
+                follows, takes little time.)
             order: order of neighbours, see `SpotFilter.feed`.
 
         Raises:
@@ -240,7 +246,8 @@ class CorrectionPlan:
         return replace(views, air=level.mean(axis=1), beam=beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
-        """Replace the transmission of a projection by line integrals, and the photons of its beam by weights."""
+        """Replace the transmission of a projection by line integrals, and the number of photons in its beam by
+        weights."""
         assert self.photons is not None
         open_beam = beam.astype(np.float64)
         extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
@@ -263,7 +270,8 @@ def survey(
     Args:
         references: darks and flats of the same detector area as the projections.
         masked: bool [row, col], pixels to fill; None: `dead_pixels` of the darks and flats.
-        standing: bool [row, col], further pixels to fill, in the shadow of a fixed object; None: none.
+        standing: bool [row, col], further pixels to fill, which are in the shadow of a fixed object; None: there are
+            none.
         photons, foreign, light: those of the plan.
 
     Raises:

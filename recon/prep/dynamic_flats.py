@@ -1,4 +1,5 @@
-"""Dynamic flats: the components of the changes of the beam between flats, and their weights in each projection.
+"""Dynamic flats: the beam changes from flat to flat. This module finds the components of these changes, and their
+weights in each projection.
 
 After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975. The components are
 principal components of the flats; parallel analysis gives their number. The weights of a projection minimise the total
@@ -20,12 +21,12 @@ from recon.base.arrays import F32, F64
 
 _FEWEST = 4  # flats
 _MOST = 10  # components
-_RANDOM = 10  # random draws of the parallel analysis
-_SAMPLED = 1 << 16  # pixels used for the components, and for the weights of a projection
+_RANDOM = 10  # number of random draws of the parallel analysis
+_SAMPLED = 1 << 16  # number of pixels used for the components, and for the weights of a projection
 _APART = 4  # distance in pixels for differences; the beam changes more slowly than noise
-_ROUNDS = 20  # rounds of reweighting
-_SMOOTHED = 5  # pixels per side, smoothed to detect air
-# percentile of the line integrals that is air; range of line integrals and least share of air
+_ROUNDS = 20  # number of rounds of reweighting
+_SMOOTHED = 5  # pixels per side of the smoothing that is used to detect air
+# percentile of the line integrals that shows air; range of line integrals in air, and smallest share of air
 _LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1
 _MOST_LEFT = 3.0  # multiple of the noise; with material, the residual is larger
 _DARKEST = 0.05  # share of the median flat; darker pixels are not used
@@ -49,13 +50,13 @@ class DynamicFlats:
         return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """The flat [row, col] (minus dark) for this projection, with the level of the mean flat."""
+        """The flat [row, col] (minus dark) for this projection. Its level is that of the mean flat."""
         w = self.weights_of(view, floor)
         return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """Weights [part] with which the line integrals of this projection vary least between pixels (absolute values).
-        If some pixels turn out to be air, a least-squares fit on these pixels follows.
+        """Weights [component] of this projection. With these weights, the sum of absolute differences of line integrals
+        between pixels is smallest. If some pixels turn out to be air, a least-squares fit on these pixels follows.
 
         Args:
             view: float32 [row, col], counts minus dark.
@@ -81,7 +82,8 @@ class DynamicFlats:
         return self._by_air(w, integral, known).astype(np.float32)
 
     def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
-        """The weights from the pixels in air; `w` if there are few of them or they do not fit."""
+        """The weights fitted on the pixels in air; `w` if there are too few such pixels, or if they do not match the
+        fit."""
         weights: NDArray[Any] = w
         for _ in range(2):
             residual = integral + np.tensordot(weights, self.components, axes=1)
@@ -156,7 +158,8 @@ def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
 
 
 def _components(samples: F64, rng: np.random.Generator) -> F64:
-    """Shares [component, flat] of the flats in each component that is above noise (Horn's parallel analysis)."""
+    """Coefficient [component, flat] of each flat, for the components that are above noise (Horn's parallel
+    analysis)."""
     values, vectors = np.linalg.eigh(samples @ samples.T)
     deviation = samples.std(axis=0, ddof=1)
     drawn = []

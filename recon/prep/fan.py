@@ -13,7 +13,8 @@ _COLS = 256  # with more columns, they are binned
 
 
 def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tuple[float, float, float, float]:
-    """How much the two measurements of each ray (from both sides) disagree, for the stated fan and for the best one.
+    """How much the two measurements of each ray (one from each side) disagree: for the stated fan angle, and for the
+    best one.
 
     The ray at γ in the projection at β is the ray at -γ in the projection at β + π - 2γ, with tan γ = slope x columns
     from the axis.

@@ -15,16 +15,16 @@ from recon.prep.projections import Projections
 from recon.prep.spots import SpotFilter, Transmission
 from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
-_NOISY = 0.01  # least share of a projection's line integrals that are below 0 if air contains noise
+_NOISY = 0.01  # if air contains noise, at least this share of the line integrals of a projection is below 0
 _DEEPEST = 60.0  # line integral; e^-60 is practically no intensity, and e^60 squared is still a finite number
 
 
 @dataclass(frozen=True, eq=False)
 class LinesPlan:
-    """The plan for projections that are already line integrals; it is used like a `CorrectionPlan`.
+    """The plan for projections that are already line integrals. It has the same functions as a `CorrectionPlan`.
 
     Zingers and pixels that are not finite or contain no data are filled. Air columns are not used. Only pixels without
-    data in all projections are masked. If air is 0 without noise, exact zeros at the corners count as measured.
+    data in all projections are masked. If air is exactly 0, without noise, zeros at the corners count as measured.
 
     Attributes:
         spots, foreign: as in `CorrectionPlan`.
@@ -49,7 +49,8 @@ class LinesPlan:
         view_ids: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
-        """The line integrals; a pixel without data, or not finite, gets the value of the nearest pixel with data."""
+        """The line integrals. A pixel without data, or with a value that is not finite, gets the value of the nearest
+        pixel with data."""
         data = lines.astype(np.float32, copy=False)
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
@@ -68,7 +69,7 @@ class LinesPlan:
         return Transmission(data, view_ids, repaired, ones, None, np.concatenate(runs), bad.min(axis=0, initial=True))
 
     def surveyed(self, views: Transmission) -> LinesPlan:
-        """The plan that masks only pixels without data in these projections, too."""
+        """The plan after these projections: a pixel stays masked only if it has no data in these projections either."""
         return self if views.unseen is None else replace(self, masked=self.masked & views.unseen)
 
     def line_integrals(
@@ -78,7 +79,7 @@ class LinesPlan:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Projections, LinesPlan]:
-        """As in `CorrectionPlan`."""
+        """The same as in `CorrectionPlan`."""
         views, spots = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(

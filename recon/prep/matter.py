@@ -46,7 +46,7 @@ KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
         "water": (1.0, {"H2O": 1}),
         "air": (1.205e-3, {"C": 0.000124, "N": 0.755267, "O": 0.231781, "Ar": 0.012827}),
         "PVDF": (1.78, {"C2H2F2": 1}),
-        # Polypropylene with 41 % of pores full of electrolyte.
+        # Polypropylene with 41 % of pores, which are filled with electrolyte.
         "separator": (1.064, {"C3H6": 590 * 0.90, **{salt: 0.41 * mass for salt, mass in _LP30.items()}}),
     }
 )
@@ -59,7 +59,8 @@ HEAVIEST = 92  # atomic number of the heaviest element, uranium
 
 @dataclass(frozen=True)
 class TabulatedEdge:
-    """An absorption edge of a free atom; `energy` in keV. In compounds the edge is a few electronvolts higher."""
+    """An absorption edge of a free atom, with its `energy` in keV. In compounds the edge is a few electronvolts
+    higher."""
 
     element: str
     shell: str
@@ -85,7 +86,7 @@ def edges_of(elements: Iterable[int]) -> list[TabulatedEdge]:
 
 
 def delta_beta(name: str, energy_kev: float) -> float:
-    """Ratio of delta to beta of the refractive index 1 - delta + i beta; it does not depend on the density.
+    """Ratio of delta to beta of the refractive index 1 - delta + i beta. The ratio does not depend on the density.
 
     delta is computed from the electron density and the dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern
     X-ray Physics, equation 3.2); beta = mu wavelength / 4 pi.
@@ -120,9 +121,9 @@ def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float
     """Entrance dose in gray of photons of one energy: fluence x energy x mass energy absorption.
 
     The energies of photoelectrons and of Compton electrons count as absorbed. Fluorescence also counts as absorbed,
-    which makes the dose up to a quarter too high just above an edge. Inside the sample, the dose is lower because of
-    the attenuation in front. xraylib's own coefficient (CS_Energy) is not used, because for water at 20 keV it is 30 %
-    below NIST's.
+    which makes the dose up to a quarter too high just above an edge. Inside the sample the dose is lower, because the
+    material in front attenuates the beam. xraylib's own coefficient (CS_Energy) is not used, because for water at 20
+    keV it is 30 % below NIST's.
 
     Raises:
         ValueError: as for `delta_beta`, or the energy is outside 1 to 200 keV.
@@ -168,7 +169,7 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
 
 @cache  # takes half a second
 def _gauss_rule() -> tuple[F64, F64]:
-    """Gauss nodes from -1 to 1 and their weights."""
+    """Nodes and weights of Gauss quadrature from -1 to 1."""
     return np.polynomial.legendre.leggauss(_NODES)
 
 

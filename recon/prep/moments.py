@@ -12,15 +12,17 @@ from recon.base.arrays import F32, F64
 
 _ORDERS = 4  # moments up to this order are used for the angles; higher ones follow edges, rings and noise
 _BANDS = 16  # bands of rows whose moments are computed
-_MATTER = 0.2  # share of the fullest row or the densest column; with less material, moments are mostly noise
-_RIM = 0.05  # share of the densest column; below it is air
-_LEAST_ROWS = 8  # fewer rows give no profile along the axis; each half of the rows must give one, too
-_ROUNDING = 1e-6  # share of a band's mass; slightly above the effect of float32 rounding on a moment
+# a row or column with less material than this share of the fullest one is not used, because its moments are mostly
+# noise
+_MATTER = 0.2
+_RIM = 0.05  # columns below this share of the densest column count as air
+_LEAST_ROWS = 8  # fewer rows give no profile along the axis; each half of the rows must give a profile, too
+_ROUNDING = 1e-6  # share of the total absorption of a band; slightly above the effect of float32 rounding on a moment
 
 
 @dataclass(frozen=True, eq=False)
 class ViewMoments:
-    """Errors that moments show, with standard deviations; NaN if there are too few rows or projections.
+    """Errors of a scan that moments show, each with its standard deviation. NaN: there are too few rows or projections.
 
     Attributes:
         axis_col: column of the rotation axis.
@@ -51,7 +53,7 @@ def moments_of(views: Iterable[F32], angles: NDArray[np.floating], axis_col: flo
     Args:
         views: projections, float32 [row, col] each, read one after the other.
         angles: [view] in radians.
-        axis_col: column about which the moments for the angles are computed; they need the right axis.
+        axis_col: column about which the moments for the angles are computed. It must be the right axis.
     """
     turned: F64 = np.asarray(angles, np.float64)
     mass, bands = _sums(views)
@@ -76,7 +78,7 @@ def _sums(views: Iterable[F32]) -> tuple[F64, F64]:
 
 
 def _down(mass: F64) -> tuple[F64, float]:
-    """Rows by which each projection is lower than the mean of all, and the standard deviation.
+    """Rows by which the sample is lower in each projection than in the mean of all, and the standard deviation.
 
     The profile of total absorption along the axis moves with the sample. A weaker beam scales this profile and adds to
     it. Both halves of the rows must agree, because drift and beam hardening change the profile, too.
@@ -104,7 +106,8 @@ def _moved(mass: F64) -> tuple[F64, float]:
 
 
 def _centres(bands: F64, angles: F64) -> tuple[float, F64, float]:
-    """The column about which the centre of each band follows a sine curve, and the deviations of all bands from it."""
+    """The column about which the centre of mass of each band follows a sine curve, and the deviations of all bands from
+    their curves."""
     mass = bands.sum(axis=2)
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
     if len(angles) <= 3 or not bands.size or (mass <= 0).any() or np.linalg.matrix_rank(parts) < 3:
@@ -120,11 +123,11 @@ def _centres(bands: F64, angles: F64) -> tuple[float, F64, float]:
 
 
 def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
-    """Relative excess of the actual rotation over the stated one, and its standard deviation.
+    """Actual rotation divided by the stated rotation, minus 1, and the standard deviation of this value.
 
-    A small error of the axis is fitted together with it. For a sample that is nearly a body of revolution this is not
-    enough, because the effects of pixels and of the axis on its moments look like an error of the angles. So a second
-    fit uses all multiples of the angle up to the order, which are valid for any axis. The two fits must agree.
+    A small error of the axis is fitted at the same time. This is not enough for a sample that is nearly a body of
+    revolution, because the effects of pixels and of the axis on its moments look like an error of the angles. So a
+    second fit uses all multiples of the angle up to the order, which are valid for any axis. The two fits must agree.
     """
     if len(angles) <= 2 * _ORDERS + 1 or not bands.size:
         return np.nan, np.nan
@@ -168,7 +171,9 @@ def _fitted(bands: F64, places: F64, column: float, angles: F64, every: int) -> 
     if np.linalg.matrix_rank(total) < 2:
         return np.nan, np.nan
     sigma = float(np.sqrt(np.linalg.inv(total)[0, 0]))
-    if (count := rounding.size) > 2:  # jackknife over the bands, because bands disagree if the sample moves
+    if (
+        count := rounding.size
+    ) > 2:  # the error is a jackknife over the bands, because bands disagree if the sample moves
         without = np.linalg.solve(total - normal, (of_all - right)[..., None])[:, 0, 0]
         sigma = max(sigma, float(np.sqrt((count - 1) * without.var())))
     return float(np.linalg.solve(total, of_all)[0]), sigma

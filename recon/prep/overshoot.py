@@ -1,7 +1,7 @@
 """Overshoot: phase fringes, seen as line integrals below the air level next to the outer edges of the sample.
 
-Blur, noise and rays through voxels above zero leave the air next to an edge at the level of the air farther away, or
-above it. Phase contrast brings it below this level, and so does a sharpening filter.
+Blur, noise and a sample with positive densities do not lower the air next to an edge below the level of the air farther
+away. Phase contrast lowers it, and so does a sharpening filter.
 """
 
 from __future__ import annotations
@@ -14,21 +14,22 @@ from recon.base.arrays import F32, I64
 from recon.base.noise import deviation_between_neighbours
 from recon.base.views import spread
 
-# rows averaged on either side of the comparison; a can has the same edge in all rows, grains a different one in each
+# numbers of rows that are averaged; a can has the same edge in all rows, grains have a different edge in each row
 _LEVELS = 1, 4, 16
 MOST_VIEWS = 96  # largest number of projections examined
-_BLOCKS = 16  # groups of rows for each level
-_AVERAGED = 16  # neighbouring projections that are also averaged, because a can looks the same from all sides
-_AIR, _BESIDE = 6, 3  # columns of air that an edge needs; columns next to the edge in which the overshoot is searched
-# material begins at this multiple of the noise, and at this share of the largest line integral
+_BLOCKS = 16  # number of groups of rows for each level
+_AVERAGED = 16  # number of neighbouring projections that are averaged, too, because a can looks the same from all sides
+# number of columns of air that an edge needs; number of columns next to the edge in which the overshoot is searched
+_AIR, _BESIDE = 6, 3
+# material begins at this multiple of the noise and this share of the largest line integral
 _EDGE, _OF_DEEPEST = 6.0, 0.02
 _FEWEST = 6  # least number of edge positions
-# least significance in standard errors: from the agreement between positions, and from the noise of the air
+# smallest significance in standard errors, computed from the agreement between positions, and from the noise of the air
 _AGREE, _ERRORS = 2.0, 6.0
 SEARCH = "`recon --phase auto` searches for a filter that removes them."
 LEAST_SHARE = 0.01
-"""Share of the step at the edge; a smaller overshoot does not count. In 227 simulated scans without fringes, examined
-once after this value was set, the overshoot is at most 1.9 standard errors."""
+"""An overshoot below this share of the step at the edge does not count. After this value was set, 227 simulated scans
+without fringes were examined once: their overshoot is at most 1.9 standard errors."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Overshoot:
 
     Attributes:
         share: overshoot as a share of the step at the edge.
-        errors: overshoot in standard errors (from the noise of the air), if edges at different positions agree on it.
+        errors: overshoot in standard errors (from the noise of the air). 0 if edges at different positions disagree
+            about the overshoot.
     """
 
     share: float = 0.0
@@ -51,8 +53,8 @@ class Overshoot:
     def of(cls, views: F32) -> Overshoot:
         """The most significant overshoot in line integrals [view, row, col]; 0 if no edge is next to air.
 
-        Edges are searched in every second row and measured in the rows between. So noise (also a ring) cannot select
-        what is measured. Edges in the same column and rows count once.
+        Edges are searched in every second row and measured in the rows between. So noise, or a ring, cannot select
+        which pixels are measured. Edges in the same column and rows count once.
         """
         most, some = cls(), spread(np.arange(len(views)), MOST_VIEWS)
         for n in _LEVELS:
@@ -104,12 +106,13 @@ def _overshoot(halves: F32) -> Overshoot:
 
 
 def _edges(sought: F32, measured: F32, kind: int) -> tuple[F32, I64]:
-    """Line integrals [edge, column] outwards from the pixel inside each first edge, and the position of each edge.
+    """Line integrals [edge, column], from the pixel just inside each first edge outwards, and the position of each
+    edge.
 
     Args:
         sought: line integrals [view, row, col] in which edges are searched: the steepest step at the end of the air.
         measured: line integrals of other rows, which are returned.
-        kind: side and half of the rows, 0 to 3; it is a part of the position.
+        kind: number 0 to 3 for the side and the half of the rows. It is a part of the position.
     """
     sought = sought - sought[:, :, :_AIR].mean(axis=2, keepdims=True)
     threshold = _EDGE * deviation_between_neighbours(sought[:, :, :_AIR])

@@ -1,4 +1,5 @@
-"""Projections: line integrals with a record of what the correction changed; and how batches are joined."""
+"""Projections: line integrals, with a record of what the correction changed, and a function that joins batches of
+them."""
 
 from __future__ import annotations
 
@@ -19,18 +20,20 @@ class Projections:
     Attributes:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
-        floored: fraction of the live pixels whose transmission was below the smallest allowed one, and was set to it.
-        air: float32 [view], mean transmission of the air in each projection, by which it was divided; 1 without air
-            columns.
+        floored: fraction of the values of live pixels whose transmission was below the lowest allowed value, and was
+            set to this value.
+        air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by it.
+            1: there are no air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
-        air_columns: (left, right) number of columns in which `air` was measured; (0, 0): `air` was not measured.
+        air_columns: (left, right) number of columns in which `air` was measured. (0, 0): `air` was not measured.
         replaced: fraction of all values of live pixels that were zingers or not finite, and were filled from their
             neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
             masked pixels. None: photons were not counted.
-        unmeasured: int64 [run, 4], pixels without data in one projection, filled from their neighbours: number of the
-            projection, row, first column, column after the last.
-        spots_left: number of pixels of zingers that were too large to be filled, in these and all earlier projections.
+        unmeasured: int64 [run, 4], runs of pixels without data in one projection, which were filled from their
+            neighbours. The four numbers are the projection, the row, the first column, and the column after the last.
+        spots_left: number of pixels in zingers that were too large to be filled, in these projections and all earlier
+            ones.
     """
 
     data: NDArray[np.float32]
@@ -46,7 +49,8 @@ class Projections:
 
     @property
     def lit(self) -> Mask | None:
-        """bool [view, row, col] True for pixels with data; None: all (interpolated single lines count as data)."""
+        """bool [view, row, col], True for pixels with data. None: all pixels have data. (Interpolated single lines
+        count as data.)"""
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
         index_of = {int(view): number for number, view in enumerate(self.view_ids)}
         for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
@@ -60,13 +64,14 @@ class Projections:
 
 
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
-    """Join batches of projections. The list is emptied meanwhile, so that few projections are in memory twice.
+    """Join batches of projections. The function empties the list of batches as it goes, so that only few projections
+    are in memory twice.
 
     The air columns, the mask and `spots_left` are those of the last batch.
 
     Args:
-        data: the line integrals of all batches, if they are in one array already; those in the batches are then
-            ignored.
+        data: the line integrals of all batches, if they are already in one array. The line integrals in the batches are
+            then ignored.
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]

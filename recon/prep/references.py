@@ -34,9 +34,10 @@ class References:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.
         flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position is the number
             of the frame in the scan.
-        dynamic: how flats differ from each other; None: the flat of a projection is interpolated between groups.
-        part_starts: the first frame of each part of the scan, ascending. The flat of a projection comes from its own
-            part, or from the nearest group if its part has no flats.
+        dynamic: components of the differences between flats, from which the flat of each projection is computed. None:
+            the flat of a projection is interpolated between groups of flats.
+        part_starts: the first frame of each part of the scan, ascending. The flat of a projection is computed from the
+            flats of its own part. If its part has no flats, the nearest group of flats is used.
     """
 
     dark: Image
@@ -60,7 +61,7 @@ class References:
 
 
 def _mean(frames: Image, what: str, beam: float) -> Image:
-    """The mean of a stack, or a single image unchanged; NaN for pixels that are masked in all frames."""
+    """The mean of a stack; a single image is returned unchanged. Pixels that are masked in all frames are NaN."""
     if np.ndim(frames) != 3:
         return cast(Image, without_mask(frames))
     if not len(frames):
@@ -90,10 +91,10 @@ def check(references: References) -> None:
 
 
 def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
-    """The dark for an exposure time in s. It is linear in the exposure time, so that two darks determine all others.
+    """The dark for an exposure time in s. A dark is linear in the exposure time, so two darks determine all others.
 
     Args:
-        darks: (exposure time, image [row, col]), one or more, with different exposure times.
+        darks: one or more pairs (exposure time in s, image [row, col]) with different exposure times.
     """
     near = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
     (first, image), *others = near
@@ -104,7 +105,8 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
 
 
 def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Flat minus dark at a frame's position: interpolated between groups of its part, otherwise the nearest group."""
+    """Flat minus dark at the position of a frame: interpolated between the two groups of its part around the frame;
+    without two such groups, that of the nearest group."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
@@ -116,11 +118,13 @@ def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts:
     return groups[upper - 1][1] * (1 - weight) + groups[upper][1] * weight
 
 
-_DIM, _SURE = 0.05, 3.0  # share of the intensity that no projection reaches in a shadow; standard errors of its median
-SHADOW_REACH = 5  # rows and columns around a pixel, and its own row, decide whether it is in a shadow
-_WHOLE = 0.9  # share of the pixels of a row; noise makes some pixels bright
-_UNLIT = 0.01  # share of the intensity in the full beam; below it, a pixel is outside the beam
-_BRIGHT = 90.0  # percentile of a flat that is in the full beam
+# a pixel is in a shadow if no projection has this share of the intensity there; limit in standard errors of the median
+_DIM, _SURE = 0.05, 3.0
+# number of rows and columns around a pixel, and of columns in its own row, that decide whether it is in a shadow
+SHADOW_REACH = 5
+_WHOLE = 0.9  # share of the pixels of a row that must be dark, because noise makes some pixels bright
+_UNLIT = 0.01  # a pixel below this share of the intensity in the full beam is outside the beam
+_BRIGHT = 90.0  # percentile of a flat that shows the full beam
 
 
 def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0) -> Mask:
@@ -138,7 +142,7 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
             f"the flats show no beam, or darks and flats are exchanged: {dead.mean():.0%} of the pixels have flat <= "
             f"dark (median flat {np.median(flats[0]):.4g}, median dark {np.median(dark):.4g})"
         )
-    # Behind a slit, both flat and projection are noise, and their ratio has no meaning.
+    # Behind a slit, flat and projection contain only noise, and their ratio has no meaning.
     dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], _BRIGHT) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
@@ -147,7 +151,8 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
         difference = filled - ndimage.median_filter(filled, 3, mode="nearest")
         return np.abs(difference) > hot_threshold * max(median_deviation(difference), least)
 
-    # Smaller deviations (dark below 1 % of the beam, response below 10 %) are corrected by the division.
+    # Smaller deviations (of the dark, below 1 % of the beam; of the response, below 10 %) are corrected by the division
+    # by the flat.
     hot = outliers(dark, 1e-3 * float(response))
     for net in nets:
         filled = np.where(dead, response, net)
@@ -156,12 +161,13 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
 
 
 def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
-    """Mask [row, col] of areas with beam in the flats but in no projection: a part of the instrument is in the beam.
+    """Mask [row, col] of areas that have beam in the flats but in no projection, because a part of the instrument is in
+    the beam.
 
-    Only runs of dark pixels from an edge of their row count, and rows that are completely dark. An opaque rod on the
-    rotation axis darkens the middle, so it does not count. Opaque material that covers an edge in all projections
-    counts, because its line integrals cannot be measured anyway. The blurred edge of the area is included, see
-    `with_rim`.
+    Only runs of dark pixels from an edge of their row count, and rows that are completely dark. So an opaque rod on the
+    rotation axis, which darkens the middle, does not count. Opaque material that covers an edge in all projections
+    counts as a shadow, because its line integrals cannot be measured anyway. The blurred edge of the area is included,
+    see `with_rim`.
 
     Args:
         light: float32 [view, row, col], transmission of at least three projections from all directions.
@@ -171,9 +177,9 @@ def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     middle = np.median(transmission, axis=0)
     spread = np.median(np.abs(transmission - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    bright = np.partition(transmission, n - 2, axis=0)[n - 2]  # one projection may have a zinger
+    bright = np.partition(transmission, n - 2, axis=0)[n - 2]  # a single projection may have a zinger
     dark &= bright < _DIM
-    whole = dark.mean(axis=1) > _WHOLE  # a row that the camera does not read has no blurred edge
+    whole = dark.mean(axis=1) > _WHOLE  # rows that the camera does not read have no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
@@ -181,14 +187,16 @@ def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     return with_rim(found, bright) | whole[:, None]
 
 
-_NEXT, _OUTER = 5, 3  # projections next to flats; columns
-# rise of the line integral from the edge to an eighth of the width; about the smallest that a beam background has
+_NEXT, _OUTER = 5, 3  # number of projections next to flats; number of columns
+# rise of the line integral from the edge to an eighth of the width; about the smallest rise that a beam background
+# causes
 _RISE = 0.005
 _BANDS = 8  # largest number of bands of rows
 
 
 def edge_profiles(transmission: F32) -> F32:
-    """Input of `air_columns` from transmissions [view, row, col]: medians [view, side, band of rows, col from edge]."""
+    """Input of `air_columns`, computed from transmissions [view, row, col]: medians [view, side, band of rows, column
+    from the edge]."""
     _, rows, cols = transmission.shape
     bands = [b for b in np.array_split(np.arange(rows), min(rows, _BANDS)) if b.size]
     widest = max(cols // 8, 1)
@@ -200,13 +208,13 @@ def edge_profiles(transmission: F32) -> F32:
 
 
 def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int, int]:
-    """Number of columns at the left and right edge that show air in all projections; (0, 0) if none do.
+    """Number of columns at the left and at the right edge that show air in all projections; (0, 0) if there are none.
 
-    Air columns are nowhere darker than the outermost columns by more than the tolerance (or the noise, if larger). This
-    must hold in every projection, over the whole height. A sample that fills the field of view is thinnest at the edge.
-    So a trend towards darker columns is the sample, and a slow trend towards brighter columns is the beam. A side with
-    fewer than 4 % of the columns, or darker than the other side by more than 10 %, counts as 0. `profiles` are the
-    `edge_profiles` of all projections.
+    A column counts as air if it is nowhere darker than the outermost columns by more than the tolerance (or the noise,
+    if that is larger). This must be true in every projection, over the whole height. A sample that fills the field of
+    view is thinnest at the edge. So if columns become darker inwards, the cause is the sample; if they become slowly
+    brighter, the cause is the beam. A side counts as 0 if it has fewer than 4 % of the columns, or if it is darker than
+    the other side by more than 10 %. `profiles` are the `edge_profiles` of all projections.
     """
     least = max(3, cols // 25)
     counts, levels = [], []
@@ -214,7 +222,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
         noise = deviation_between_neighbours(relative)
-        # One projection in twenty may deviate, because noise has tails; the median over the columns tolerates it.
+        # One projection in twenty may deviate, because noise has tails. The median over the columns tolerates this.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)
         n = int(np.argmin(np.append(steady, False)))
@@ -227,12 +235,13 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
 
 
 def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[float], columns: tuple[int, int]) -> float:
-    """Line integral at edges that look like air but may show a sample wider than the field of view; 0: they are air.
+    """Line integral at edges that look like air but may show a sample wider than the field of view. 0: the edges show
+    air.
 
-    It is measured in the projections next to each group of flats, and the smallest value of all groups counts. The
-    reason: a beam drifts away from its flats, but a sample is there from the start. A sample is thinnest at the edges,
-    so the median line integrals rise from the edge inwards on all sides. If they do not rise, the beam is weaker than
-    in the flats.
+    The line integral is measured in the projections next to each group of flats, because near its flats the beam has
+    not drifted, whereas a sample is there from the start. The smallest value of all groups counts. A sample is thinnest
+    at the edges, so the median line integrals rise from the edge inwards on all sides. If they do not rise, the beam is
+    weaker than in the flats.
 
     Args:
         profiles: from `edge_profiles`; positions: [view], positions of the projections in the scan.
@@ -249,10 +258,11 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:
-    """Transmission of the air across each projection [view, col], from its air columns; 1 without air columns.
+    """Transmission of the air across each projection [view, col], computed from its air columns; 1 if there are no air
+    columns.
 
-    It is the line through the medians of both sides. The line is sloped if the beam moved or changed its shape since
-    the flat.
+    The transmission is the straight line through the medians of both sides. The line is sloped if the beam moved or
+    changed its shape since the flat.
     """
     views, _, cols = transmission.shape
     sides = [(side, at) for side, at in (

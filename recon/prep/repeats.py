@@ -1,4 +1,5 @@
-"""Repeats: two measurements of the same rays at different times show how the sample changed (any beam or width)."""
+"""Repeats: measures how the sample changed, from two measurements of the same rays at different times. The beam may be
+of any kind, and the sample of any width."""
 
 from __future__ import annotations
 
@@ -12,13 +13,17 @@ from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.views import spread
 
-# approximate number of columns after binning; least number of rows and of projections
+# approximate number of columns after binning; smallest number of rows, and of projections
 _COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12
-_SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation of the smoothing, and width left out at either edge
-# distance in pixels between two rays at the edge of the field; beyond the second value the difference is not linear
+_SMOOTH, _EDGE = 1.5, 2  # standard deviation of the smoothing, and width that is left out at each edge, in pixels
+# limits for the distance in pixels between two rays at the edge of the field of view; beyond the second value the
+# difference is not linear
 _EXACT, _LINEAR = 0.1, 2.3
-_LATER, _LONGEST = 3, 0.9  # a pair is at least a third of the scan apart; share of the longest time in a pair
-# largest number of projections for which pairs are searched; pairs; bands of rows, which are compared
+# the two projections of a pair are at least one part in _LATER of the scan apart, and at least this share of the
+# longest time in any pair
+_LATER, _LONGEST = 3, 0.9
+# largest number of projections for which pairs are searched; number of pairs; number of bands of rows, which are
+# compared
 _FIRSTS, _PAIRS, _BANDS = 512, 8, 4
 # number of pixels with common errors: those that the Gaussian smoothing joins, twice
 _CORRELATED = 2 * 4 * np.pi * _SMOOTH**2
@@ -26,20 +31,21 @@ _NOISY = 0.1  # ratio of noise to structure above which nothing is reported
 
 
 def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int], float, F64, F64]]:
-    """How the sample changes between projections of the same rays: 180° apart and mirrored (parallel), or 360° apart.
+    """How the sample changes between projections of the same rays, which are 360° apart, or in a parallel beam 180°
+    apart and mirrored.
 
-    The difference of two projections is fitted with the effects of small changes: shifts, a small rotation, a change of
-    absorption, of the air level, and of both sizes. The sample may be wider than the field of view, because both
-    projections see the same rays. The uncertainty comes from the disagreement between bands of rows and from the
-    unexplained rest.
+    The effects of small changes are fitted to the difference of two projections: shifts, a small rotation, and changes
+    of the absorption, of the air level and of the size along both directions. The sample may be wider than the field of
+    view, because both projections see the same rays. The uncertainty comes from the disagreement between bands of rows
+    and from the unexplained rest.
 
     Args:
         data: line integrals [view, row, col], in the order of time.
 
     Yields:
-        The first of the examined pairs; the mean time within a pair, as a share of the scan; and the change in that
-        time and its standard deviation, float64 [4] each. The four changes are: rows by which the sample sinks, and
-        shares by which its line integrals, its size across the axis and its size along the axis grow.
+        The first pair of those examined; the mean time within a pair, as a share of the scan; the change in that time
+        and its standard deviation, float64 [4] each. The four changes are the rows by which the sample sinks, and the
+        shares by which three values grow: its line integrals, its size across the axis, and its size along the axis.
     """
     side = -(-data.shape[2] // _COLUMNS)
     if len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS * side:
@@ -50,7 +56,7 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
         normal, right, squares, structure, sizes = (np.stack(each) for each in zip(*sums, strict=True))
         total, of_all = normal.sum(axis=0), right.sum(axis=0)
         too_noisy = noise**2 / (2 * np.pi * _SMOOTH**2) * sizes.sum() > _NOISY**2 * structure.sum()
-        # a single band may contain all the information
+        # a single band of rows may contain all the information
         if too_noisy or np.linalg.matrix_rank(total - normal).min() < len(total):
             continue
         shares = np.linalg.solve(total, of_all)

@@ -2,7 +2,7 @@
 
 Positions are in pixels of the whole detector, 0 at the centre of the first one. The value of a pixel (col, row) of the
 new projection is read at a position on the detector. To find this position, (col, row) is first rotated about the
-detector's middle and then displaced by the lens.
+detector's middle, and then displaced as the lens displaces it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _TAPS = 6  # taps: number of pixels along each axis from which a new pixel is interpolated
-_BEFORE = _TAPS // 2 - 1  # taps before a position
-_PHASES = 4096  # positions within a pixel at which weights are tabulated
-_LOOKED_AT = 65  # positions along each side at which the largest displacement is measured
+_BEFORE = _TAPS // 2 - 1  # number of taps before a position
+_PHASES = 4096  # number of positions within a pixel at which weights are tabulated
+_LOOKED_AT = 65  # number of positions along each side at which the largest displacement is measured
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How projections are resampled: in one step, by cubic convolution over six pixels.
+    """Resamples projections in one step, by cubic convolution over six pixels.
 
     Attributes:
         shape: (rows, cols) of the whole detector.
         tilt: tilt of the rotation axis in the detector's plane in radians: the column of the axis grows by tan(tilt)
-            per row. A `Geometry` calls this tilt roll; the tilt of a `Geometry` is the one along the beam.
+            per row. `Geometry` calls this tilt `roll`; `Geometry.tilt` is the tilt along the beam.
         distortion: distortion of the lens; None: no distortion.
         binning: each pixel of the projections is the mean of binning x binning pixels.
     """
@@ -87,7 +87,7 @@ class Resampling:
 
     @property
     def reach(self) -> int:
-        """Largest distance, in binned rows, of the rows from which a new row is interpolated."""
+        """Number of binned rows on each side from which a new row is interpolated, at most."""
         rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
         seen = self._seen_at(*np.meshgrid(cols, rows))[1]
         return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2
@@ -95,7 +95,7 @@ class Resampling:
     def apply(self, views: F32, first: int) -> None:
         """Resample projections [view, row, col] in place.
 
-        Pixels beyond the given rows and columns take the value of the nearest one.
+        Pixels beyond the given rows and columns take the value of the nearest given pixel.
 
         Args:
             first: detector row of the first row of the projections.
@@ -106,7 +106,7 @@ class Resampling:
             _resample(view.copy(), *_split(rows), *_split(cols), table, view)
 
     def nearest(self, image: NDArray[Any], first: int) -> NDArray[Any]:
-        """An image [row, col] resampled without interpolation, for masks."""
+        """An image [row, col] resampled without interpolation. It is meant for masks."""
         rows, cols = self._places(image.shape, first)
         row, col = (
             np.clip(np.rint(at), 0, n - 1).astype(np.int64) for at, n in zip((rows, cols), image.shape, strict=True)
@@ -140,7 +140,7 @@ class Resampling:
 
 
 def _split(positions: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
-    """The whole pixels of a position, and the rest in units of 1 / number of phases."""
+    """The integer part of a position, and its fraction in units of 1 / number of phases."""
     steps = np.rint(positions * _PHASES)
     whole = np.floor(steps / _PHASES)
     return whole.astype(np.int32), (steps - whole * _PHASES).astype(np.int16)

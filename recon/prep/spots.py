@@ -1,4 +1,4 @@
-"""Spots (zingers): finds and fills pixels that a stray gamma or X-ray hit in a single projection."""
+"""Spots (zingers): finds and fills pixels that a stray gamma or X-ray photon hit in a single projection."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ from recon.base.jit import njit
 from recon.base.masks import Image, fill, plan_fill
 from recon.prep.unmeasured import DARK, NO_RUNS
 
-# smallest noise of √intensity, as a fraction of that of the open beam: 1 % of the intensity, for grain of the optics
+# smallest assumed noise of √intensity, as a fraction of √intensity of the open beam. It is 1 % of the intensity, for
+# the grain of the optics
 _LEAST = 0.005
 _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot in which the normal difference of the projections is measured
-# pixels (about; at least) from which the noise of a projection, and a change of its intensity, are measured
+# number of pixels (approximate; smallest) from which the noise of a projection, and a change of its intensity, are
+# measured
 _SAMPLE, _FEWEST = 600, 30
-# √intensity; if a projection is darker, it cannot show whether a gap is about to open in the sample
+# limit of √intensity; a darker projection cannot show whether a gap is about to open in the sample
 _OPAQUE = DARK**0.5
 _MEDIAN = MEDIAN * 2**0.5  # median of |x - y| for normal variables of standard deviation 1
 
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Projections divided by the flat, or given line integrals, before their spots are filled.
+    """Projections before their spots are filled: divided by the flat, or given as line integrals.
 
     Attributes:
         data: float32 [view, row, col], finite; `line_integrals` reuses its memory.
         view_ids: int64 [view].
-        repaired: int64 [view], number of pixels that were not finite or were a spot; filled from their neighbours.
-        air: float32 [view], transmission of the air by which each projection was divided; 1: not divided yet.
+        repaired: int64 [view], number of pixels that were not finite or part of a spot, and were filled from their
+            neighbours.
+        air: float32 [view], transmission of the air by which each projection was divided. 1: it was not divided yet.
         beam: float32 [view, row, col], number of photons without the sample; None: photons are not counted.
         unmeasured: int64 [run, 4], pixels without data, filled from their neighbours, see `runs_of`.
         unseen: bool [row, col], pixels that are not finite in any projection of this batch; None: not determined.
@@ -49,7 +52,7 @@ class Transmission:
     unseen: Mask | None = None
 
     def __getitem__(self, part: slice | NDArray[np.intp] | list[int]) -> Transmission:
-        """Some of the projections."""
+        """A part of the projections."""
         ids, beam = self.view_ids[part], None if self.beam is None else self.beam[part]
         runs = self.unmeasured[np.isin(self.unmeasured[:, 0], ids)]
         return Transmission(self.data[part], ids, self.repaired[part], self.air[part], beam, runs)
@@ -63,7 +66,8 @@ class Transmission:
 
 @dataclass(frozen=True, eq=False)
 class SpotFilter:
-    """Fills spots of projections, which come in batches of any size, by comparing neighbours in angle or time.
+    """Fills the spots of projections by comparing neighbours in angle or time. The projections may come in batches of
+    any size.
 
     The newest projection waits for the next one. The result is bit-identical for any split into batches.
 
@@ -88,14 +92,15 @@ class SpotFilter:
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Transmission, SpotFilter]:
-        """The waiting projection and these, with spots filled in place; and the filter for the projections that follow.
+        """The waiting projection and the given ones, with their spots filled in place; and the filter for the
+        projections that follow.
 
         Args:
             views: the next projections; None: the waiting projection was the last one.
-            last: True if no projection comes after these; otherwise the newest one waits.
-            progress: function called with the number of projections done, after each one.
-            order: [view], an order in which neighbours are adjacent; then all projections must be given, and none
-                waits. None: the neighbours are the projections before and after.
+            last: True if no projection comes after these. False: the newest projection waits. progress: function called
+                with the number of projections done, after each one.
+            order: [view], an order in which neighbours are adjacent. With an order, all projections must be given at
+                once, and none waits. None: the neighbours of a projection are the projections before and after it.
         """
         if self.waiting is not None:
             views = self.waiting[[0]] if views is None else self.waiting.and_then(views)
@@ -121,7 +126,7 @@ class SpotFilter:
 def without_spots(frames: Iterable[NDArray[Any]], intensity: float) -> Iterator[tuple[NDArray[Any], int]]:
     """Darks or flats [row, col] without their spots, and the number of filled pixels in each frame.
 
-    A spot is filled with the mean of the frames before and after. A single frame is not changed.
+    A spot is filled with the mean of the frames before and after. If there is only one frame, it is not changed.
 
     Args:
         intensity: counts in the open beam.
@@ -153,19 +158,19 @@ def spots(
     The second result is the number of pixels in spots that are too large.
 
     All images are √transmission, in which photon noise is uniform. A spot is at most three pixels wide along its row
-    and its column. The previous projection, whose spots are filled, must have nothing as bright within one pixel. This
-    tells spots from edges of the sample, which are longer, and from its gaps, which move from projection to projection.
-    A gap between opaque grains may open in a single projection. So if a neighbouring projection is opaque there, a spot
-    must be brighter than the open beam and than both neighbours. Such light may be part of a line, and the next
-    projection may have a spot there, too.
+    and its column. The previous projection, whose spots are filled, must have nothing as bright within one pixel. These
+    rules distinguish spots from edges of the sample, which are longer, and from gaps in it, which move from projection
+    to projection. A gap between opaque grains may open in a single projection. So if a neighbouring projection is
+    opaque there, a spot must be brighter than the open beam and than both neighbours. Such a bright pixel may be part
+    of a line, and the next projection may have a spot there, too.
 
     Args:
-        before, after: the projections before and after; None: there is none. If most of this projection is brighter
-            than both, its intensity has changed, and both are scaled to its brightness.
-        threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three
-            values: the noise between the pixels of this projection, the difference of both neighbours around the pixel
-            (because the sample turns), and 1 % of the intensity. A normal variable exceeds 8 standard deviations once
-            in 10¹⁵ pixels.
+        before, after: the projections before and after; None: there is no such projection. If most of the present
+            projection is brighter than both, its intensity has changed, and both are scaled to its brightness.
+        threshold: a spot is brighter by more than this many standard deviations of the noise. The noise is the largest
+            of three values: the noise between the pixels of this projection, the difference of both neighbours around
+            the pixel (because the sample turns), and 1 % of the intensity. A normal variable exceeds 8 standard
+            deviations once in 10¹⁵ pixels.
         still: True if there is no moving sample, as in darks and flats.
     """
     found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
@@ -182,10 +187,11 @@ def spots(
 
 @njit(nogil=True, cache=True)
 def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
-    """Two medians over some lit pixels: the difference from the next pixel, and the intensity divided by a neighbour's.
+    """Two medians over some pixels with beam: the difference from the next pixel, and the intensity divided by that of
+    a neighbouring projection.
 
-    The neighbour is the brighter one of `before` and `after`. The second median is 0 if no pixel is lit, or if the sum
-    of the intensity is not larger."""
+    The neighbouring projection is the brighter one of `before` and `after`. The second median is 0 if no pixel has
+    beam, or if the sum of the intensity is not larger than in the neighbour."""
     rows, cols = view.shape
     step = max(1, rows * cols // _SAMPLE)
     differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
@@ -226,7 +232,7 @@ def _mark(  # type: ignore[no-untyped-def]
             stray = intensity > brightest + limit
             if intensity <= before[r, c] + limit or (not stray and intensity <= after[r, c] + limit):
                 continue
-            along, down = -np.inf, -np.inf  # light that the brightest piece of its line must exceed to be a spot
+            along, down = -np.inf, -np.inf  # intensity that the brightest part of a line must exceed to be a spot
             for first in range(-_WIDEST, 1):
                 if c + first >= 0 and c + first + _WIDEST < cols:
                     along = max(along, view[r, c + first : c + first + _WIDEST + 1].min())

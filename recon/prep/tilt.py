@@ -17,11 +17,11 @@ from recon.prep.axis_wedge import FEWEST_BANDS, FEWEST_COLS, wedge_curves
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-STEEPEST = math.radians(5)  # largest tilt of the search, radians
-_DEEP = 0.2  # least difference in the logarithm of the mismatch between the found axes and typical ones
-_FLOOR = 1e-3  # least mismatch that counts
+STEEPEST = math.radians(5)  # largest tilt of the search, in radians
+_DEEP = 0.2  # smallest difference in the logarithm of the mismatch between the axes of the result and typical axes
+_FLOOR = 1e-3  # smaller mismatches are set to this value
 _SIGMAS = 1.4826  # ratio of standard deviation to median distance for normal errors
-_OWN = 6  # px; the axis of a single band is searched within this distance from the line
+_OWN = 6  # px; the axis of a single band is searched within this distance of the line
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class TiltEstimate:
     """Estimate of the in-plane tilt of the rotation axis.
 
     Attributes:
-        tilt: radians; the column of the axis grows by tan(tilt) per row (`Geometry` calls it roll).
+        tilt: radians; the column of the axis grows by tan(tilt) per row. (`Geometry` calls this tilt roll.)
         uncertainty: radians, one standard deviation.
         axis_col: column of the axis at height 0.
     """
@@ -40,21 +40,24 @@ class TiltEstimate:
 
 
 def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEstimate:
-    """The tilt, from the straight line through the axes of bands of rows with the smallest sum of log mismatches.
+    """The in-plane tilt of the rotation axis, measured from bands of rows. It is the slope of the straight line (column
+    of the axis against row) with the smallest sum of log mismatches of the bands.
 
-    The mismatch of a band with an axis comes from the double wedge. If that fails and the scan covers 360°, it comes
-    from opposite projections (see `recon.prep.align`). Its logarithm is the likelihood of a band with unknown noise. So
-    a band that fits badly with any axis, such as air or a clipped row, has little influence. The uncertainty has two
-    parts. One is the jackknife over bands, or over groups of neighbouring bands (which see the same sample) if that is
-    larger (Efron & Stein 1981, Ann. Stat. 9, 586). The other is the scatter of the bands' own axes about the line,
-    because the jackknife is too small if few bands determine the estimate.
+    The mismatch of a band with an axis comes from the double wedge. If the double wedge fails and the scan covers 360°,
+    the mismatch comes from opposite projections (see `recon.prep.align`). The logarithm of the mismatch is the
+    log-likelihood of a band with unknown noise. So a band that agrees badly with every axis, such as air or a clipped
+    row, has little influence. The uncertainty has two parts. One is the jackknife over bands, or over groups of
+    neighbouring bands (which see the same sample) if that is larger (Efron & Stein 1981, Ann. Stat. 9, 586). The other
+    is the scatter of the bands' own axes about the line, because the jackknife is too small if few bands determine the
+    estimate.
 
-    A tilt also rotates the projections, so that rows mix by tilt times half the width. The estimate is exact if that is
-    small. It is better on projections that were corrected with a first estimate.
+    A tilt also rotates the projections, so that rows mix by tilt times half the width. The estimate is exact if this
+    product is small. Otherwise, correct the projections with a first estimate, and measure again.
 
     Args:
         bands: [view, band, col], line integrals of thin bands of rows.
-        heights: [band], px from the row of `axis_col` to the middle of each band.
+        heights: [band], distance in px of the middle of each band from the row to which `axis_col` of the result
+            refers.
         angles: [view], radians.
 
     Raises:
@@ -78,7 +81,7 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
 
 
 def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
-    """The line through the axes of bands, from their mismatch [band, candidate], as in `find_tilt`.
+    """The line through the axes of the bands, as in `find_tilt`, from the mismatch [band, candidate].
 
     Raises:
         ValueError: there is no clear optimum.
@@ -133,17 +136,18 @@ def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64
 def roll_of_mean_view(mean: F64, axis_col: float) -> tuple[float, float]:
     """The in-plane tilt of the axis from the mean projection of a 360° scan, and its standard deviation.
 
-    The mean projection is that of a body of revolution, so its left and right halves are mirror images, in a cone and
-    in a parallel beam. A tilt rotates it, and a wrong axis shifts it. A detector that is not perpendicular to the beam,
-    or an intensity gradient, skews it. All of these effects are fitted to the difference of the halves. The standard
-    deviation is from the jackknife over bands of rows.
+    The mean projection is that of a body of revolution. So its left and right halves are mirror images, in a cone beam
+    and in a parallel beam. A tilt rotates the mean projection, and a wrong axis shifts it. A detector that is not
+    perpendicular to the beam, or an intensity gradient, skews it. All of these effects are fitted to the difference of
+    the halves. The standard deviation is from the jackknife over bands of rows.
 
     Args:
         mean: float64 [row, col], line integrals.
-        axis_col: column about which the halves are compared; it may be wrong by a pixel or two.
+        axis_col: column about which the halves are compared. It may be wrong by a pixel or two.
 
     Returns:
-        Radians, as `Geometry.roll`; NaN if the field of view does not contain both halves.
+        The tilt in radians, as `Geometry.roll`, and its standard deviation. NaN if the field of view does not contain
+        both halves.
     """
     rows, cols = mean.shape
     reach = int(min(axis_col, cols - 1 - axis_col))

@@ -1,10 +1,11 @@
-"""Pixels without data: finds the pixels of a projection that measured nothing, as opposed to a dark sample.
+"""Pixels without data: finds the pixels of a projection that contain no data, and distinguishes them from a dark
+sample.
 
-There are three kinds: pixels that are not finite; pixels that a shift or rotation of the image moved in, which have one
-value and include a corner of the frame; and an opaque object that is not the sample, such as the post of a load frame,
-and that reaches a border. Metal in the sample is equally dark, but it stays within the field of view. So each row shows
-it in all projections, or has the same total absorption in projections along it. A post comes and goes, and adds
-absorption.
+There are three kinds. (1) Pixels that are not finite. (2) Pixels at the border of an image that was shifted or rotated;
+they have a single value and include a corner of the frame. (3) An opaque object that is not the sample and reaches a
+border, such as the post of a load frame. Metal in the sample is equally dark, but the metal stays within the field of
+view: a row shows the metal in all projections, or the total absorption stays the same when the metal becomes dark. A
+post comes and goes, and adds absorption.
 """
 
 from __future__ import annotations
@@ -22,24 +23,26 @@ NO_RUNS = np.zeros((0, 4), np.int64)
 NO_RUNS.flags.writeable = False
 DARK = 0.01  # transmission below which a pixel counts as dark
 _BLOCK = np.ones((3, 3), np.bool_)
-# largest reach of interpolation or blur next to an area, in pixels; pixels beyond it for comparison
+# number of pixels next to an area that interpolation or blur may change; number of pixels beyond them, for comparison
 _RIM, _BEYOND = 4, 3
-# a rim differs from the pixels beyond it by this share of the intensity and this many standard errors
+# a rim differs from the pixels beyond it by at least this share of the intensity, and this many standard errors
 _ALTERED, _SURE = 0.02, 3.0
-_FEWEST = 3  # fewest dark pixels, at a border and in an area
-_ONE_VALUE = 0.9  # share of the pixels of an area that must be dark, and must have one value if they are not noise
-_BELOW = 3.0  # standard deviations below the dark; no camera gives such values
-_CLEARLY = 0.5  # share of the changing absorption that may remain without the post
+_FEWEST = 3  # smallest number of dark pixels, at a border and in an area
+# share of the pixels of an area that must be dark; share that must have a single value, if they are not noise
+_ONE_VALUE = 0.9
+_BELOW = 3.0  # standard deviations below the dark; no camera gives such low values
+_CLEARLY = 0.5  # share of the change of the absorption that may remain without the post
 
 
 def unmeasured(values: NDArray[np.generic], intensity: F32, hidden: Mask, foreign: Mask | None) -> Mask | None:
-    """Mask [row, col] of the pixels of a projection without data; None: no pixel, or all pixels.
+    """Mask [row, col] of the pixels of a projection that have no data. None: no pixel, or all pixels, have no data.
 
     Args:
         values: pixel values as stored.
         intensity: transmission; NaN: not finite.
         hidden: areas that are masked in all projections.
-        foreign: bool [row], rows in which dark pixels are not the sample, see `foreign_rows`; None: no such rows.
+        foreign: bool [row], rows in which dark pixels do not show the sample, see `foreign_rows`. None: there are no
+            such rows.
     """
     if intensity.min() > DARK:  # false for NaN
         return None
@@ -69,7 +72,7 @@ def with_rim(dark: Mask, intensity: F32) -> Mask:
     """Dark areas [row, col], extended on their four sides by the pixels whose intensity is mixed with the dark area.
 
     Blur, or interpolation in a shift, mixes the intensities at an edge. The median of the pixels next to the edge then
-    differs from a straight line through the logarithms of the next three pixels; this test continues outwards. If rows
+    differs from a straight line through the logarithms of the next three pixels. The test is repeated outwards. If rows
     were not read, or the shift is by whole pixels, the next pixel is not affected.
 
     Args:
@@ -88,7 +91,8 @@ def with_rim(dark: Mask, intensity: F32) -> Mask:
 
 
 def _mixed(lines: F64) -> bool:
-    """Whether the first of adjacent pixels [edge, pixel] is darker than the others extrapolate to (logarithms)."""
+    """Whether the first of adjacent pixels [edge, pixel] is darker than an extrapolation of the other pixels (in
+    logarithms)."""
     lines = lines[np.isfinite(lines).all(axis=1)]
     if not len(lines):
         return True
@@ -100,7 +104,7 @@ def _mixed(lines: F64) -> bool:
 
 
 def foreign_rows(intensity: F32, angles: F64) -> Mask:
-    """Rows [row] whose dark areas at borders come and go, and add more absorption than the other projections show.
+    """Rows [row] whose dark areas at borders come and go, and have more absorption than the other projections show.
 
     Args:
         intensity: transmission [view, row, col], finite, of projections from all directions.
@@ -141,7 +145,8 @@ def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def runs_of(mask: Mask, view: int) -> I64:
-    """Runs [run, 4] of masked pixels: number of the projection, row, first column, column after the last."""
+    """Runs [run, 4] of masked pixels. The four numbers are the projection, the row, the first column, and the column
+    after the last."""
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, first), end = np.nonzero(edges > 0), np.nonzero(edges < 0)[1]
     return np.stack([np.full(row.size, view), row, first, end], axis=1).astype(np.int64)

@@ -1,9 +1,9 @@
 """Anytime: learning rates and running mean of a fit whose number of steps is not known in advance.
 
-After t steps, the rates are reduced by the factor 1 / (1 + t / 60). The model is the mean of the parameters over the
+After t steps, the rates are 1 / (1 + t / 60) times the first rates. The model is the mean of the parameters over the
 last quarter of the steps. A step uses one or two projections, so at a high rate the parameters fluctuate around the
-optimum for all projections. Their mean does not (Polyak & Juditsky 1992). After any number of steps, the mean is about
-as good as a fit whose rates were planned to end there.
+optimum for all projections. Their mean does not (Polyak & Juditsky 1992). So the fit can end after any number of steps:
+the mean is then about as good as a fit that was planned for this number of steps.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _WINDOW = 0.25  # share of the steps over which the mean is computed
 _EVERY = 4  # steps between two terms of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
-"""Settings of a fit during a scan: the rates of a fit to all projections, with lower final rates.
+"""Settings of a fit during a scan. They differ from those of a fit to all projections by lower final rates.
 
-Density control runs in every round, up to the limit of the round.
+Density control runs in every round, until the number of Gaussians reaches the limit of the round.
 """
 
 
 def while_views_come(settings: FitSettings) -> FitSettings:
-    """`WHILE_VIEWS_COME` with those of the caller's settings that differ from the defaults."""
+    """`WHILE_VIEWS_COME`, changed by those settings of the caller that differ from the defaults."""
     usual = FitSettings()
     chosen = {
         f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
@@ -53,14 +53,14 @@ def while_views_come(settings: FitSettings) -> FitSettings:
 def fallen(steps: int, settings: FitSettings) -> float:
     """Fraction, 0 to 1, of the logarithmic decay of the rates after `steps` steps.
 
-    If the first rates are lower, their decay starts correspondingly later.
+    If the first rates are lower by a factor, it takes longer by this factor until they have fallen to their half.
     """
     half = HALF * WHILE_VIEWS_COME.pace / settings.pace
     return min(1.0, math.log1p(steps / half) / max(-math.log(settings.decay), 1e-9))
 
 
 def average(state: FitState, since: int) -> None:
-    """Add the parameters to their running mean at every fourth step; the first parameters start the mean.
+    """Add the parameters to their running mean at every fourth step. The mean starts with the first parameters.
 
     Args:
         since: the step from which the last quarter is counted.
@@ -77,7 +77,7 @@ def average(state: FitState, since: int) -> None:
 
 
 def averaged(state: FitState) -> FitState:
-    """The state with its parameters replaced by their running mean, if it has one; nothing is copied."""
+    """The state with its parameters replaced by their running mean, if the state has one. No array is copied."""
     return state if state.mean is None else replace(state, parameters=state.mean)
 
 
@@ -105,7 +105,8 @@ def checked_views(data: ArrayLike, angles: NDArray[np.float64], detector_shape: 
 
 
 def next_view(n_views: int, rng: np.random.Generator) -> int | None:
-    """The projection for the next step: in every third step one of the newest, otherwise None (any, in turn).
+    """The projection for the next step. In every third step it is one of the newest; otherwise None, so that all
+    projections take turns.
 
     The fit must learn new projections without forgetting old ones (the rule of on-the-fly mapping; Meuleman et al.
     2025).
@@ -117,7 +118,8 @@ def next_view(n_views: int, rng: np.random.Generator) -> int | None:
 
 
 def is_held_out(view: int) -> bool:
-    """Whether the projection with this number is held out until the final fit, to assess the volumes before it."""
+    """Whether the projection with this number is held out until the final fit. Held-out projections measure the quality
+    of the volumes before the final fit."""
     return view % _ONE_IN == _ONE_IN // 2
 
 
@@ -128,22 +130,23 @@ def covered_angle(theta: NDArray[np.float64]) -> float:
 
 
 def shift_with_axis(theta: NDArray[np.float64], moved: float) -> NDArray[np.float32]:
-    """The shift (x, y) of all points that best corresponds to a shift of the axis by `moved`, for angles `theta`.
+    """The shift (x, y) of all points that best corresponds to a shift of the axis by `moved`, for the angles `theta`.
 
-    If the axis is wrong by d, a point appears at x cos θ + y sin θ + d. The shift (a, b) is the one for which a cos θ +
-    b sin θ is nearest to d: (0, 4 d / π) for evenly spread projections.
+    If the axis is wrong by d, a point appears at x cos θ + y sin θ + d. The shift (a, b) makes a cos θ + b sin θ as
+    near to d as possible. For evenly spread projections, it is (0, 4 d / π).
     """
     across = np.stack((np.cos(theta), np.sin(theta)), 1)
     return np.linalg.lstsq(across, np.full(theta.size, moved), rcond=None)[0].astype(np.float32)
 
 
 _ROWS = 8  # number of rows that are compared
-_VIEWS = 400  # largest number of projections of an FBP; of more, some are left out, evenly in angle
-_COMPARED = 4  # number of held-out projections that are compared, the last ones
+_VIEWS = 400  # largest number of projections of an FBP; if there are more, an evenly spread part of them is used
+_COMPARED = 4  # number of held-out projections that are compared (the latest ones)
 
 
 def volume_error(rendered: F32, measured: F32) -> float:
-    """The relative error of a volume in projections [..., col]: √Σ|ω||F Δ|², divided by that of the measured ones."""
+    """The relative error of a volume in projections [..., col]: √Σ|ω||F Δ|² for the residual Δ, divided by the same
+    norm of the measured projections."""
     n = 2 * measured.shape[-1]
     ramp = np.arange(n // 2 + 1)
 
@@ -161,11 +164,12 @@ def direct_volume(images: Sequence[F32], geometry: Geometry, grid: Grid) -> F32:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """The `volume_error` of the fit and of FBP during a scan, in held-out and in as many other projections.
+    """The `volume_error` of the fit and of FBP during a scan, in the held-out projections and in the same number of
+    other projections.
 
-    NaN: unknown. The error of a volume is smallest at the angles of the projections and largest in the gaps between
-        them. A held-out projection makes a gap that is twice as wide as the others, which is worse for FBP than for a
-        fit.
+    An unknown error is NaN. The error of a volume is smallest at the angles of the projections and largest in the gaps
+    between them. A held-out projection leaves a gap that is twice as wide as the others. This gap lowers the quality of
+    FBP more than that of a fit.
     """
 
     fit: float = math.nan
@@ -175,7 +179,8 @@ class PredictionErrors:
     def of(
         cls, images: Sequence[F32], geometry: Geometry, held_out: Sequence[int], render: Callable[[int], F32]
     ) -> Self:
-        """Errors in the last held-out projections and in those before them; FBP uses all that are not held out.
+        """Errors in the last held-out projections and in the projections before them. FBP uses all projections that are
+        not held out.
 
         NaN if none is held out, or if a detector row does not show one slice (FBP is then not compared).
 
@@ -198,7 +203,8 @@ class PredictionErrors:
 
 @dataclass(frozen=True, eq=False)
 class BetterVolume:
-    """The volume so far, in 1/mm, that predicts held-out projections best; `direct`: FBP made it, not the fit."""
+    """The current volume, in 1/mm, that predicts held-out projections best. `direct`: True if FBP made it, False if the
+    fit made it."""
 
     volume: Volume
     direct: bool
@@ -208,7 +214,8 @@ class BetterVolume:
     def of(
         cls, state: FitState, problem: FitProblem, settings: FitSettings, grid: Grid, held_out: Sequence[int]
     ) -> Self:
-        """The better volume for a problem; the fit in this state did not use the held-out projections."""
+        """The better of two volumes for a problem: that of the fit, or FBP. The fit in this state did not use the
+        held-out projections."""
 
         def render(view: int) -> F32:
             return problem.backend.numpy(next(renders(state, problem, settings, [view])))

@@ -15,7 +15,7 @@ from recon.splatting.backend import Backend, Cpu, Pass
 
 
 class Renderer(NamedTuple):
-    """Density unit, kernel and backend that belong to raw parameters."""
+    """The values that are needed to interpret raw parameters: density unit, kernel and backend."""
 
     unit: float
     kernel: Kernel
@@ -23,14 +23,16 @@ class Renderer(NamedTuple):
 
 
 class Project(torch.autograd.Function):
-    """Projection of raw parameters on a backend. The backward pass renders each projection again, to save memory."""
+    """Projection of the raw parameters, computed by a backend. The backward pass renders each projection again, to save
+    memory."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer,
         geometry: Geometry, how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
-        """Images [view, row, col]; `how`: faintness limit, truncation in standard deviations, and ray model."""
+        """Images [view, row, col]. `how` contains the faintness limit, the truncation in standard deviations, and the
+        ray model."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = renderer, geometry, how
         run = _begin((means, log_scales, quaternions, raw), renderer)
@@ -49,14 +51,14 @@ class Project(torch.autograd.Function):
 
 
 class Voxelize(torch.autograd.Function):
-    """Voxelization of raw parameters on a backend."""
+    """Voxelization of the raw parameters, computed by a backend."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer, grid: Grid,
         how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
-        """Density [z, y, x]; `how`: faintness limit, and truncation in standard deviations."""
+        """Density [z, y, x]. `how` contains the faintness limit, and the truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = renderer, grid, how
         run = _begin((means, log_scales, quaternions, raw), renderer)
@@ -76,6 +78,6 @@ def _begin(parameters: Sequence[Tensor], renderer: Renderer) -> Pass[Any]:
 
 
 def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
-    """The values as an array of the backend, without a copy if they are contiguous."""
+    """The values as an array of the backend. Contiguous values are not copied."""
     values = tensor.detach().contiguous()
     return values.numpy() if isinstance(backend, Cpu) else values

@@ -1,8 +1,8 @@
 """Backend: the operations of a fitting step as a Protocol, with implementations for CPU and GPU.
 
-Arrays are numpy arrays on the CPU and torch tensors on a GPU. A fit passes them from one operation to the next without
-reading them. Losses can be converted with `float`. On a GPU the conversion waits for the device, so convert them
-rarely.
+Arrays are numpy arrays on the CPU and torch tensors on a GPU. A fit passes these arrays from one operation to the next
+without reading them. Losses can be converted with `float`. On a GPU this conversion waits for the device, so convert
+losses rarely.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Array = TypeVar("Array")
 
 
 class SplatView(Protocol[Array]):
-    """One rendered projection and its backward pass."""
+    """One rendered projection, with its backward pass."""
 
     @property
     def image(self) -> Array:
@@ -45,20 +45,22 @@ class VoxelBox(Protocol[Array]):
     density: Array
 
     def backward(self, gradient: Array, *, means_too: bool = True) -> None:
-        """Back-propagate a gradient [z, y, x]; `means_too=False`: not to positions."""
+        """Back-propagate a gradient [z, y, x]. With `means_too=False`, the positions get no gradient."""
 
 
 class Pass(Protocol[Array]):
-    """One pass over a model: physical parameters, and the sum of gradients from its projections and voxel boxes."""
+    """One pass over a model: its physical parameters, and the sum of the gradients from its projections and voxel
+    boxes."""
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> SplatView[Array]:
-        """Render one projection. Footprints end below `faint` (units of the image), and at the latest after `cut` σ.
+        """Render one projection. A footprint ends at `cut` standard deviations, or earlier if it falls below `faint`
+        (in units of the image).
 
         Call `backward` of a projection before the next one is rendered, because they share memory.
         """
 
     def box(self, grid: Grid, faint: float, cut: float) -> VoxelBox[Array]:
-        """Voxelise on a grid; `faint` is a density."""
+        """Voxelise on a grid. `faint` is the density below which a Gaussian ends."""
 
     def gradients(self) -> tuple[Array, Array, Array, Array]:
         """Gradients with respect to means, log scales, quaternions and raw densities."""
@@ -68,12 +70,12 @@ class ProjectionLoss(Protocol[Array]):
     """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `recon.kernels.cpu.losses`."""
 
     def target_maps(self, target: Array, weights: Array | None = None) -> Array:
-        """The maps of a target [row, col] that are computed only once."""
+        """The maps of a target [row, col] that are computed once and reused in every step."""
 
     def __call__(
         self, image: Array, target: Array, target_maps: Array, weights: Array | None = None
     ) -> tuple[SupportsFloat, Array]:
-        """The loss and its gradient [row, col]; the next call overwrites the gradient."""
+        """The loss and its gradient [row, col]. The next call overwrites the gradient."""
 
 
 class Backend(Protocol[Array]):
@@ -89,7 +91,7 @@ class Backend(Protocol[Array]):
         self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> Pass[Array]:  # fmt: skip
-        """A pass over raw parameters; densities are unit * softplus(raw)."""
+        """A pass over raw parameters. The densities are unit * softplus(raw)."""
 
     def projection_loss(
         self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
@@ -115,7 +117,8 @@ class Backend(Protocol[Array]):
         step: int,
         bounds: Sequence[tuple[float, float] | None],
     ) -> None:
-        """Update the four parameter arrays and their moments in place, within bounds; steps count from 1."""
+        """Update the four parameter arrays and their moments in place, within bounds. The first step has the number
+        1."""
 
     def unit_quaternions(self, quaternions: Array, first: Array, second: Array) -> None:
         """Normalise quaternions [n, 4] to length 1 in place, and rescale Adam's moments accordingly.
@@ -127,14 +130,15 @@ class Backend(Protocol[Array]):
         """The rows `origin` of an array; zeros for -1."""
 
     def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> FusedStep | None:
-        """Complete steps on the device without the host; None if steps are made operation by operation.
+        """An object that makes complete steps on the device, without the host. None if this backend makes steps
+        operation by operation.
 
-        `earlier`: the previous fused step, for another model or plan.
+        `earlier`: the previous fused step, which was made for another model or plan.
         """
 
 
 def backend_for(device: str) -> Backend[Any]:
-    """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" if it has this number).
+    """The backend for "cpu" or "cuda" (the current CUDA device, which may also be given by its number, as "cuda:0").
 
     Raises:
         ImportError: triton is not installed.
@@ -150,7 +154,7 @@ def backend_for(device: str) -> Backend[Any]:
 
 
 class Cpu:
-    """The numba kernels on numpy arrays."""
+    """A `Backend` for the CPU: numba kernels on numpy arrays."""
 
     adam, add_lengths = staticmethod(adam_all), staticmethod(add_lengths)
 
@@ -182,7 +186,8 @@ class Cpu:
         return None
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
-        """Scratch buffers for one projection of n Gaussians; the last ones are reused if they have the right size."""
+        """Scratch buffers for one projection of n Gaussians. The previous buffers are reused if they have the right
+        size."""
         if self._scratch is None or self._scratch[0] != (n, detector_shape):
             self._scratch = ((n, detector_shape), Scratch.of(n, detector_shape))
         return self._scratch[1]
@@ -204,7 +209,7 @@ class Cpu:
 
 
 class CpuPass:
-    """A `Pass` with the numba kernels."""
+    """A `Pass` that uses the numba kernels."""
 
     def __init__(self, backend: Cpu, active: Active, quaternions: F32, raw: F32, unit: float) -> None:
         self._backend, self.active, self._raw, self._unit = backend, active, (quaternions, raw), unit
@@ -222,7 +227,7 @@ class CpuPass:
 
 
 class CpuBox:
-    """A `VoxelBox` with the numba kernels."""
+    """A `VoxelBox` that uses the numba kernels."""
 
     def __init__(self, run: CpuPass, grid: Grid, faint: float, cut: float) -> None:
         self._into, self._layout = run.into, grid_layout(run.active, grid, faint, cut)

@@ -1,4 +1,4 @@
-"""Checkpoint of a fit: its complete state as plain arrays, restored bit for bit. Nothing is pickled."""
+"""Checkpoint of a fit: its complete state as plain arrays, which restore the fit bit for bit. Nothing is pickled."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
 
 
 def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
-    """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
+    """The state of a fit from the arrays of `arrays_of`. The fit then continues as if it had not been interrupted.
 
     Raises:
         ValueError: arrays are missing, have different lengths, or contain values that are not finite.
@@ -81,7 +81,7 @@ def _refuse_damaged(arrays: Mapping[str, NDArray[Any]]) -> None:
     others = ("statistic", "counts", "scalars", "kernel_exponent", "drawn", "generator")
     missing = [key for key in (*wanted, *others) if key not in arrays]
     if missing:
-        raise ValueError(f"this is not the checkpoint of a fit: {missing} are missing")
+        raise ValueError(f"this is not the checkpoint of a fit, because {missing} are missing")
     n = len(arrays["parameters.raw"])
     widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
     shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}
@@ -105,7 +105,7 @@ _BEST = "best."  # prefix of the names of the best model's arrays in a checkpoin
 
 @dataclass(eq=False)
 class HeldOutTracker:
-    """Tracks the residual in held-out projections, and keeps the model with the lowest one."""
+    """Tracks the residual in held-out projections, and keeps the model with the lowest residual."""
 
     problem: FitProblem | None
     settings: FitSettings
@@ -118,7 +118,7 @@ class HeldOutTracker:
     def over(
         cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
     ) -> HeldOutTracker:
-        """A new tracker for a fit at `step`, or the one from a checkpoint."""
+        """A tracker for a fit at `step`: new, or with the values from a checkpoint."""
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
         best, best_step = resume["watch"]

@@ -1,7 +1,8 @@
-"""Voxel refinement (`finish`): refines the volume of a fit on voxels, with the prior that held-out projections prefer.
+"""Voxel refinement (`finish`): improves the volume of a fit by iterations on voxels, with the prior that predicts
+held-out projections best.
 
-Gaussians describe smooth material with few parameters. Sharp edges, cracks and pores come last, so when a fit ends,
-they are still in its residual. A few iterations on voxels restore them.
+Gaussians describe smooth material with few parameters. A fit represents sharp edges, cracks and pores last, so when it
+ends, they are still in its residual. A few iterations on voxels restore them.
 """
 
 from __future__ import annotations
@@ -32,21 +33,22 @@ from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, c
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
-"""Iterations of total variation after a fit. Without a voxel refinement: -1.7 dB on a teapot (docs/published.md)."""
+"""Number of total-variation iterations after a fit. Without a voxel refinement: -1.7 dB on a teapot
+(docs/published.md)."""
 
 PULLED_SWEEPS = 16
-"""Iterations with a pull to discrete levels, after those of total variation."""
+"""Number of iterations with a pull to discrete levels. They follow the total-variation iterations."""
 
-_REACH = 1.5  # standard deviations of a Gaussian's longest axis up to which it counts as reaching
+_REACH = 1.5  # a Gaussian counts as reaching this many standard deviations of its longest axis
 
 
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
-    """The part of the projections [view, row, col] that Gaussians explain, but the voxels of their volume do not; or
-    None.
+    """The part of the projections [view, row, col] that the Gaussians explain and the voxels of their volume do not;
+    None if there is no such part.
 
-    This part is material outside the box: Gaussians there contribute to the projections but not to the voxels. If it
-    were not subtracted from the measured projections, the volume would lose 12 dB in a region of interest, and 22 dB in
-    the end slices of a thorax that continues above the field of view. None: there is no such part.
+    This part is material outside the box: Gaussians outside the box contribute to the projections but not to the
+    voxels. If this part were not subtracted from the measured projections, the volume would lose 12 dB in a region of
+    interest, and 22 dB in the end slices of a thorax that continues above the field of view.
     """
     import torch
 
@@ -62,17 +64,17 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
 
 
 def level_of(beyond: F32) -> F32:
-    """The mean of `beyond_voxels` in each projection, [view, 1, 1]; only this mean counts when a fit is judged.
+    """The mean of `beyond_voxels` in each projection, [view, 1, 1]. A test fit uses only this mean, see `trial_fit`.
 
-    Gaussians far outside can represent an air level that is not zero, and voxels cannot. Without this mean, a walnut in
-    a cone whose air level is wrong by 2 % of the largest line integral loses 5.7 dB. Anything else that these Gaussians
-    represent is not in any volume.
+    Gaussians far outside the box can represent an air level that is not zero; voxels cannot. An example is a walnut in
+    a cone beam whose air level is wrong by 2 % of the largest line integral. Without this mean, the walnut loses 5.7
+    dB. Whatever else these Gaussians represent is not part of the volume.
     """
     return beyond.mean(axis=(1, 2), keepdims=True)
 
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
-    """Iterations of total variation from x [y, x, z], and PnP-DCT steps if `strength` is above 0."""
+    """Total-variation iterations that start from x [y, x, z], followed by PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     parts = Subsets.of(problem, count, to_the_end=False)
     x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
@@ -87,7 +89,7 @@ class _Finish:
 
     Attributes:
         patches: True: PnP-DCT steps may follow.
-        planned: number of iterations, and of PnP-DCT steps if they follow.
+        planned: number of iterations, including PnP-DCT steps if they follow.
     """
 
     iterations: int
@@ -112,9 +114,9 @@ class _Finish:
 
 
 class Finished(NamedTuple):
-    """The refined volume, and the number of its iterations of total variation.
+    """The refined volume, and the number of its total-variation iterations.
 
-    0: the volume of the fit is unchanged.
+    If the number is 0, the volume is the unchanged volume of the fit.
     """
 
     volume: Volume
@@ -132,20 +134,20 @@ def finish(
 ) -> Finished:
     """The volume after `sweeps` iterations over all projections, starting from the volume of a fit.
 
-    The iterations use the measured projections and not the residual of the fit, which is better by 0.5 to 2 dB.
-    Material outside the box is subtracted from the projections first, see `beyond_voxels`. Single pixels that deviate
-    in the same way in all projections would become rings, so their offsets are removed first, see `ring_offsets`.
+    The iterations use the measured projections. This is better by 0.5 to 2 dB than iterations on the residual of the
+    fit. Material outside the box is subtracted from the projections first, see `beyond_voxels`. Single pixels with the
+    same offset in all projections would make rings, so these offsets are subtracted first, too (see `ring_offsets`).
     Memory: 8 volumes and 5 times the projections.
 
     Args:
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the projections.
         problem: the projections that were fitted, and the weights of their rays.
-        sweeps: iterations of total variation, 1 or more. None: 8, followed by discrete levels or PnP-DCT steps if these
-            predict held-out projections better.
+        sweeps: number of total-variation iterations, 1 or more. None: 8, followed by iterations with discrete levels or
+            PnP-DCT steps, if these predict held-out projections better.
         settings: settings of the fit; None: the defaults.
-        control: is told the progress after each iteration, also of test reconstructions, and may then stop. Its
-            decisions may contain the prior.
+        control: gets the progress after each iteration (also those of test reconstructions), and may stop the
+            refinement there. Its decisions may contain the prior.
         nonnegative: True: voxels below zero are clipped.
 
     Raises:
@@ -177,7 +179,8 @@ def finish(
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> Views | None:
-    """The projections without outliers and rings; None: they or those of the model are empty."""
+    """The projections without outliers and rings. None if these projections, or the projections of the model, contain
+    no material."""
     views = problem.views.masked()
     model = project(gaussians, views.geometry, truncation=fit.truncation, model=fit.rays).numpy()
     if not (views.data.any() and model.any()):
@@ -187,10 +190,11 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
 
 
 def _without_outliers(views: Views, model: F32) -> Views:
-    """The projections, with weight 0 for single rays that differ from the model by as much as its material.
+    """The projections, with weight 0 for single rays whose difference from the model is as large as the model's own
+    line integrals.
 
-    The fit uses absolute differences, which such rays hardly affect. The squares of the voxel refinement would be
-    affected.
+    Such rays hardly affect the fit, because it uses absolute differences. They would affect the voxel refinement,
+    because it uses squares.
     """
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:

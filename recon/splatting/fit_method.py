@@ -1,4 +1,4 @@
-"""Fit: base class of the methods that fit Gaussians; they can also reconstruct during a scan."""
+"""Fit: base class of the methods that fit Gaussians. These methods can also reconstruct during a scan."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 from recon.base.method_kinds import Iterative
 
-if TYPE_CHECKING:  # a check whether a method is a fit must not load these modules
+if TYPE_CHECKING:  # code that only checks whether a method is a fit must not load these modules
     from collections.abc import Mapping
 
     from recon.base.choices import Start
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # a check whether a method is a fit must not load these modul
 
 
 class Fit(Iterative):
-    """A Gaussian fit with these settings, see `R2`. It can also reconstruct during a scan."""
+    """A method that fits Gaussians, see `R2`. It can also reconstruct during a scan."""
 
     takes: ClassVar[frozenset[str]] = frozenset({"device", "held_out", "checkpoints", "quality"})
     needs_matter: ClassVar[bool] = True
@@ -48,20 +48,22 @@ class Fit(Iterative):
     @property
     @abstractmethod
     def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
-        """All settings that determine the steps (a resumed run must have the same ones), and further values by name."""
+        """All settings that determine the steps, and further values, by name. A resumed run must have the same
+        settings."""
 
     @property
     @abstractmethod
     def finish_sweeps(self) -> int:
-        """Iterations of total variation in the voxel refinement; 0: no voxel refinement."""
+        """Number of total-variation iterations in the voxel refinement; 0: no voxel refinement."""
 
     @abstractmethod
     def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit without voxel refinement, for this share of the rows, with this share of the steps."""
+        """The fit for a test reconstruction: without voxel refinement, for this fraction of the rows, with this
+        fraction of the steps."""
 
     @abstractmethod
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit that takes projections during a scan, with the geometry of `template` (its angles are ignored).
+        """A fit that takes projections during a scan. They have the geometry of `template`, apart from its angles.
 
-        `seconds` is then the time limit of the final fit to all projections.
+        The setting `seconds` of the method becomes the time limit of the final fit to all projections.
         """

@@ -24,16 +24,16 @@ _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_dens
 class Gaussians:
     """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
 
-    If f is another kernel, we still call them Gaussians, and S still contains standard deviations.
+    With another kernel f, the elements are still called Gaussians, and S still contains their standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
-        quaternions: [n, 4] (w, x, y, z), of any non-zero length.
+        quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. Because densities are divided by it, raw values and their learning
-            rates are independent of the units of the data.
-        kernel: radial profile.
+        density_unit: a typical density in 1/mm. Raw values refer to densities divided by this unit, so raw values and
+            their learning rates do not depend on the units of the data.
+        kernel: radial profile f.
     """
 
     means: Tensor
@@ -109,7 +109,7 @@ class Gaussians:
         return replace(self, **some)
 
     def widened(self, variance: float) -> Gaussians:
-        """The same Gaussians with `variance` (mm²) added in every direction, and the same mass."""
+        """The same Gaussians, widened by adding `variance` (mm²) in every direction. Their mass stays the same."""
         import torch
 
         if variance <= 0:
@@ -126,7 +126,7 @@ class Gaussians:
     def physical(self) -> dict[str, NDArray[np.float32]]:
         """Centres [n, 3] (x, y, z) and widths [n, 3] in mm, unit quaternions [n, 4] (w, x, y, z), densities [n] 1/mm.
 
-        The inverse is `from_physical`.
+        `from_physical` is the inverse function.
         """
         from torch.nn.functional import normalize
 
@@ -136,10 +136,12 @@ class Gaussians:
 
 
 def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaussians:
-    """Each Gaussian rotated about the axis by the skew at its row. A Gaussian over many rows is not bent.
+    """The Gaussians, each rotated about the axis by the skew at its row. A Gaussian that extends over many rows is not
+    bent.
 
     Args:
-        sense: -1: from the object's frame to the frame in which all rows have the angle of the first row; 1: back.
+        sense: -1 rotates from the object's frame to the frame in which all rows have the angle of the first row; 1
+            rotates back.
     """
     if not geometry.skew:
         return gaussians
@@ -173,19 +175,20 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     return tensor
 
 
-NEEDLES_LIMIT = 0.2  # share of the mass in needle-shaped Gaussians that causes a warning, see docs/published.md
+# share of the mass in needle-shaped Gaussians above which a warning is given, see docs/published.md
+NEEDLES_LIMIT = 0.2
 
-# standard deviation, in pixels, that projections do not resolve; ratio of longest to shortest width
+# standard deviation, in pixels, below which projections do not resolve a Gaussian; ratio of longest to shortest width
 _THIN, _LONG = 0.5, 10.0
 
 
 @dataclass(frozen=True)
 class Needles:
-    """Needle-shaped Gaussians: Gaussians that are thinner than the projections resolve.
+    """Measure of needle-shaped Gaussians, which are thinner than the projections resolve.
 
     Attributes:
         thin: share of the mass in Gaussians that are narrower than half a pixel.
-        share: share of the mass in Gaussians that are also ten times as long as wide.
+        share: share of the mass in needle-shaped Gaussians: narrower than half a pixel, and ten times as long as wide.
         aspect: median ratio of longest to shortest width, weighted by mass.
     """
 
@@ -195,7 +198,8 @@ class Needles:
 
 
 def needles(gaussians: Gaussians, geometry: Geometry) -> Needles:
-    """Measure the needle-shaped Gaussians. The mass is the density times the three widths (standard deviations)."""
+    """Measure how much of a model is in needle-shaped Gaussians. The mass of a Gaussian is its density times its three
+    widths (standard deviations)."""
     values = gaussians.physical()
     widths = np.sort(values["widths"].astype(np.float64), axis=1)
     mass = values["densities"] * widths.prod(axis=1)

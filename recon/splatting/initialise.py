@@ -29,22 +29,24 @@ from recon.voxels.projector import volume_lines
 from recon.voxels.voxel_problem import density_unit, difference_weights
 
 START_SWEEPS = 10
-"""Iterations for the first volume "tv"; with momentum, more would fit the noise. The effect was not measured."""
+"""Number of iterations for the first volume "tv". Because they use momentum, more iterations would fit the noise. The
+effect was not measured."""
 
 LEAST_GAUSSIANS, MOST_GAUSSIANS = 2000, 200_000
 """Bounds of the default number of Gaussians.
 
-Without them, small fields would get too few Gaussians, and large ones more than 400 steps can place. The effect was not
-measured.
+Without these bounds, small fields of view would get too few Gaussians, and large ones more Gaussians than 400 steps can
+place. The effect was not measured.
 """
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 LEAST_DENSITY = 0.05
 
-# The published start: density of a Gaussian divided by that of its voxel; its least width divided by that of the field.
+# The published start: density of a Gaussian, divided by that of its voxel; least width of a Gaussian, divided by the
+# width of the field of view.
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
-SCALED_BY = 12  # number of projections used to scale the densities
+SCALED_BY = 12  # number of projections from which the scale of the densities is computed
 _SLOPE_SIGMA = 1.0  # standard deviation, in voxels, of the Gaussian for gradients
 _LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle whose changes are measured
@@ -58,8 +60,8 @@ def default_count(geometry: Geometry, voxel_size: float) -> int:
 def count_for(field: Grid, cone: bool) -> int:
     """Number of Gaussians for a field of view: one per 60 voxels of its inscribed cylinder, from 2000 to 200 000.
 
-    For a cone, whose field is often much larger than the sample, it is at most V^(2/3) for V voxels, because Gaussians
-    gather at surfaces (docs/published.md).
+    The field of view of a cone beam is often much larger than the sample, and Gaussians gather at surfaces. So for a
+    cone beam the number is at most V^(2/3) for V voxels (docs/published.md).
     """
     return int(np.clip(_count_of(field, cone), LEAST_GAUSSIANS, MOST_GAUSSIANS))
 
@@ -67,9 +69,9 @@ def count_for(field: Grid, cone: bool) -> int:
 def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
     """The factor by which pixels [row, col] are binned for a fit of `count` Gaussians.
 
-    If there are fewer Gaussians than one per 60 voxels, each one is wider by the cube root of the ratio. In a cone,
-    Gaussians cover surfaces and are wider by its square root. Pixels of that width show all of them. At least four rows
-    remain.
+    If there are fewer Gaussians than one per 60 voxels, each Gaussian is wider by the cube root of the ratio. In a cone
+    beam, Gaussians cover surfaces and are wider by the square root of the ratio. Pixels of this width still show every
+    Gaussian. At least four rows remain.
     """
     wider = (_count_of(field, cone) / count) ** (1 / 2 if cone else 1 / 3)
     return max(1, min(int(wider), detector[0] // _LEAST_JOINED, detector[1] // _LEAST_JOINED))
@@ -95,10 +97,10 @@ def place(
 
     Args:
         volume: see `first_volume`. Its box must contain everything that the projections see (`Grid.for_fit`), because a
-            fit cannot represent material outside. The corners of the box, outside the circle that all projections see,
-            stay empty unless the sample is wider than the field of view.
+            fit cannot represent material outside its box. No Gaussian is placed in the corners of the box, outside the
+            circle that all projections see, unless the sample is wider than the field of view.
         count: number of Gaussians; None: the default for the field, see `default_count`.
-        start: how the volume was made.
+        start: how the volume was made, see `first_volume`.
 
     Raises:
         ValueError: the count is below 1, or the data contain no material or are not line integrals.
@@ -115,11 +117,11 @@ def place(
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Projections [view, row, col] whose wild pixels are filled from neighbours.
+    """The projections [view, row, col] with their wild pixels filled from neighbours.
 
-    A wild pixel is more than ten times the largest value of other projections. One such pixel makes a streak in a first
-    volume, and may dominate a least-squares factor. Up to a tenth of the projections, and at least one, may contain
-    wild pixels. A projection that has only wild pixels is clipped.
+    A wild pixel has more than ten times the largest value of the other projections. A single wild pixel makes a streak
+    in a first volume, and may dominate a least-squares factor. At most a tenth of the projections, but at least one,
+    may contain wild pixels. If all pixels of a projection are wild, its values are clipped.
     """
     peaks = np.maximum(projections.max(axis=(1, 2)), -projections.min(axis=(1, 2)))
     sound = max(1, peaks.size - max(1, round(WILD_VIEWS * peaks.size)))
@@ -136,11 +138,12 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
 def first_volume(
     projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", device: str = "cpu"
 ) -> Volume:
-    """A quick volume in 1/mm to sample Gaussians from, without the effect of wild pixels (`without_wild_pixels`).
+    """A quickly computed volume in 1/mm from which Gaussians are sampled. Wild pixels are filled first
+    (`without_wild_pixels`).
 
-    "fbp": FBP or FDK; if a cone scan is too short for FDK, a few iterations of OS-SIRT with TV. "tv": these iterations
-    in every case, slower but without the streaks of few projections. "published": as "fbp" with the plain ramp filter.
-    `device`: for the direct method and the iterations.
+    "fbp": FBP or FDK. If a cone scan is too short for FDK, the volume comes from a few iterations of OS-SIRT with TV.
+    "tv": the volume always comes from these iterations, which are slower but without the streaks of few projections.
+    "published": as "fbp", but with the plain ramp filter. `device` is where the volume is computed.
     """
     sweeps = OsSirtTv(iterations=START_SWEEPS, still=0.0)
     quick: Method = sweeps if _swept(geometry, start) else Fbp("ram-lak" if start == "published" else "hann")
@@ -153,10 +156,11 @@ def mean_change(
 ) -> float:
     """Total variation of the sample per voxel, in density units, in the middle slices of a first volume "fbp".
 
-    It is 0 if a direct method is not suitable (too short a cone scan), or if the slices contain no material.
+    The value is 0 if a direct method is not suitable (the cone scan is too short), or if the slices contain no
+    material.
 
     Args:
-        known: such a volume on the grid; None: the slices are reconstructed on the device.
+        known: a volume "fbp" on the grid, if there is one; None: the slices are reconstructed on the device.
     """
     nz, ny, nx = grid.shape
     first = max(0, nz // 2 - _MIDDLE)
@@ -188,12 +192,12 @@ def sample_gaussians(
 
     The volume is smoothed first, because Gaussians would otherwise be placed on the streaks of few projections (Yuluo
     et al. 2025, GR-Gaussian; gain 0.4 dB with 25 projections). Then voxels above 5 % of the density unit are drawn
-    without replacement. The probability is half from the density and half from the gradient. The size of a Gaussian is
-    the distance to its neighbours, its density that of the voxel.
+    without replacement. Density and gradient of a voxel contribute equally to its probability. The size of a Gaussian
+    is the distance to its neighbours, and its density is that of its voxel.
 
     Args:
         volume: an FBP or iterative reconstruction.
-        n: number of Gaussians; the result has fewer if fewer voxels contain material.
+        n: number of Gaussians. The result has fewer Gaussians if fewer voxels contain material.
         field_radius: radius in mm around the rotation axis outside which no Gaussian is placed.
         smooth: standard deviation of the smoothing, in voxels.
 
@@ -223,9 +227,9 @@ def sample_as_published(
 ) -> Gaussians:
     """The published start (Zha et al. 2024): voxels above 5 % of the density unit, all with the same probability.
 
-    The width of a Gaussian is the distance to its neighbours, its density 0.15 of that of its voxel. In the published
-    code, Gaussians are half a voxel away from the voxel centres; here they are at the centres. Arguments and errors as
-    in `sample_gaussians`.
+    The width of a Gaussian is the distance to its neighbours. Its density is 0.15 times that of its voxel. In the
+    published code, Gaussians are half a voxel away from the voxel centres; here they are at the centres. Arguments and
+    errors as in `sample_gaussians`.
     """
     data, unit, candidates = _material(volume, field_radius, 0.0)
     chosen = rng.permutation(candidates)[:n]
@@ -249,15 +253,17 @@ def _material(
     candidates = np.flatnonzero(data.ravel() > LEAST_DENSITY * unit) if unit > 0 else np.empty(0, np.int64)
     if candidates.size < 4:
         raise ValueError(
-            f"the initial volume contains no material: only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
-            f"{unit:.3g} 1/mm. Are the projections line integrals (-log of the transmission), and is the rotation "
-            "axis right?"
+            f"check that the projections are line integrals (-log of the transmission) and that the rotation axis is "
+            "right: the initial volume contains no material, because "
+            f"only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
+            f"{unit:.3g} 1/mm"
         )
     return data, unit, candidates
 
 
 def _smoothed(x: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """x [z, y, x] smoothed by a Gaussian with this standard deviation in voxels, cut off at four of them."""
+    """x [z, y, x] smoothed by a Gaussian with this standard deviation in voxels. The Gaussian is cut off at four
+    standard deviations."""
     taps, out = np.arange(-round(4 * sigma), round(4 * sigma) + 1), np.empty(x.shape, np.float32)
     window = np.exp(-0.5 * (taps / max(sigma, 1e-9)) ** 2)
     windowed(x, (window / window.sum()).astype(np.float32), out)
@@ -278,10 +284,11 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
 def scale_to_data(
     gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, rays: RayModel | None = None
 ) -> Gaussians:
-    """The same Gaussians with all densities multiplied by k = <Aρ, P> / <Aρ, Aρ> over a few projections.
+    """The same Gaussians, with all densities multiplied by the factor k = <Aρ, P> / <Aρ, Aρ>, computed from a few
+    projections.
 
-    Projection is linear in density, so k is the exact least-squares factor. It replaces the published constant 0.15,
-    and makes the start independent of units and of the number of Gaussians.
+    Projection is linear in density, so k is the exact least-squares factor. k replaces the published constant 0.15, and
+    makes the start independent of units and of the number of Gaussians.
     """
     chosen = spread(np.arange(geometry.n_views), SCALED_BY)
     rendered = project(gaussians, geometry, chosen.tolist(), model=rays).numpy()
@@ -301,7 +308,8 @@ def scale_to_data(
 
 
 def morton_order(means: NDArray[np.float32], cell: float) -> NDArray[np.int64]:
-    """Order [n] along a Z-curve of cells of the given edge, so that neighbours in space are neighbours in memory."""
+    """Order [n] of points along a Z-curve through cells of the given edge, so that neighbours in space become
+    neighbours in memory."""
     cells = np.clip(((means - means.min(axis=0)) / cell).astype(np.int64), 0, 1023)
     code = np.zeros(means.shape[0], np.int64)
     for bit in range(10):

@@ -1,4 +1,5 @@
-"""The fitting steps on an explicit state: init and step. They print nothing, read no clock, and can stop anywhere."""
+"""The steps of a fit, as functions on an explicit state: init and step. They print nothing, read no clock, and a fit
+can stop after any step."""
 
 from __future__ import annotations
 
@@ -29,11 +30,12 @@ NORMALISE = 100  # number of steps between two normalisations of the quaternions
 
 @dataclass(eq=False)
 class FitState:
-    """Everything that a step reads and changes. With the settings it is a complete checkpoint (see `checkpoint`).
+    """Everything that a step reads and changes. The state and the settings together are a complete checkpoint (see
+    `checkpoint`).
 
     `step` updates the arrays in place, because for 50k Gaussians a copy takes as long as the kernels. The arrays are on
     the device of the backend. `mean` is a running mean of the parameters or None, see `anytime`. If `fused` makes the
-    steps, the arrays may be some steps behind until `settle` is called.
+    steps, the arrays may lack the latest steps until `settle` is called.
     """
 
     parameters: dict[str, Any]
@@ -60,7 +62,7 @@ class FitState:
 def problem_of(
     views: Views, grid: Grid, unit: float, settings: FitSettings, backend: Backend[Any] | None = None
 ) -> FitProblem:
-    """The problem for these settings; see `make_problem`. backend None: the CPU."""
+    """The problem of a fit with these settings; see `make_problem`. If `backend` is None, the fit runs on the CPU."""
     return make_problem(views, grid, unit, backend or Cpu(), loss=settings.loss, ssim_weight=settings.ssim_weight)
 
 
@@ -97,11 +99,14 @@ def init(
 def step(
     state: FitState, problem: FitProblem, settings: FitSettings, fraction: float, view: int | None = None
 ) -> FitState:
-    """One Adam step on one projection (or a few), and density control when it is due. Changes and returns `state`.
+    """Make one Adam step on one projection (or a few), and density control when it is due. The function changes `state`
+    and returns it.
 
     Args:
-        fraction: position in the schedule, 0 to 1; it sets the learning rates and the window of density control.
-        view: the first projection to use; None: it is drawn without replacement, as are the others.
+        fraction: position in the schedule, 0 to 1. The learning rates depend on it, and whether density control is
+            active.
+        view: the first projection to use; the others are drawn without replacement. None: all are drawn without
+            replacement.
     """
     views = [
         _draw(state, problem.geometry.n_views) if view is None or k else view for k in range(settings.views_per_step)
@@ -136,7 +141,8 @@ def step(
 
 
 class _RandomBox(NamedTuple):
-    """The box of voxels for the total variation of a step: first voxel (z, y, x), and number along each axis.
+    """The box of voxels for the total variation of a step: its first voxel (z, y, x), and the number of voxels along
+    each axis.
 
     It is not a `Grid`, because the checks of a `Grid` take as long as the step takes on a GPU.
     """
@@ -181,7 +187,7 @@ class _Update:
 def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
-    """The fused step of this state on the device; it is kept for the next steps as long as its plan is the same."""
+    """The fused step of this state on the device. The same fused step is used again as long as its plan is the same."""
     shape, before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
@@ -275,7 +281,7 @@ def volume_of(state: FitState, grid: Grid, views: Geometry, settings: FitSetting
 
 
 def _order(parameters: dict[str, F32]) -> NDArray[np.int64]:
-    """An order of the Gaussians in which neighbours in space follow each other."""
+    """An order of the Gaussians in which neighbours in space are next to each other."""
     return morton_order(parameters["means"], 4 * float(np.exp(np.median(parameters["log_scales"]))))
 
 
@@ -325,7 +331,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
             changed[fresh:] = True
             state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}
-    origin[fresh:] = -1  # copies start without momentum
+    origin[fresh:] = -1  # the new Gaussians start without momentum
     for moments in (state.first, state.second):
         for name in NAMES:
             moments[name] = backend.taken(moments[name], origin[order])

@@ -20,8 +20,8 @@ from recon.splatting.backend import Backend, ProjectionLoss
 
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
-# Images contain values of about one. No material in the field of view can cause values above this limit. In SSIM, sums
-# of products of their squares would exceed the range of float32.
+# Images contain values of about one. No material in the field of view can cause values above this limit. Larger values
+# would exceed the range of float32 in SSIM, which sums products of squares.
 _LARGEST = 1e6
 # Limit for later projections: that of SSIM in float32. Their unit may come from noise before the sample was in the
 # beam.
@@ -33,11 +33,11 @@ class FitProblem:
     """The data of a fit. Images are in units of half_field * unit, geometry and grid in mm.
 
     Attributes:
-        images: one [row, col] for each projection: line integrals / (half_field * unit).
+        images: one image [row, col] for each projection: line integrals / (half_field * unit).
         target_maps: each projection blurred for SSIM.
         weights: weights of the pixels [row, col] of each projection; None: all 1.
-        grid: box of the Gaussians; it should contain everything that the projections see, whatever volume is wanted
-            later.
+        grid: box of the Gaussians. It should contain everything that the projections see, even if a smaller volume is
+            wanted later.
         half_field: half of the field of view, mm.
         unit: density unit, 1/mm.
         noise: standard deviation of the noise of a pixel, in units of `images`.
@@ -74,8 +74,8 @@ def make_problem(
     """Normalise projections for a fit with the density unit `unit` (1/mm).
 
     Values that are not finite, or above a million times half_field * unit, get weight 0, see `masks.masked`. The
-    squared losses are scaled so that at the noise of the data (`noise_level`) they are as large as the absolute loss.
-    So the weights of SSIM and total variation mean the same with every loss.
+    squared losses are scaled: for residuals as large as the noise of the data (`noise_level`), they equal the absolute
+    loss. So the weights of SSIM and total variation have the same effect with every loss.
 
     Raises:
         ValueError: the shapes do not match, a projection has no usable value, or the loss is unknown.
@@ -98,8 +98,8 @@ def make_problem(
 def extend(problem: FitProblem, projections: F32, angles: NDArray[np.float64]) -> FitProblem:
     """The problem with additional projections [view, row, col]; the existing ones are not copied.
 
-    Large values are accepted up to the limit of the loss, because the density unit is wrong if the first projections
-    were empty. Values above 10⁹ times half_field * unit get weight 0.
+    Large values are accepted up to the limit of the loss, because the density unit is too small if the first
+    projections were empty. Values above 10⁹ times half_field * unit get weight 0.
 
     Raises:
         ValueError: the projections of the problem differ in shift, roll or tilt (see `Geometry.at`), or a projection
@@ -121,9 +121,9 @@ def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
 
 
 def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
-    """The geometry of pixels binned by factor x factor, for a sample that stays at its position.
+    """The geometry of pixels binned by factor x factor, without a change of the height z = 0.
 
-    In contrast, `Geometry.binned` counts the heights of a parallel beam from the middle of the remaining rows.
+    In contrast, `Geometry.binned` moves z = 0 of a parallel beam to the middle of the remaining rows.
 
     Raises:
         ValueError: the detector has fewer rows or columns than the factor.
@@ -140,8 +140,7 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
 def join_pixels(views: Views, factor: int) -> Views:
     """Projections binned by factor x factor pixels.
 
-    A binned pixel is the weighted mean of its pixels and has their mean weight, so that pixels without data do not
-    count.
+    A binned pixel has the weighted mean of its pixels, and their mean weight. So pixels without data do not count.
 
     Raises:
         ValueError: as for `binned_geometry`.

@@ -1,4 +1,4 @@
-"""R2: the R²-Gaussian fit as a reconstruction method, with the settings for its users."""
+"""R2: the R²-Gaussian fit as a reconstruction method, with the settings that users choose."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ class R2(Fit):
     """R²-Gaussian fit: fits a sum of Gaussians to the projections (Zha et al. 2024, with refinements).
 
     Attributes:
-        steps: number of steps. 0: the result is the starting point. None: 400 steps, or with `seconds` as many as time
-            allows.
+        steps: number of steps. 0: the result is the starting point. None: 400 steps; if `seconds` is given, as many
+            steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
-            learning rates decay over this time limit. The limit includes the compilation of kernels if `warm_up` was
-            not called. The start and one step are always made.
+            learning rates decay over this time. If `warm_up` was not called, the compilation of kernels counts, too.
+            Start and first step are made even if the time is too short.
         gaussians: number of Gaussians at the start, or the Gaussians to start from. None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
         early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
             the lowest residual.
         finish: iterations of the voxel refinement after the fit, see `finish.finish`. None: 8 iterations, and after
-            them discrete levels, or steps of PnP-DCT, if one of these predicts held-out projections better. `gaussians`
-            of the result remain the fitted model.
-        allow_negative: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
+            them discrete levels, or steps of PnP-DCT, if one of these predicts held-out projections better.
+            `Reconstruction.gaussians` is the fitted model in every case.
+        allow_negative: True: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
         fit: weights, learning rates and limits.
     """
 
@@ -73,8 +73,8 @@ class R2(Fit):
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
     def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit for a test reconstruction: without voxel refinement, with `share` of the Gaussians and of the
-        steps."""
+        """The fit for a test reconstruction: without voxel refinement, with the fraction `share` of the Gaussians and
+        of the steps."""
         steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
         return replace(self.for_part(share, 1.0), steps=steps, finish=0)
 
@@ -87,12 +87,13 @@ class R2(Fit):
 
     @property
     def trial_sweeps(self) -> int:
-        """Usual number of voxel iterations and fitting steps in a test reconstruction."""
+        """Usual number of voxel iterations and fitting steps, taken together, in a test reconstruction."""
         refined = FINISH_SWEEPS + PnpDct.iterations
         return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """How well the fit predicts held-out projections: with voxel refinement if steps end it, otherwise without."""
+        """How well the fit predicts held-out projections. The test includes the voxel refinement if a number of steps
+        ends the fit, but not if a time limit ends it."""
         other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if other or self.early_stop or trial.prior is None:
             return trial.predicted(self)
@@ -102,7 +103,7 @@ class R2(Fit):
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that takes projections during a scan, and starts with `gaussians` Gaussians.
 
-        The fit has the settings `WHILE_VIEWS_COME`, except for the values of `fit` that differ from the defaults.
+        The fit has the settings `WHILE_VIEWS_COME`. Values of `fit` that differ from the defaults replace them.
 
         Raises:
             ValueError: as for `StreamingFit`, or `gaussians` is a model instead of a number.
@@ -112,7 +113,7 @@ class R2(Fit):
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The fit for a part of a volume: with the fraction `share` of the Gaussians, in the fraction `of_time` of
+        """The fit for a part of a volume. It has the fraction `share` of the Gaussians and the fraction `of_time` of
         the time limit."""
         count, seconds = self.gaussians, self.seconds
         return replace(
@@ -135,7 +136,7 @@ class R2(Fit):
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)
         rays = self.fit.rays
         if rays.exact_above < math.inf:
-            rays = replace(rays, exact_above=0.0)  # so that the toy also runs the kernels for exact rays
+            rays = replace(rays, exact_above=0.0)  # so that the small example also runs the kernels for exact rays
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 

@@ -38,22 +38,23 @@ Rule = Literal["mass", "published"]
 
 @dataclass(frozen=True)
 class DensityPolicy(Checked):
-    """When density control (splitting, cloning, removing Gaussians) runs, and its thresholds.
+    """Settings of density control (splitting, cloning and removing Gaussians): when it runs, and its thresholds.
 
     All values except `growth` and `rule` are those of Zha et al. 2024.
 
     Attributes:
-        start, stop: first and last step, as fractions of all steps.
+        start, stop: first and last step with density control, as fractions of all steps.
         every: number of steps between two rounds.
         threshold: a Gaussian is split or cloned if the mean gradient of the loss with respect to its centre, per half
             detector width, is above this.
         large: a Gaussian longer than this fraction of the field of view is split, a smaller one is cloned. With the
-            rule "mass" all are split.
+            rule "mass" every such Gaussian is split.
         prune_below: a Gaussian with a density below this (in density units) is removed.
         growth: largest number of Gaussians, relative to the number at the start.
-        rule: "mass": splits conserve the mass of the Gaussian, see `control`. "published": a clone becomes two equal
-            Gaussians with half the density. A split draws two centres from the Gaussian; the new ones have half its
-            density and its width divided by 1.6. A Gaussian whose centre is outside the box is removed.
+        rule: "mass": splits conserve the mass of the Gaussian, see `control`. "published": cloning replaces a Gaussian
+            by two equal ones with half the density. Splitting draws two centres from the Gaussian; the two new
+            Gaussians have half the density, and the width divided by 1.6. A Gaussian whose centre is outside the box is
+            removed.
     """
 
     start: NonNegative = 500 / 30_000
@@ -96,8 +97,8 @@ def control(
     change.
 
     Pruning comes first, so that a model at its limit can add as many Gaussians as were pruned. The number then stays
-    constant. In effect, faint Gaussians and those outside the box move to the positions with the largest statistic.
-    Only the mass of the pruned Gaussians is lost, which is negligible.
+    constant. In effect, faint Gaussians and Gaussians outside the box move to the positions with the largest statistic.
+    Only the mass of the pruned Gaussians is lost; it is negligible.
 
     Args:
         model: means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]; ρ = softplus(raw) in density units.
@@ -159,7 +160,7 @@ def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
 def _published_halves(
     log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[F32, F32, F32, float]:
-    """The same with the rule "published"; mass and covariance are not conserved."""
+    """Splits Gaussians with the rule "published", which does not conserve mass and covariance."""
     own = np.exp(log_scales) * rng.standard_normal((2, *log_scales.shape))
     first, second = np.einsum("nij,hnj->hni", rotations, own * split[:, None]).astype(np.float32)
     narrower = np.where(split, -np.log(_PUBLISHED_SHRINK), 0.0)[:, None].astype(np.float32)
@@ -172,9 +173,9 @@ def _inverse(density: NDArray[np.floating]) -> F32:
 
 
 TV_WIDEST = 96
-"""Largest side, in voxels, of the box of total variation.
+"""Largest side, in voxels, of the box in which total variation acts.
 
-Without it, a step on a grid of 512³ voxels would take longer (not measured).
+Without this limit, a step on a grid of 512³ voxels would take longer (not measured).
 """
 
 NAMES = ("means", "log_scales", "quaternions", "raw")  # parameters of the model, in the order of their rates
@@ -189,31 +190,32 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
         ssim_weight: weight of 1 - SSIM, which is added to the loss.
-        tv_weight: weight of total variation. None: 3e5 s² / n, where n is the number of pixels that a Gaussian
-            covers, and s is the noise of a pixel, divided by the density unit and by half the field's width. If the
+        tv_weight: weight of total variation. None: 3e5 s² / n. Here n is the number of pixels that a Gaussian covers. s
+            is the noise of a pixel, divided by the density unit and by half the width of the field of view. If the
             sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
-            change. It is at most 0.25.
+            change. The weight is at most 0.25.
         tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
             is lower, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
-        tv_moves: True: total variation may move centres. In the published code this gradient is too small by the voxel
-            size squared and has no effect (its weight there is 0.05). The correct gradient improves the walnut
-            by 0.2 dB (60 projections) and the battery by 0.4 dB (90 projections).
+        tv_moves: True: total variation may move centres. In the published code (weight 0.05), this gradient is too
+            small by the square of the voxel size and has no effect. The correct gradient improves the walnut by 0.2 dB
+            (60 projections) and the battery by 0.4 dB (90 projections).
         rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
             quaternions and raw densities.
         pace: factor on all rates. The published rates are for 30 000 steps; a fit of 1000 steps with the published
-            rates is far from convergence. Rates twenty times as high, with two projections per step and a low last
-            rate, gain 1 to 4 dB in 1000 steps. Rates 26 times as high, with a higher last rate, need only 400 steps
-            before the voxel refinement for what rates 20 times as high reach in 500 steps.
-        paced_for: number of steps of the longest fit for which `pace` is valid, see `in_steps`.
+            rates is far from convergence. With rates 20 times as high, two projections per step and a low last rate, a
+            fit of 1000 steps gains 1 to 4 dB. With rates 26 times as high and a higher last rate, 400 steps before the
+            voxel refinement are as good as 500 steps with rates 20 times as high.
+        paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
-        truncation: where Gaussians are cut off; a compact kernel ends by itself.
-        smallest: smallest standard deviation in pixels; point sampling misses anything thinner.
+        truncation: where Gaussians are cut off. A compact kernel ends by itself.
+        smallest: smallest standard deviation in pixels. A thinner Gaussian could lie between the points at which pixels
+            are sampled.
         views_per_step: number of projections whose gradients are averaged in a step.
         joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). None: pixels become
-            as wide as the Gaussians, which happens only in large volumes, see `initialise.joined_for`.
+            as wide as the Gaussians, see `initialise.joined_for`. This changes the pixels only in large volumes.
         rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
         kernel: radial profile of the Gaussians, or its name. A fit that starts from an existing model keeps the kernel
             of that model.
@@ -247,17 +249,18 @@ class FitSettings:
 
 
 def in_steps(settings: FitSettings, steps: float) -> FitSettings:
-    """The settings for a fit of `steps` steps: lower rates if there are more steps than `paced_for`.
+    """The settings for a fit of `steps` steps. If `steps` is larger than `paced_for`, the rates are lower.
 
-    The rates and the smallest weight of total variation are divided by the square root of the ratio. A short fit needs
-    the larger weight to be smooth.
+    The rates and the smallest weight of total variation are divided by the square root of steps / paced_for. A short
+    fit needs the larger weight to be smooth.
     """
     share = min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
     return replace(settings, pace=share * settings.pace, tv_least=share * settings.tv_least)
 
 
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
-    """The weight of total variation in a fit of at most `count` Gaussians: as set, or from the noise of the data."""
+    """The weight of total variation in a fit of at most `count` Gaussians: the given weight, or a weight computed from
+    the noise of the data."""
     if settings.tv_weight is not None:
         return settings.tv_weight
     rows, cols = problem.geometry.detector_shape
@@ -267,7 +270,8 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
-    """Voxels per side of the box of total variation: as set, or from the size of the grid."""
+    """Voxels per side of the box in which total variation acts: the given number, or a number computed from the size of
+    the grid."""
     if settings.tv_size is not None:
         return settings.tv_size
     side = round(math.prod(grid.shape) ** (1 / 3) / TV_SHARE / 16) * 16  # a multiple of the kernels' vector length
@@ -275,5 +279,5 @@ def tv_size(settings: FitSettings, grid: Grid) -> int:
 
 
 def growth(settings: FitSettings) -> float:
-    """Largest number of Gaussians, as a multiple of the first count."""
+    """Largest number of Gaussians, as a multiple of the number at the start."""
     return 1.0 if settings.policy is None else settings.policy.growth

@@ -1,4 +1,4 @@
-"""project and voxelize: differentiable functions from Gaussians to line integrals and to voxels.
+"""project and voxelize: differentiable functions that compute line integrals, or voxels, of Gaussians.
 
 Tensors are float32. On the CPU, the threaded CPU kernels are used; on a CUDA device, the GPU kernels.
 """
@@ -29,8 +29,9 @@ def project(
     model: RayModel | None = None,
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians. For a parallel beam the integrals are exact,
-    except that each Gaussian is cut off. For a cone, `model` chooses between an affine approximation of the footprint
-    and the integral along each true ray. The result is differentiable in all four parameter tensors.
+    except that each Gaussian is cut off. For a cone beam, `model` chooses how a Gaussian is integrated: with an affine
+    approximation of its footprint, or exactly along each ray. The result is differentiable in all four parameter
+    tensors.
 
     Raises:
         ValueError: the tensors are not float32.
@@ -66,7 +67,8 @@ def voxel_means(
     contain the variance of a pixel, p²/12. So voxels of pixel size get the values at their centres.
     """
     pixel, edge = 0.0 if geometry.width.pixel else geometry.sample_pitch, min(grid.spacing)
-    # parts of a coarse voxel's edge, because a Gaussian does not approximate its box
+    # a coarse voxel is divided into this many parts along each edge, because a Gaussian is a bad approximation of its
+    # box
     parts = max(1, math.ceil(edge / (2 * geometry.sample_pitch)))
     nz, ny, nx = (parts * n for n in grid.shape)
     slices = None if grid.slice_pitch is None else grid.slice_pitch / parts
@@ -79,7 +81,7 @@ def voxel_means(
 
 
 def _raw(g: Gaussians) -> tuple[Any, ...]:
-    """The first arguments for `Project` and `Voxelize`."""
+    """The first arguments of `Project` and `Voxelize`."""
     import torch
 
     from recon.splatting.autograd import Renderer

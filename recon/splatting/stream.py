@@ -1,13 +1,13 @@
 """StreamingFit: a Gaussian fit that takes projections one by one during a scan.
 
 The first Gaussians are placed with an FBP of the first projections, as soon as these are well spread. If there is time
-for many steps, the Gaussians are placed again when the number of projections has grown by half, from the volume of the
-model and an FBP of its residual. After that the model is kept. Each time the number of projections has grown by half, a
-new round allows more Gaussians, and density control clones and splits Gaussians according to the new projections.
-Between arrivals the fit continues, with learning rates that suit any number of future steps (`anytime`). A new
-projection is used in the first step after its arrival. Of the other steps, every third uses one of the newest
-projections, and the rest use all projections evenly (`anytime`). One in sixteen projections is held out until the final
-fit.
+for many steps, the Gaussians are placed once more when the number of projections has grown by half. They are then
+placed with the volume of the model plus an FBP of its residual. After that the model is kept. Each time the number of
+projections has grown by half, a new round begins. It allows more Gaussians, and density control clones and splits
+Gaussians where the new projections require it. Between arrivals the fit continues, with learning rates that suit any
+number of future steps (`anytime`). A new projection is used in the first step after its arrival. Of the other steps,
+every third uses one of the newest projections, and the rest use all projections evenly (`anytime`). One in sixteen
+projections is held out until the final fit.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class StreamingFit:
             projections see.
         gaussians: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
         settings: settings of the fit; `joined_pixels` can only be used in a fit of a finished scan.
-        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
-            π).
+        first_views, first_span: the fit starts when this number of projections has arrived and they span this angle in
+            radians (modulo π).
 
     Raises:
         ValueError: the number of Gaussians is 0, `joined_pixels` is set, the axis is outside the detector, or the
@@ -74,7 +74,8 @@ class StreamingFit:
         self._stage: Waiting | Growing = Waiting(arrivals, (), np.random.default_rng(seed))
         self._now, self._start = now, now()
         self.unlearnt = math.nan
-        """Running mean of ||rendered - measured|| / ||measured|| of new projections before a step uses them."""
+        """Running mean of ||rendered - measured|| / ||measured|| for new projections, computed before a step uses
+        them."""
         self.step_seconds = 0.0
         """Duration of a step in s, measured in the last `advance`."""
 
@@ -93,7 +94,7 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """Whether there is a model; False as long as there are too few projections."""
+        """Whether the fit has a model. It has none as long as there are too few projections."""
         return isinstance(self._stage, Growing)
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
@@ -112,14 +113,14 @@ class StreamingFit:
         theta, before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
         images = checked_views(data, theta, before.template.detector_shape)
         self._stage = self._stage.followed_by(images, theta)
-        if not look_like_degrees(before.angles, ended=False):  # otherwise the warning was given before
+        if not look_like_degrees(before.angles, ended=False):  # otherwise this warning was given before
             warn_of_degrees(self._stage.views.angles, ended=False)
         if isinstance(self._stage, Growing) and theta.size:
             self.unlearnt = _running_mean(self.unlearnt, *self._stage.newest(self.settings))
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest projection, and the same projection computed from the model, as line integrals [row, col]. In
-        pixels without data both are equal.
+        """The newest projection as measured, and as computed from the model: two arrays of line integrals [row, col].
+        In pixels without data both are equal.
 
         Raises:
             ValueError: there is no model yet.
@@ -131,10 +132,10 @@ class StreamingFit:
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
         """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
-        The model is kept, unless the new data differ by a fifth from the data with which the Gaussians were placed. In
-        that case the Gaussians are placed again. `kept` are the numbers of the projections that these data belong to,
-        in order. If `kept` is given, the fit uses only these projections from now on. The learning rates then start
-        from their first values again, because the model has learnt from bad projections.
+        If the new data differ by more than a fifth (norm) from the data with which the Gaussians were placed, the
+        Gaussians are placed again. Otherwise the model is kept. `kept` are the numbers, in order, of the projections to
+        which these data belong. If `kept` is given, the fit drops all other projections. The learning rates then start
+        again from their first values, because the model was fitted to bad projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.
@@ -160,9 +161,10 @@ class StreamingFit:
         self._stage = self._stage.with_newest(image)
 
     def move_axis(self, axis_col: float) -> None:
-        """Move the rotation axis. The model moves with the axis, to where the projections show it.
+        """Move the rotation axis. The model moves with the axis, so that it stays in agreement with the projections.
 
-        After the move the model has double edges. The learning rates rise again, so that the fit can remove them.
+        After the move the model has double edges. The learning rates rise again, so that the fit can remove the double
+        edges.
         """
         self._stage = self._stage.about(float(axis_col))
 
@@ -190,18 +192,19 @@ class StreamingFit:
         """Number of steps of the final fit. Together with the steps during the scan, they make up a fit to all
         projections at once.
 
-        It is at least one per projection, and never more than a fit of all projections has. A fit that was too slow
-        during the scan therefore catches up in the final fit.
+        The number is at least one step per projection, and never more than in a fit of the finished scan. A fit that
+        was too slow during the scan therefore catches up in the final fit.
         """
         each_view_once = math.ceil(self.n_views / self.settings.views_per_step)
         taken = self._stage.state.step if isinstance(self._stage, Growing) else 0
         return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - taken))
 
     def finish(self, seconds: float = math.inf, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
-        """Make the final fit to all projections after the scan: `last_steps` steps, or about `seconds` s if shorter.
+        """Make the final fit to all projections after the scan. It has `last_steps` steps; a time limit of about
+        `seconds` s may end it earlier.
 
-        The rates decay until its end. Density control continues in its first half. `on_progress` is called about ten
-        times a second; if it returns True, the fit ends.
+        The rates decay until the end of the final fit. Density control continues in the first half. `on_progress` is
+        called about ten times a second; if it returns True, the fit ends.
 
         Raises:
             ValueError: no projection has arrived, or the projections show no material.
@@ -221,8 +224,8 @@ class StreamingFit:
         return reached()
 
     def snapshot(self, grid: Grid | None = None) -> Volume:
-        """The current volume in 1/mm on a grid (None: the grid of the fit). It is 0 everywhere as long as there is no
-        model."""
+        """The current volume in 1/mm on a grid (None: the grid of the fit). The volume is 0 everywhere as long as there
+        is no model."""
         return self._stage.volume(grid or self._plan.grid, self.settings)
 
     def best_preview(self) -> BetterVolume:
@@ -231,16 +234,17 @@ class StreamingFit:
 
     @property
     def gaussians(self) -> Gaussians | None:
-        """A copy of the model; None before the first one."""
+        """A copy of the model; None as long as there is no model."""
         return fit.gaussians_of(averaged(self._stage.state)) if isinstance(self._stage, Growing) else None
 
     def progress(self) -> Progress:
-        """The progress so far."""
+        """The progress reached so far."""
         return self._stage.progress(self._now() - self._start)
 
 
 def _run(last: Finishing, seconds: float, now: Clock, ends: Callable[[], bool]) -> None:
-    """Make the steps of a final fit, for at most about `seconds` s. `ends` is called about ten times a second."""
+    """Make the steps of a final fit, for at most about `seconds` s. `ends` is called about ten times a second; True
+    ends the steps."""
     share, begin = 0.0, now()
     reported = begin
     while share < 1:
@@ -254,6 +258,7 @@ def _run(last: Finishing, seconds: float, now: Clock, ends: Callable[[], bool]) 
 
 
 def _running_mean(before: float, measured: F32, rendered: F32) -> float:
-    """The mean of ||rendered - measured|| / ||measured|| with one more projection; `before` NaN: it is the first."""
+    """The running mean of ||rendered - measured|| / ||measured|| with one more projection. `before` is NaN if it is the
+    first projection."""
     residual = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
     return (1 - _NEW) * (before if math.isfinite(before) else residual) + _NEW * residual

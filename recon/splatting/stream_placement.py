@@ -1,4 +1,4 @@
-"""The projections of a streamed fit, and the Gaussians that are placed with them."""
+"""The projections of a fit during a scan, and the placing of Gaussians with them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _PLACED_FROM = 2**22
 
 @dataclass(frozen=True)
 class StreamPlan:
-    """How a streamed fit is made. It never changes.
+    """The plan of a fit during a scan. It never changes.
 
     Attributes:
         settings: settings of the fitting steps.
         grid: grid of the snapshots.
         count: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
-        first_views, first_span: the fit starts with this number of projections, if they span this many radians (modulo
-            π).
+        first_views, first_span: the fit starts when this number of projections has arrived and they span this angle in
+            radians (modulo π).
     """
 
     settings: FitSettings
@@ -55,13 +55,13 @@ class StreamPlan:
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """The projections of a streamed fit in the order of their arrival, without their pixels.
+    """The projections of a fit during a scan, in the order of their arrival, without their pixels.
 
     Attributes:
         template: geometry of each of them, at the angle 0.
         angles: [view] radians.
-        held_out: [view] True for a projection that no step uses until the final fit. The value stays if earlier
-            projections are dropped.
+        held_out: [view] True for a projection that no step uses until the final fit. The value stays the same if
+            earlier projections are dropped.
         n_ever: number of projections that ever arrived, including those that were dropped.
     """
 
@@ -89,7 +89,7 @@ class Arrivals:
         )
 
     def only(self, which: NDArray[np.intp]) -> Arrivals:
-        """Those with these numbers, in this order."""
+        """The projections with these numbers, in this order."""
         return replace(self, angles=self.angles[which], held_out=self.held_out[which])
 
     def about(self, axis_col: float) -> Arrivals:
@@ -98,7 +98,7 @@ class Arrivals:
 
 
 class Placement(NamedTuple):
-    """Gaussians that were placed, and the line integrals of their projections as the fitting steps use them."""
+    """Gaussians that were placed, and the line integrals of the projections in the form that the fitting steps use."""
 
     problem: FitProblem
     state: fit.FitState
@@ -113,7 +113,8 @@ def place_gaussians(
     all_views: bool,
     known: Placement | None = None,
 ) -> Placement:
-    """Gaussians placed with an FBP of the projections, or with the volume of `known` ones and an FBP of its residual.
+    """Place Gaussians with an FBP of the projections; or, if `known` Gaussians are given, with their volume plus an FBP
+    of their residual.
 
     Held-out projections are not used, unless `all_views` is True.
 

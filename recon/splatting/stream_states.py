@@ -1,10 +1,12 @@
-"""States of a streamed fit: before it has a model, with a model that grows, and in its final fit.
+"""States of a fit during a scan: before it has a model, with a model that grows, and in its final fit.
 
 `Waiting` becomes `Growing` when there are enough projections. `Growing` becomes `Waiting` again if very different line
-integrals replace those that it was placed with. `Finishing` is the final fit of a `Growing` model.
+integrals replace the line integrals with which its Gaussians were placed. `Finishing` is the final fit of a `Growing`
+model.
 
-A function of a state returns the next state and leaves the state as it was, except the model `Growing.state`. Functions
-change the model in place, because a copy of it takes as long as a step. So use only the newest `Growing` of a fit.
+A function of a state returns the next state and does not change the state itself, except the model `Growing.state`.
+Functions change the model in place, because copying the model takes as long as a step. So use only the newest `Growing`
+of a fit.
 """
 
 from __future__ import annotations
@@ -36,24 +38,24 @@ from recon.splatting.stream_placement import Arrivals, Placement, StreamPlan, pl
 
 _GROWTH = 1.5  # a new round begins when the number of projections has grown by this factor
 _YOUNG = 16  # a round that begins with fewer projections, after HALF steps, places all Gaussians again
-_LAST_GROWTH = 0.5  # density control ends at this share of the final fit
+_LAST_GROWTH = 0.5  # density control ends when this share of the final fit is done
 _AXIS_ANEW = 0.3  # px; if the axis moves by this much, the rates start again; a smaller move raises them in part
 _OTHERS = 0.2  # if replaced projections change by more than this share of their norm, the Gaussians are placed again
 # Without it: -0.4 to -13.5 dB on three scenes (texture, plates, points) in which the first 3 to 16 of 48 projections
 # are empty.
-_BLIND = 100.0  # if data are larger than the density unit implies by this factor, the first projections were empty
+_BLIND = 100.0  # if the data exceed by this factor what the density unit implies, the first projections were empty
 # share of the first number of Gaussians that a round may add; the final fit may add the rest of the growth
 _ROUND_GROWTH = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """A streamed fit without a model: there are too few projections, or they show no material.
+    """A fit during a scan that has no model yet: there are too few projections, or they show no material.
 
     Attributes:
         views: the projections so far.
         images: line integrals [row, col] of each; NaN: no data.
-        rng: of the placement and the steps.
+        rng: random generator of the placement and the steps.
         round_views: number of projections at the last attempt to place Gaussians; 0: there was none.
     """
 
@@ -63,7 +65,7 @@ class Waiting:
     round_views: int = 0
 
     def followed_by(self, images: F32, angles: F64) -> Waiting:
-        """With new projections [view, row, col]."""
+        """The state with new projections [view, row, col]."""
         return replace(self, views=self.views.followed_by(angles), images=(*self.images, *images))
 
     def with_newest(self, image: F32) -> Waiting:
@@ -80,9 +82,10 @@ class Waiting:
         return replace(self, views=self.views.about(axis_col))
 
     def next_round(self, plan: StreamPlan) -> Waiting | Growing:
-        """Place the first Gaussians if half as many projections again have arrived, and they cover enough angles.
+        """Place the first Gaussians if the number of projections has grown by half since the last attempt, and they
+        cover enough angles.
 
-        If they show no material, the fit waits for half as many again.
+        If the projections show no material, the fit waits until their number has grown by half again.
         """
         angles = self.views.angles
         early = self.views.n < _GROWTH * self.round_views or angles.size < plan.first_views
@@ -108,7 +111,7 @@ class Waiting:
         return Volume(np.zeros(grid.shape, np.float32), grid)
 
     def preview(self, plan: StreamPlan) -> BetterVolume:
-        """A volume of zeros, which is not compared."""
+        """A volume of zeros; it is not compared with FBP."""
         return BetterVolume(self.volume(plan.grid, plan.settings), False, PredictionErrors())
 
     def progress(self, seconds: float) -> Progress:
@@ -118,7 +121,7 @@ class Waiting:
 
 @dataclass(frozen=True, eq=False)
 class Growing:
-    """A streamed fit with a model.
+    """A fit during a scan that has a model.
 
     Attributes:
         views: the projections so far.
@@ -126,7 +129,7 @@ class Growing:
         state: the model. The steps, a new round and a move of the axis change it in place.
         placed: number of Gaussians at the last placement.
         schedule_step: the step from which the decay of the learning rates is counted.
-        round_views: number of projections at the begin of this round.
+        round_views: number of projections at the beginning of this round.
         unseen: projections that no step has used, in the order of arrival.
     """
 
@@ -169,8 +172,9 @@ class Growing:
     def with_images(self, images: F32, kept: NDArray[np.intp] | None) -> Growing | Waiting:
         """With other line integrals [view, row, col] of projections `kept`; None: of all.
 
-        The model goes if they differ by a fifth from those with which it was placed. If some projections are dropped,
-        the learning rates start again, because the model has learnt from bad projections.
+        If the line integrals differ by more than a fifth from those with which the Gaussians were placed, the model is
+        dropped. If some projections are dropped, the learning rates start again, because the model was fitted to bad
+        projections.
 
         Raises:
             ValueError: a projection has no usable value.
@@ -189,7 +193,7 @@ class Growing:
         )  # fmt: skip
 
     def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
-        """Whether these line integrals differ from projections `which` by more than a fifth (norm)."""
+        """Whether these line integrals differ from the projections `which` by more than a fifth (norm)."""
         changed = total = 0.0
         for view, image in zip(which, images, strict=True):
             before = self.problem.backend.numpy(self.problem.images[view]) * self.problem.scale
@@ -198,9 +202,10 @@ class Growing:
         return changed > _OTHERS**2 * total
 
     def about(self, axis_col: float) -> Growing:
-        """With the rotation axis at another column. The model moves with it to its position in the projections.
+        """The state with the rotation axis at another column. The model moves with the axis, so that it stays in
+        agreement with the projections.
 
-        The remaining errors are double edges, which the model must correct, so the learning rates rise again.
+        After the move the model has double edges. The learning rates rise again, so that the fit can remove them.
         """
         template, state = self.views.template, self.state
         moved = axis_col - template.axis_col
@@ -217,7 +222,7 @@ class Growing:
         )
 
     def next_round(self, plan: StreamPlan) -> Growing:
-        """Begin a round if half as many projections again have arrived: there is room for more Gaussians, and steps
+        """Begin a round if the number of projections has grown by half. A round allows more Gaussians, and its steps
         draw from all projections. After many steps with few projections, all Gaussians are placed again.
         """
         if self.views.n < _GROWTH * self.round_views:
@@ -226,15 +231,18 @@ class Growing:
         return self._placed_again(plan, young=young, final=False)._with_room(plan, final=False)
 
     def completed(self, plan: StreamPlan) -> Growing:
-        """The model for the final fit: with room for all Gaussians, from the better parameters (the running mean)."""
+        """The model for the final fit. It may have all Gaussians, and starts from the running mean of the parameters,
+        which is better than the latest parameters."""
         model = self._placed_again(plan, young=False, final=True)._with_room(plan, final=True)
         if model.state.mean is not None:
             model.state.parameters = {name: values + 0 for name, values in model.state.mean.items()}
         return replace(model, unseen=())
 
     def _placed_again(self, plan: StreamPlan, young: bool, final: bool) -> Growing:
-        """With all Gaussians placed again if the model is young, or if the first projections were empty."""
-        # Either the sample or the beam came later, so the density unit is noise; or the projections were too few.
+        """The model with all Gaussians placed again, if it is `young` (many steps with few projections) or if the first
+        projections were empty; otherwise the same model."""
+        # Either the sample or the beam came later, so that the density unit was computed from noise; or there were too
+        # few projections.
         problem = self.problem
         blind = max(float(image.max()) for image in problem.images) > _BLIND
         if not (blind or young):
@@ -246,9 +254,10 @@ class Growing:
         return Growing.of(self.views, again)
 
     def _with_room(self, plan: StreamPlan, final: bool) -> Growing:
-        """With room for more Gaussians; the steps draw from all projections that are there now.
+        """The model, allowed to have more Gaussians. The steps draw from all projections that have arrived.
 
-        Early projections span a narrow angle and would use all Gaussians for streaks, so a round adds only some.
+        Early projections span a narrow angle and would use all Gaussians for streaks. So a round adds only a part of
+        the Gaussians.
         """
         most = round(self.placed * growth(plan.settings))
         self.state.limit = most if final else min(most, self.state.n + round(_ROUND_GROWTH * self.placed))
@@ -256,7 +265,7 @@ class Growing:
         return replace(self, round_views=self.views.n)
 
     def stepped(self, settings: FitSettings) -> Growing:
-        """After one more step: on a projection that no step has used if there is one."""
+        """The state after one more step. The step uses a projection that no step has used, if there is one."""
         state = self.state
         if len(state.drawn) < settings.views_per_step:
             drawn = state.rng.permutation(self.views.n)
@@ -273,7 +282,8 @@ class Growing:
         return fallen(self.state.step - self.schedule_step, settings)
 
     def newest(self, settings: FitSettings) -> tuple[F32, F32]:
-        """The newest projection and that of the model, line integrals [row, col]; equal in pixels without data."""
+        """The newest projection as measured, and as computed from the model: line integrals [row, col]. In pixels
+        without data both are equal."""
         problem = self.problem
         (image,) = fit.renders(averaged(self.state), problem, settings, [self.views.n - 1])
         measured, weight = problem.images[-1] * problem.scale, problem.weights[-1]
@@ -290,7 +300,7 @@ class Growing:
         return BetterVolume.of(averaged(self.state), self.problem, plan.settings, plan.grid, apart)
 
     def progress(self, seconds: float) -> Progress:
-        """The steps so far, and the seconds since the begin of the fit."""
+        """The progress: the steps made so far, and the seconds since the beginning of the fit."""
         state = self.state
         return Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.views.n)
 
@@ -303,7 +313,7 @@ class Finishing:
         model: the model, `completed`.
         steps: number of steps of the final fit, unless a time limit ends it.
         begun: number of steps before the final fit.
-        first: position of the learning rates in their decay at its begin, 0 to 1.
+        first: position of the learning rates in their decay when the final fit begins, 0 to 1.
         settings: settings of the first half of the steps, with density control.
         settled: settings of the second half, without it.
     """
@@ -323,11 +333,11 @@ class Finishing:
 
     @property
     def share(self) -> float:
-        """Share of the steps that are done."""
+        """Share of the final fit's steps that are done."""
         return (self.model.state.step - self.begun) / self.steps
 
     def step(self, share: float) -> None:
-        """One step. `share` is the share of the final fit that is over, by steps or by time."""
+        """Make one step. `share` is the share of the final fit that is done, measured by steps or by time."""
         state, settings = self.model.state, self.settings if share < _LAST_GROWTH else self.settled
         fit.step(state, self.model.problem, settings, self.first + (1 - self.first) * share)
         average(state, self.begun)

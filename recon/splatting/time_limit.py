@@ -28,11 +28,12 @@ from recon.voxels.trial import TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
-"""Largest share of the voxel refinement in the time after the first steps. It adds more than most fitting steps."""
+"""Largest share of the time after the first steps that the voxel refinement gets. It improves the volume more than most
+fitting steps."""
 
-# a fit may end with this many times the Gaussians, and filling the volume then takes as many times longer
+# a fit may end with this many times the Gaussians of its start; filling the volume then takes this many times longer
 _GROWTH = 1.5
-_SLAB = 16  # number of slices that are filled to measure the time
+_SLAB = 16  # number of slices that are filled to measure the time for the volume
 _SWEPT_VIEWS = 8
 # Work before the iterations of a voxel refinement, without the choice of its weight, in units of an iteration: the
 # largest eigenvalue of a subset, projections and an FBP.
@@ -40,9 +41,10 @@ _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 
 
 def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of one FISTA-TV iteration over all projections.
+    """Time in s of one FISTA-TV iteration over all projections.
 
-    It is measured with forward and back-projections of a few projections and one proximal step of total variation.
+    The time is measured with forward and back-projections of a few projections and one proximal step of total
+    variation.
     """
     some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
     projector = Projector(some, grid)
@@ -55,7 +57,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
-    """Time to fill the grid at the end of a fit that starts with these Gaussians, measured on a slab."""
+    """Time in s to fill the grid at the end of a fit that starts with these Gaussians, measured on a slab."""
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
     begin = now()
     voxelize(gaussians, slab)
@@ -66,10 +68,10 @@ class FinishPlan(NamedTuple):
     """Plan of a voxel refinement: iterations, seconds and test reconstructions.
 
     Attributes:
-        sweeps: iterations of total variation; None: the default number, and PnP-DCT steps.
+        sweeps: number of total-variation iterations; None: the default number, followed by PnP-DCT steps.
         seconds: expected duration.
-        trials: True: held-out projections choose its regularisation. False: total variation with a weight from the
-            noise.
+        trials: True: test reconstructions choose the regularisation with held-out projections. False: the
+            regularisation is total variation, with a weight from the noise.
     """
 
     sweeps: int | None
@@ -80,10 +82,11 @@ class FinishPlan(NamedTuple):
 def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
     """Plan the voxel refinement of a fit within `seconds`.
 
-    If `seconds` and `beside_steps` (the time that the fitting steps leave) are enough, the plan is the default
-    refinement with PnP-DCT and test reconstructions. Otherwise it has at most the usual number of iterations. If time
-    is short, the weight is chosen without test reconstructions, which on few rows take longer than seven refinements.
-    If there is time for fewer than two iterations, the plan has none, because the work before them takes as long.
+    `beside_steps` is the time that the fitting steps leave. If `seconds` and `beside_steps` are enough, the plan is the
+    default refinement with PnP-DCT and test reconstructions. Otherwise the plan has at most the usual number of
+    iterations. If time is short, the weight is chosen without test reconstructions. (For few rows, test reconstructions
+    take longer than seven refinements.) If there is time for fewer than two iterations, the plan has no iterations,
+    because the work before the iterations takes as long as two of them.
     """
     if seconds <= 0:
         return FinishPlan(0, 0.0)
@@ -107,9 +110,10 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
 
 
 def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
-    """The voxel refinement of a method in its share of the remaining seconds, of which all steps take `steps`.
+    """The plan for the voxel refinement of a method, within its share of the remaining seconds. The fitting steps take
+    `steps` of these seconds.
 
-    If there is time for two iterations, a number that the method states is used.
+    If there is time for two iterations, and the method states a number of iterations, the plan has this number.
     """
     room, geometry = FINISH_SHARE * remaining, problem.geometry.at_row(0)
     plan = finish_within(room, remaining - steps, geometry, problem.grid, now)
@@ -118,17 +122,17 @@ def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconPr
 
 @dataclass(frozen=True, eq=False)
 class FinalFit(Iterative):
-    """The final fit after a scan, to the projections that the fit already knows, and the voxel refinement after it.
+    """The final fit after a scan, to the projections that have arrived, and the voxel refinement after it.
 
     Attributes:
         fit: the fit during the scan. It contains the line integrals of the problem in the same order, except laterally
             offset projections.
         method: the method that started the fit.
         seconds: time limit for the final fit and the voxel refinement.
-        began: time at which the fit began to wait for projections, by the clock of the run; `Progress.seconds` count
-            from it.
+        began: time at which the fit began to wait for projections, by the clock of the run. `Progress.seconds` counts
+            from this time.
         before: progress of the fit so far.
-        on_progress: also called with each progress of the final fit, while the fit can be inspected.
+        on_progress: function that also gets each progress of the final fit, at moments at which the fit may be read.
     """
 
     fit: StreamingFit
@@ -179,9 +183,9 @@ class FinalFit(Iterative):
         finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
         if not ((finished and reached.step >= reached.steps) or stop.stopped):
             warnings.warn(
-                f"{self.seconds:g} s were not enough for the final fit: it made {reached.step} of {reached.steps} "
-                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement. To get "
-                "the full quality, reconstruct the finished scan",
+                "to get the full quality, reconstruct the finished scan: "
+                f"{self.seconds:g} s were not enough for the final fit. It made {reached.step} of {reached.steps} "
+                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement",
                 stacklevel=2,
             )
         settings = {

@@ -46,7 +46,7 @@ from recon.voxels.residuals import residuals_of
 
 _TIMED = 3  # number of steps after which the time of a fit is planned
 _LOOK = 50  # number of steps between two measurements in held-out projections
-_PATIENCE = 0.2  # share of the planned steps that may pass without a better model; at least six measurements
+_PATIENCE = 0.2  # share of the planned steps that may pass without a better model, but at least six measurements
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class _FitViews:
         fitted: projections for the voxel refinement: all values finite, mean weight in the sample about 1.
         kept_back: the held-out projections in the same form; None: there are none.
         joined: factor by which pixels are binned for the fitting steps.
-        seen: the projections that the fitting steps use.
+        seen: geometry and data of the projections in the form that the fitting steps use.
         field: box of the Gaussians.
         count: number of Gaussians at the start.
     """
@@ -115,9 +115,9 @@ class _FitViews:
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
-    """The geometry of the fitting steps: all rows at the angle of the first row; on a GPU, rays without a width.
+    """The geometry of the fitting steps: all rows have the angle of the first row. On a GPU, rays have no width.
 
-    With an angle for each row, slices would turn against each other and twist the model.
+    With a different angle for each row, slices would turn against each other and twist the model.
     """
     first = geometry.at_row(0)
     return first if device == "cpu" else first.seen_with(NO_WIDTH)
@@ -131,8 +131,8 @@ class _Length:
         steps: number of steps after which the fit ends; None: only `seconds` ends it.
         seconds: time for the steps by the caller's clock; None: only `steps` ends the fit.
         sweeps: iterations of the voxel refinement; None: its default.
-        trials: True: the voxel refinement may make test reconstructions to choose its regularisation.
-        planned: True: the seconds have been divided between steps and voxel refinement.
+        trials: True: the voxel refinement may make test reconstructions to choose its regularisation. planned: True:
+            the seconds have been divided between steps and voxel refinement.
     """
 
     steps: int | None
@@ -156,7 +156,7 @@ class _Length:
 
 @dataclass(eq=False)
 class _Run:
-    """A running fit: the data that its phases share."""
+    """A running fit: the data that all of its phases use."""
 
     method: Fit
     problem: ReconProblem
@@ -183,7 +183,7 @@ class _Run:
         return self.state.step - self.tracker.best_step > patience
 
     def model(self) -> tuple[Volume, Gaussians]:
-        """The volume of the Gaussians, and the Gaussians rotated to the angle of their row."""
+        """The volume of the Gaussians, and the Gaussians, each rotated by the skew at its row."""
         model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.problem.geometry, 1)
         filled = voxel_means(
             model, self.problem.grid, self.fitting.geometry, truncation=self.method.fit.truncation
@@ -234,7 +234,7 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
 def _started(
     method: Fit, problem: ReconProblem, control: RunControl, decide: Decisions, views: _FitViews, begin: float
 ) -> _Run:
-    """The fit before its first step, or in the state of a checkpoint."""
+    """A fit before its first step, or in the state of a checkpoint."""
     settings, start, backend = method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
     first = None
@@ -280,14 +280,16 @@ def _steps(run: _Run) -> None:
         done += 1
         if done >= _TIMED and length.seconds is not None:
             _pace(run, length.seconds, now() - begin, done)
-        if state.step % _LOOK == _LOOK - 1:  # before density control, because its changes need some steps to settle
+        if (
+            state.step % _LOOK == _LOOK - 1
+        ):  # measured before density control, because its changes need some steps to settle
             run.tracker.measure(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
             run.report(reported)
         if run.control.on_checkpoint is not None and now() - saved >= run.control.checkpoint_every:
             run.control.on_checkpoint(run.checkpoint(state))
-            saved = now()  # the time for saving must not displace the fit
+            saved = now()  # saving checkpoints must take only a small part of the time
         if method.early_stop and run.stopped_falling:
             break
     run.tracker.measure(state, method.early_stop)
@@ -295,7 +297,8 @@ def _steps(run: _Run) -> None:
 
 
 def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
-    """Plan the voxel refinement and the rates of a fit of `seconds` s, from the duration of its first `done` steps."""
+    """Plan the voxel refinement and the rates of a fit with a time limit of `seconds` s, from the duration of its first
+    `done` steps."""
     length, state = run.length, run.state
     remaining, step = seconds - spent, spent / done
     if not length.planned and done == _TIMED:
@@ -308,7 +311,7 @@ def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
 
 
 def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]:
-    """The volume of the fit after voxel refinement (if there is time), and the number of iterations."""
+    """The volume of the fit after the voxel refinement (if there is time for it), and the number of iterations."""
     method, length, now, kept_back = run.method, run.length, run.control.now, run.views.kept_back
     if method.finish_sweeps == 0:
         return volume, 0
@@ -329,12 +332,12 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
 
 
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
-    """The plan of the voxel refinement, with `remaining` s left after first steps of `step` s each."""
+    """The plan of the voxel refinement if `remaining` s are left and the first steps took `step` s each."""
     return planned_finish(run.method, remaining, MOST_STEPS * step, run.views.fitted, run.control.now)
 
 
 def _predicts_worse(finished: Volume, fitted: Volume, unseen: Views) -> bool:
-    """Whether the residual in held-out projections is larger after the refinement than before, by more than 0.1 dB."""
+    """Whether the refinement increased the residual in held-out projections by more than 0.1 dB."""
     after, before = (np.square(residuals_of(volume, unseen)).mean() for volume in (finished, fitted))
     return bool(after > 10 ** (0.1 / 10) * before)
 
@@ -344,7 +347,7 @@ def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Back
     state = state_from(checkpoint, backend)
     if max(state.drawn, default=0) >= n_views:
         raise ValueError(
-            f"the checkpoint belongs to a fit of at least {max(state.drawn) + 1} projections, but the data have "
-            f"{n_views}. To resume, use the same data and settings"
+            f"to resume, use the same data and settings: the checkpoint belongs to a fit of at least "
+            f"{max(state.drawn) + 1} projections, but the data have {n_views}"
         )
     return state

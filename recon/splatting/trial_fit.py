@@ -19,25 +19,28 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 FAR_BEHIND = 0.25
-"""A test fit ends at the first look if the residual of total variation is lower by this share of its own residual.
+"""Margin of a test fit at its first check: it ends if its residual exceeds that of total variation by this share.
 
-Without this rule, the test takes half as much time again. In 17 scans, the fit is best in two; there its residual at
-the first look is 1.17 and 1.22 times that of total variation. In ten others it is 1.45 times and more, and the test
-ends.
+Without this rule, the test takes half as much time again. Of 17 scans, the fit is best in two. In these two, the
+residual of the fit at the first check is 1.17 and 1.22 times that of total variation. In ten of the others it is 1.45
+times or more, and the test ends.
 """
 
 FIRST_SHARE = 0.25
-"""Share of the steps after which a test fit is examined first. Without it: 0.9 s more CPU time, of 3 s."""
+"""Share of the steps after which a test fit is checked first. Without this check, a test takes 0.9 s more CPU time, of
+3 s."""
 
 
 def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
-    """How well a fit to the other projections predicts the held-out ones (a fit to all would know them).
+    """How well a fit predicts the held-out projections. It is a fit to the other projections, because a fit to all
+    would have used the held-out ones.
 
-    The fit ends after a quarter of its steps if it is then already better than the simpler candidates, or far behind
-    total variation.
+    The fit is checked after a quarter of its steps. It ends there if it is already better than the simpler candidates,
+    or much worse than total variation.
 
-    The prediction names no prior if the fit subtracts material outside the box from the projections. For a region of
-    interest, a prior chosen from all projections would cost 1.3 dB.
+    The prediction names no prior if the Gaussians outside the box contribute more to the projections than the residual.
+    The fit subtracts this contribution. For a region of interest, a prior that was chosen from the whole projections
+    would cost 1.3 dB.
     """
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
@@ -73,7 +76,7 @@ class _Fit:
 
     @classmethod
     def of(cls, method: Fit, trial: Trial, share: float) -> _Fit:
-        """The fit with this share of its steps.
+        """The test fit, after this share of its steps.
 
         Raises:
             ValueError: the fit cannot use these projections, for example rows without material.
@@ -97,8 +100,8 @@ class _Fit:
     def refined(self, prior: Prior) -> F64:
         """Residuals [held-out projection] of the volume after refinement with total variation.
 
-        PnP-DCT steps follow only if the residual is below that of total variation alone. They take four times as long,
-        and otherwise would not be better than PnP-DCT alone either.
+        PnP-DCT steps follow only if this residual is below that of total variation alone, because they take four times
+        as long. Otherwise the result would not be better than PnP-DCT without a fit either.
         """
         residuals = self._by(prior, 0.0)
         if prior.patches and residuals.mean() < self.trial.smooth_residuals.mean():
@@ -115,7 +118,7 @@ class _Fit:
 
     @property
     def level_beyond(self) -> float:
-        """Root mean square of the contribution from outside the box in the held-out projections."""
+        """Root mean square, in the held-out projections, of the contribution from outside the box."""
         if self.beyond_unseen is None:
             return 0.0
         return math.sqrt(np.mean(np.square(self.beyond_unseen, dtype=np.float64)))

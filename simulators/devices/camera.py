@@ -1,8 +1,8 @@
 """Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, with the timing of the real camera.
 
 Nothing runs in the background. On each call, the camera catches up with the trigger line and the clock. A frame is
-computed when it is read. For faults and noise, triggers and frames are numbered over the life of the camera, so that
-any frame can be computed again alone. Framestamps start at 0 with every arm.
+computed when it is read. For faults and noise, the camera numbers triggers and frames over its whole life, so that any
+frame can be computed again alone. Framestamps start at 0 with every arm.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class SimulatedOrcaQuest:
         seed: seed of all random numbers, together with the name of the effect and the number of the frame over the life
             of the camera.
         beam_is_on, place_of_sample: called when a frame is exposed. If the beam is off, the frame is a dark. Otherwise
-            the second one returns how many mm the sample is moved sideways; None: the frame is a flat.
+            `place_of_sample` returns how many mm the sample is moved sideways; None: the frame is a flat.
     """
 
     def __init__(
@@ -96,7 +96,8 @@ class SimulatedOrcaQuest:
         # time of the last trigger that was examined, and of the last accepted trigger
         self._seen, self._accepted = 0.0, -np.inf
         self._gone = ""
-        self._labels: dict[float, tuple[AnomalyLabel, ...]] = {}  # by the time of the frame; only frames with labels
+        # the key is the time of the frame; only frames with labels are kept
+        self._labels: dict[float, tuple[AnomalyLabel, ...]] = {}
         self._lock = threading.Lock()
 
     @property
@@ -162,7 +163,7 @@ class SimulatedOrcaQuest:
             self._seen, self._accepted = self._clock.now(), -np.inf
 
     def software_trigger(self) -> None:
-        """Expose one frame now. Raises DeviceRefused if it is not armed for software triggers, or not ready."""
+        """Expose one frame now. Raises DeviceRefused if the camera is not armed for software triggers, or not ready."""
         with self._lock:
             self._answer(armed=True)
             now, source = self._clock.now(), self._settings.trigger
@@ -246,7 +247,8 @@ class SimulatedOrcaQuest:
         )
 
     def _answer(self, armed: bool = False) -> None:
-        """Raise DeviceError if the camera is unplugged (after its last frame was read), or must be armed and is not."""
+        """Raise DeviceError if the camera is unplugged (after its last frame was read), or if it must be armed and is
+        not armed."""
         if self._gone and not self._ring:
             raise DeviceError(self.name, self._gone, advice="Connect it again", state="Frames already taken are good")
         if armed and not self._armed_for:

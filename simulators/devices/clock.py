@@ -32,7 +32,7 @@ class VirtualClock:
 
 
 class ScaledClock:
-    """A clock that starts at its base's time, or at `not_before` if that is later, and runs `speed` times as fast.
+    """A clock that starts at the time of its base, or at `not_before` if this is later, and runs `speed` times as fast.
 
     Raises:
         ValueError: speed is not positive.

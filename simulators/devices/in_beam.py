@@ -19,7 +19,7 @@ class SimulatedMonochromator:
     """Implements `drivers.base.protocols.Monochromator` and `Watchable`.
 
     Args:
-        energy: energy of the scene in keV; None: the scene states no energy.
+        energy: energy of the scene in keV; None: the scene has no energy.
         scene_at: function that returns the scene at an energy in keV; if it raises an error, the monochromator does not
             move.
         show: function that sets the sample and the beam of all later frames.
@@ -101,7 +101,7 @@ class Exposed:
 
     Attributes:
         framestamp: number from 0 since the camera was armed.
-        number: number over the life of the camera.
+        number: number of the frame over the life of the camera.
         time: time of the trigger, s since the Unix epoch.
         angle: angle of the stage at this time, radians.
         ready: time from which the frame can be read, s since the Unix epoch.

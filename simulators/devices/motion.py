@@ -1,8 +1,9 @@
 """Trapezoidal move (accelerate, constant speed, decelerate) in closed form: position at a time, and time at a
 position.
 
-With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²/a it never reaches v and takes
-2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move with the same past.
+With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²/a the axis never reaches v, and the move
+takes 2√(D/a) (constant-acceleration kinematics). A move that is stopped on the way is another such move with the same
+past.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class MotionPhase:
 
 @dataclass(frozen=True)
 class TrapezoidMove:
-    """A move from `start` to `target` that began at `begin` (s, on any clock). Built by `between`.
+    """A move from `start` to `target` that began at `begin` (s, on any clock). `between` builds it.
 
     `beyond`: function of time; additional rotation that the controller does not report as a move: by a hand on the
     knob, a hunting servo, or a motor that continues after "done". None: there is no such rotation.
@@ -153,7 +154,7 @@ class TrapezoidMove:
     def slowed(self, time: float, deceleration: float) -> TrapezoidMove:
         """The same move until `time`, then slowed down with `deceleration` (> 0) to a whole position.
 
-        It is the last whole position before the move would come to rest."""
+        This position is the last whole one before the axis would come to rest."""
         position, velocity = self.position(time), self.velocity(time)
         stand = position + self.direction * velocity**2 / (2 * deceleration)
         last = math.floor(stand) if self.direction > 0 else math.ceil(stand)
@@ -181,8 +182,8 @@ class MovedAxis:
     """An axis that rotates the sample with moves in closed form, and keeps the last moves.
 
     Args:
-        begin: s, on any clock; from this time on, the axis is at rest at `counts`.
-        counts_per_turn: counts for 2π of true angle.
+        begin: time in s on any clock; from this time on, the axis is at rest at `counts`. counts_per_turn: number of
+            counts for 2π of true angle.
     """
 
     def __init__(self, begin: float, counts: float, counts_per_turn: int) -> None:
@@ -206,7 +207,7 @@ class MovedAxis:
         self._replace(replace(self.move, beyond=beyond))
 
     def _at(self, time: float) -> tuple[TrapezoidMove, int]:
-        """The move at a time, and the count at the true angle 0 then."""
+        """The move at a time, and the count at the true angle 0 at this time."""
         return next((past for past in reversed(self._moves) if past[0].begin <= time), self._moves[0])
 
     def _remember(self, move: TrapezoidMove) -> None:
@@ -219,7 +220,7 @@ class MovedAxis:
 
 
 def _seconds_for(distance: float, phase: MotionPhase, sign: int) -> float:
-    """Time to cover `distance` ahead in a phase: the root of d = vt + at²/2 in the form that does not cancel."""
+    """Time that a phase takes for `distance`: the root of d = vt + at²/2, in the form in which no digits cancel."""
     velocity, acceleration = sign * phase.velocity, sign * phase.acceleration
     root = math.sqrt(max(velocity * velocity + 2.0 * acceleration * distance, 0.0))
     return 2.0 * distance / (velocity + root) if velocity + root > 0 else 0.0

@@ -17,7 +17,7 @@ from simulators.devices.trigger_line import Pulse, TriggerLine
 
 
 class Ended(IntFlag):
-    """Why the last move ended early; the values are the PM16C's status bits."""
+    """The reason why the last move ended early; the values are status bits of the PM16C."""
 
     LIMIT = 0x20
     SLOW_STOP = 0x40
@@ -26,8 +26,8 @@ class Ended(IntFlag):
 
 @dataclass(frozen=True)
 class TriggerSettings:
-    """Pulses of `width` s at start, start + interval, ... not beyond end (counts); end < start turns the other way.
-    Without a width the output is off."""
+    """Pulses of `width` s at the counts start, start + interval, ... up to end. If end < start, the motor turns the
+    other way. Without a width the output is off."""
 
     width: float | None = 1e-3
     start: int = 1000
@@ -46,13 +46,13 @@ class TriggerSettings:
 class MotorOutput:
     """The counter of a trigger output. After it is armed, each point fires once when the axis passes it forwards.
 
-    After a stop between points, the remaining points fire when the move continues. Moving back over points that have
-    fired does not fire them again. A pulse that begins while the last one is still high gives no edge, so with width >=
-    interval time the output stays high.
+    After a stop between points, the remaining points fire when the move continues. Points that have fired do not fire
+    again if the axis moves back over them. A pulse that begins while the last one is still high gives no edge. So the
+    output stays high if the width is at least the time of one interval.
 
     Args:
-        lost: pulses, counted from 0 since power-on, that never reach the line.
-        fires_at_start: the start point itself is one of the points.
+        lost: pulses that never reach the line, counted from 0 since power-on. fires_at_start: True: the start point
+            itself is one of the points.
     """
 
     def __init__(self, lost: Set[int], fires_at_start: bool = True) -> None:
@@ -65,7 +65,7 @@ class MotorOutput:
         self._coming: list[float] = []
 
     def can_arm(self, position: int) -> bool:
-        """True if the output is on, and the axis, at `position`, is before its start point."""
+        """True if the output is on, and the axis is at a `position` before the start point."""
         return self.settings.width is not None and self.settings.sign * (self.settings.start - position) > 0
 
     def arm(self) -> None:
@@ -101,7 +101,7 @@ class MotorOutput:
             arrival = _arrival(move, point)
             if arrival is None:
                 break
-            time = max(arrival, math.nextafter(now, math.inf))  # not fired yet, so it is still to come
+            time = max(arrival, math.nextafter(now, math.inf))  # this edge has not fired yet, so it is still to come
             if time > high_until and self._fired_before + index not in self._lost:
                 edges.append((time, point))
             high_until = time + width
@@ -110,7 +110,7 @@ class MotorOutput:
 
 
 def _arrival(move: TrapezoidMove, position: int) -> float | None:
-    """When a move arrives at `position`; None if it does not arrive, or starts there."""
+    """Time at which a move arrives at `position`; None if the move does not arrive there, or starts there."""
     low, high = sorted((move.start, move.target))
     return move.time_at(position) if low <= position <= high and position != move.start else None
 
@@ -119,8 +119,8 @@ class PulseMotor(MovedAxis):
     """One axis. `line()` returns the cable of its trigger output, or None without a cable.
 
     Args:
-        counts_per_turn: pulses for 2π of true angle.
-        lost: trigger pulses, counted from 0 since power-on, that never reach the line.
+        counts_per_turn: number of pulses for 2π of true angle. lost: trigger pulses that never reach the line, counted
+            from 0 since power-on.
         stall_at: a move that would pass this count stops there at once (EMERGENCY), as by an interlock.
         switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
         fires_at_start: True: the start point of a train itself gives a pulse.
@@ -150,17 +150,17 @@ class PulseMotor(MovedAxis):
         return self._clock.now() < self.move.end
 
     def position(self) -> int:
-        """Pulses put out so far, signed."""
+        """The signed number of pulses so far."""
         return self.move.counts(self._clock.now())
 
     def preset(self, count: int) -> None:
-        """Set the count of the present position to `count`; nothing moves."""
+        """Set the count of the present position to `count`; the motor does not move."""
         now, here = self._clock.now(), self.position()
         self.zero += count - here
         self._remember(TrapezoidMove(now, count, count, ()))
 
     def start(self, target: int, speed: float, acceleration: float) -> None:
-        """Move from standing to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""
+        """Move from rest to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""
         now, here = self._clock.now(), self.position()
         move = TrapezoidMove.between(here, target, speed, acceleration, begin=now)
         self.ended = Ended(0)

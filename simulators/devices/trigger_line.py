@@ -53,7 +53,7 @@ class TriggerLine:
             del self._pulses[bisect_right(self._pulses, time, key=attrgetter("time")) :]
 
     def next_after(self, time: float) -> Pulse | None:
-        """The first pulse strictly later than `time`, even in the future; None without one."""
+        """The first pulse strictly later than `time`, even if it is in the future; None if there is none."""
         with self._lock:
             at = bisect_right(self._pulses, time, key=attrgetter("time"))
             return self._pulses[at] if at < len(self._pulses) else None
@@ -64,7 +64,7 @@ class TriggerLine:
             self._angle = angle
 
     def angle_at(self, time: float) -> float:
-        """The true angle in radians at `time`; 0 if nothing turns the sample."""
+        """The true angle in radians at `time`; 0 if no stage turns the sample."""
         with self._lock:
             angle = self._angle
         return 0.0 if angle is None else float(angle(time))

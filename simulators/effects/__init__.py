@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Domain(IntEnum):
-    """The quantity that an effect acts on, in the order of physics."""
+    """The quantity on which an effect acts, in the order of physics."""
 
     MOTION = 0
     OPTICAL_DEPTH = 1
@@ -25,11 +25,10 @@ class EffectRow:
     """An effect of the catalogue.
 
     Attributes:
-        domain: what it acts on.
-        summary: what happens, in half a sentence.
-        follows: effects of the same domain that must come before it, because another order changes the frame.
-        reason: why they come before it.
-        module: the module of its class; the class PhotonNoise belongs to the effect photon_noise.
+        domain: the quantity on which the effect acts. summary: half a sentence that says what happens. follows: effects
+            of the same domain that must come before this one, because another order changes the frame. reason: the
+            reason why they come before. module: the module of its class; the class PhotonNoise belongs to the effect
+            photon_noise.
     """
 
     domain: Domain

@@ -1,7 +1,7 @@
 """Catalogue: every effect by name, with its domain and its place in the order; no effect's module is imported here.
 
-The module of effect `photon_noise` is simulators.effects.sensor, and its class PhotonNoise. It is imported when a
-scene names the effect. EFFECTS of a folder has those in it.
+The module of effect `photon_noise` is simulators.effects.sensor, and its class PhotonNoise. It is imported when a scene
+names the effect. EFFECTS of a folder contains the effects of this folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from simulators.effects import Domain, EffectRow
 __all__ = ["CATALOGUE", "FINAL", "Domain", "EffectRow", "load_effect", "order_error"]
 
 FINAL = frozenset({"photon_noise", "read_noise", "adc"})
-"""Effects that end their domain: nothing of that domain may follow."""
+"""Effects that end their domain: no other effect of this domain may follow."""
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
 _exposure, _sensor = (partial(EffectRow, module=f"simulators.effects.{name}") for name in ("exposure", "sensor"))
 _OURS: Mapping[str, EffectRow] = MappingProxyType(
@@ -30,7 +30,7 @@ _OURS: Mapping[str, EffectRow] = MappingProxyType(
             Domain.PHOTONS,
             "the sensor detects only a share of the photons",
             frozenset({"scatter"}),
-            "stray light is detected like other light",
+            "the detector counts stray light like other light",
         ),
         "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),
         "dark_current": _sensor(Domain.ELECTRONS, "electrons that are generated without light (dark current)"),
@@ -66,7 +66,7 @@ _ALL = {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()
 
 
 def _place(name: str) -> tuple[Domain, bool, int]:
-    """Position of an effect: in the order of domains, and within its domain after all effects that it must follow."""
+    """Position of an effect: first by its domain, and within the domain after all effects that it must follow."""
 
     def depth(of: str) -> int:
         return max((1 + depth(before) for before in _ALL[of].follows if before in _ALL), default=0)
@@ -78,7 +78,7 @@ CATALOGUE: Mapping[str, EffectRow] = MappingProxyType({name: _ALL[name] for name
 
 
 def order_error(earlier: str, later: str) -> str:
-    """Why two effects of one domain cannot have this order; "" if they can."""
+    """The reason why two effects of one domain cannot have this order; "" if they can."""
     entry = CATALOGUE.get(earlier)
     if entry is None or later not in entry.follows:
         return ""

@@ -18,7 +18,7 @@ class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
     The catalogue gives its `name`, its `domain`, and `final` for the last effect of a domain. These are photon noise,
-    read noise (of electrons) and the converter (of counts). An effect outside the catalogue states all three.
+    read noise (of electrons) and the converter (of counts). An effect outside the catalogue defines all three itself.
     """
 
     name: ClassVar[str]
@@ -48,7 +48,8 @@ class PoseEffect(Effect, Protocol):
 class AreaEffect(Effect, Protocol):
     @property
     def offsets(self) -> Sequence[tuple[float, float]]:
-        """(row, col) of each ray of a pixel, in pixels from its middle: its light is the mean over them."""
+        """(row, col) of each ray of a pixel, in pixels from its middle; the intensity of the pixel is the mean over
+        these rays."""
 
 
 @runtime_checkable
@@ -68,7 +69,7 @@ AnyEffect: TypeAlias = SamplingEffect | PoseEffect | AreaEffect | ImageEffect
 
 @dataclass(frozen=True)
 class Chain:
-    """Effects in an order that physics allows. Created by `Chain.of`."""
+    """Effects in an order that physics allows. `Chain.of` creates it."""
 
     effects: tuple[AnyEffect, ...]
 
@@ -102,7 +103,7 @@ class Chain:
 
     @property
     def moves(self) -> bool:
-        """Whether frames depend on other times than that of the trigger."""
+        """True if frames depend on other times than the time of the trigger."""
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
@@ -144,7 +145,7 @@ class Chain:
         return tuple(labels.values())
 
 
-VISIBLE = 1e-3  # smallest change of the light that is labelled, as a share
+VISIBLE = 1e-3  # smallest change of the intensity that is labelled, as a share
 NARROWEST = 1e-9  # mm: an edge with a smaller penumbra is a step
 
 
@@ -155,7 +156,7 @@ def _in_order(views: tuple[int, int]) -> tuple[int, int]:
 
 
 ViewRange = Annotated[tuple[int, int], AfterValidator(_in_order)]
-"""First view and the one after the last. A flat belongs to the projection that is exposed next."""
+"""First projection and the one after the last. A flat belongs to the projection that is exposed next."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ class AnomalyLabel:
     Attributes:
         kind: the anomaly's name.
         region: (first row, row after the last, first column, column after the last) in pixels of the frame.
-        which: number among several of one kind; the same in every frame.
+        which: number of the anomaly among several of one kind; the same in every frame.
     """
 
     kind: str
@@ -173,14 +174,14 @@ class AnomalyLabel:
     which: int = 0
 
     def joined(self, other: AnomalyLabel) -> AnomalyLabel:
-        """This label with a region that includes the other's."""
+        """This label with a region that includes the region of the other label."""
         (top, below, left, right), region = self.region, other.region
         joined = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
         return AnomalyLabel(self.kind, joined, self.which)
 
 
 def within(views: ViewRange | None, shot: Shot) -> bool:
-    """True if the shot lies in the range; True without a range."""
+    """True if the shot lies in the range, or if there is no range."""
     return views is None or views[0] <= shot.view < views[1]
 
 

@@ -18,7 +18,7 @@ LOOKS = 5  # number of times within the exposure at which the stage's angle is r
 
 @dataclass(frozen=True)
 class MotionBlur(SamplingEffect):
-    """Mean of the transmission over times within the exposure; their number depends on the blur (at rest: 1).
+    """Mean of the transmission over times within the exposure; the number of times depends on the blur (at rest: 1).
 
     The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are not better, since the
     transmission jumps at edges. A battery with 1 px of blur and 1, 2, 4, 8 moments has errors of 1.1, 0.38, 0.13,
@@ -37,7 +37,7 @@ class MotionBlur(SamplingEffect):
         n = self.samples(shot)
         if n == 0:
             return moments
-        within = ((np.arange(n) + 0.5) / n - 0.5) * shot.exposure  # from the middle of the exposure
+        within = ((np.arange(n) + 0.5) / n - 0.5) * shot.exposure  # time from the middle of the exposure
         times = (within[:, None, None] + moments.times).reshape(-1, moments.times.shape[1])
         return Moments(times, np.tile(moments.weights / n, n))
 
@@ -45,9 +45,9 @@ class MotionBlur(SamplingEffect):
         """Number of moments; 0 if the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
-        rim, sod = shot.radius / shot.detector.pitch, shot.detector.sod  # its travel, pixels a radian
+        rim, sod = shot.radius / shot.detector.pitch, shot.detector.sod  # travel of the rim, pixels per radian
         if not math.isinf(sod):
-            rim /= max(1 - shot.radius / sod, 0.05)  # on the side towards the source
+            rim /= max(1 - shot.radius / sod, 0.05)  # the rim on the side towards the source
         return math.ceil(min(turned * rim / self.tolerance_px, self.max_samples))
 
 
@@ -59,7 +59,8 @@ class PixelArea(AreaEffect):
     explain such projections, and iterative methods change their volumes to fit them (docs/studies.md).
 
     Attributes:
-        rays: number along each side of the pixel, 2 ... 8; each of the rays² needs the line integrals of a frame.
+        rays: number of rays along each side of the pixel, 2 ... 8; each of the rays² rays needs the line integrals of a
+            frame.
     """
 
     rays: int = setting(2, ge=2, le=8)
@@ -74,19 +75,16 @@ class PixelArea(AreaEffect):
 class BeamProfile(ImageEffect):
     """A Gaussian of 1 in its middle times horizontal stripes, as a multilayer monochromator leaves them.
 
-    The middle of the beam, stripes and all, is at centre + wander_speed t + wander sin(2 pi t / wander_period), t in s
+    The middle of the beam, with its stripes, is at centre + wander_speed t + wander sin(2 pi t / wander_period), t in s
     since the camera was connected. The wander does not shift the image: the beam moves, the sample and the scintillator
     do not. Within an exposure the beam is constant.
 
     Attributes:
         sigma: (horizontal, vertical) in mm.
         stripes: amplitude of the stripes, as a share of the beam.
-        stripe_period: mm, vertically.
-        drift: mm/s, speed of the stripes down the rows within the beam.
-        centre: (horizontal, vertical) in mm from the rotation axis and z = 0.
-        wander_speed: (horizontal, vertical) in mm/s.
-        wander: amplitude (horizontal, vertical) in mm.
-        wander_period: s.
+        stripe_period: vertical period of the stripes in mm. drift: speed of the stripes down the rows within the beam,
+            mm/s. centre: position (horizontal, vertical) in mm from the rotation axis and z = 0. wander_speed: speed
+            (horizontal, vertical) in mm/s. wander: amplitude (horizontal, vertical) in mm. wander_period: period in s.
     """
 
     sigma: tuple[Positive, Positive]

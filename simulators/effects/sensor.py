@@ -19,7 +19,8 @@ from simulators.pixels.pattern import binned, normals
 
 @dataclass(frozen=True)
 class QuantumEfficiency(ImageEffect):
-    """Scales the expectation before the photon noise. Thinned Poisson is Poisson (Kingman 1993, ch. 5), so it is exact.
+    """Scales the expectation before the photon noise. This is exact, because a thinned Poisson process is a Poisson
+    process (Kingman 1993, ch. 5).
 
     A scene's beam.photons_per_s are then photons of the scintillator's light that arrive at the sensor; without this
     effect they are detected photons. LuAG:Ce emits at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
@@ -27,8 +28,8 @@ class QuantumEfficiency(ImageEffect):
     Attributes:
         value: 0 ... 1, or
         wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly, or
-        path: the path from X-ray photons to electrons; photons_per_s then counts X-ray photons. Their noise is not
-            simulated, only that of light, see `PhotonNoise`.
+        path: the path from X-ray photons to electrons; photons_per_s then counts X-ray photons. The noise of X-ray
+            photons is not simulated, only the noise of light, see `PhotonNoise`.
     """
 
     value: Share | None = None
@@ -41,7 +42,7 @@ class QuantumEfficiency(ImageEffect):
 
     @property
     def efficiency(self) -> float:
-        """Photoelectrons a photon."""
+        """Number of photoelectrons per photon."""
         if self.path is not None:
             return self.path.absorbed * self.path.electrons
         if self.wavelength_nm is not None:
@@ -58,10 +59,10 @@ class QuantumEfficiency(ImageEffect):
 class PhotonNoise(ImageEffect):
     """Poisson noise around the expected photons, which are whole numbers afterwards.
 
-    Detected photons and pixels are independent. Behind a scintillator this holds if few of an X-ray's photons reach
-    the same pixel. If g of them reach it, the variance is 1 + g times larger and correlated by the blur (Cunningham,
-    Westmore & Fenster 1994, Med. Phys. 21:417). That is not simulated: photons_per_s divided by 1 + g gives the same
-    signal-to-noise ratio.
+    Detected photons and pixels are independent. Behind a scintillator this is true if few of the light photons of one
+    X-ray photon reach the same pixel. If g of them reach it, the variance is 1 + g times larger and correlated by the
+    blur (Cunningham, Westmore & Fenster 1994, Med. Phys. 21:417). This is not simulated: photons_per_s divided by 1 + g
+    gives the same signal-to-noise ratio.
     """
 
     def apply(self, image: Image, shot: Shot) -> Image:
@@ -79,7 +80,7 @@ class DarkCurrent(ImageEffect):
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
 
     Attributes:
-        rate: electrons a second and sensor pixel.
+        rate: dark current, electrons per second in each sensor pixel.
     """
 
     rate: NotNegative = DARK_CURRENT
@@ -121,10 +122,11 @@ class Saturation(ImageEffect):
 
 @dataclass(frozen=True)
 class ReadNoise(ImageEffect):
-    """Gaussian noise of the readout. Binned pixels are read one by one, so that their variances add up.
+    """Gaussian noise of the readout. The camera reads the sensor pixels of a binned pixel one by one, so their
+    variances add up.
 
     Attributes:
-        rms: electrons of a sensor pixel; replaces the value of the readout.
+        rms: noise of a sensor pixel in electrons; it replaces the value of the readout.
         spread: differences between pixels: standard deviation of ln(rms of a pixel); the median is rms.
         seed: seed of the pixels' noise.
     """
@@ -150,12 +152,11 @@ class ReadNoise(ImageEffect):
 
 @dataclass(frozen=True)
 class Offset(ImageEffect):
-    """Offset of the counts, the same for any binning (to check on a camera); none in the photon number readout.
+    """Offset of the counts, the same for any binning (to check on a camera). The photon number readout has no offset.
 
     Attributes:
-        spread: standard deviation between sensor pixels in counts (normal distribution), about 1 on an ORCA-Quest;
-            the offsets of binned pixels add up.
-        seed: of the pixels' offsets.
+        spread: standard deviation between sensor pixels in counts (normal distribution), about 1 on an ORCA-Quest; the
+            offsets of binned pixels add up. seed: seed of the offsets.
     """
 
     spread: NotNegative = 0.0

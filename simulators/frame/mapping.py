@@ -52,7 +52,8 @@ def build(cls: type[T], where: str, mapping: Any) -> T:
 
 
 def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[str, Any]]:
-    """The kind that an entry names and the rest of its keys: a bare name, or a mapping with a `kind`."""
+    """The kind that an entry names, and the other keys of the entry. An entry is a bare name, or a mapping with a
+    `kind`."""
     kind = entry.get("kind") if isinstance(entry, Mapping) else entry
     if not isinstance(kind, str) or kind not in legal:
         raise SceneError(f"{where}: {unknown('kind', kind, legal)}")
@@ -61,14 +62,14 @@ def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[st
 
 
 def choose(where: str, choices: Mapping[str, type[Any]], entry: Any) -> Any:
-    """The dataclass that an entry names, built from the rest."""
+    """The dataclass that an entry names, built from the other keys."""
     kind, rest = named(where, list(choices), entry)
     return build(choices[kind], f"{where} ({kind})", rest)
 
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Turn a ValueError of the block into a SceneError at this path; a SceneError keeps its own."""
+    """Turn a ValueError of the block into a SceneError at this path; a SceneError keeps its own path."""
     try:
         yield
     except SceneError:
@@ -85,7 +86,7 @@ def _adapter(cls: type[T]) -> TypeAdapter[T]:
 
 
 def _dataclasses(kind: Any) -> Iterator[Any]:
-    """A dataclass and those of its fields; those in a type that is made of others."""
+    """A dataclass and the dataclasses of its fields, also inside types that are made of others."""
     parts = get_type_hints(kind).values() if is_dataclass(kind) else get_args(kind)
     yield from (kind,) if is_dataclass(kind) else ()
     for part in parts:

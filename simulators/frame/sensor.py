@@ -1,14 +1,13 @@
 """Sensor: values of the ORCA-Quest, and the conversion of electrons to counts.
 
-A beam states detected photons, so that each photon gives one electron, unless a scene names the quantum efficiency.
-The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000
-electrons.
-Binning is digital: charge and noise of the summed pixels add up.
+The photons of a beam are detected photons, so that each photon gives one electron, unless a scene names the quantum
+efficiency. The 16-bit converter clips at 65 535 counts. This is 6991 electrons above the offset, just below a full well
+of 7000 electrons. Binning is digital: charge and noise of the summed pixels add up.
 
 Photon number resolving is a readout of the camera and needs no effect. A count is an electron and there is no offset,
 so that `digitise` gives round(max(electrons, 0)). To check on a camera: that it subtracts the offset of each pixel,
-reads with the noise of ultra quiet and counts to about 200. A binned pixel is rounded once, after its sum; the camera
-rounds each pixel first, which leaves slightly less noise.
+reads with the noise of ultra quiet and counts to about 200. Here a binned pixel is rounded once, after its sum. The
+camera rounds each pixel first, so its noise is slightly lower.
 """
 
 from __future__ import annotations
@@ -21,16 +20,17 @@ from numpy.typing import NDArray
 from drivers.orca_quest import BITS, MODEL
 
 CONVERSION = MappingProxyType({"standard": 0.107, "ultra_quiet": 0.107, "photon_number": 1.0})
-"""Electrons a count in each readout."""
+"""Number of electrons per count in each readout."""
 OFFSET = MappingProxyType({"standard": 200.0, "ultra_quiet": 200.0, "photon_number": 0.0})
 """Counts of a pixel without charge in each readout."""
 READ_NOISE = MappingProxyType({"standard": 0.43, "ultra_quiet": 0.27, "photon_number": 0.27})
-"""Electrons rms in each readout."""
+"""Rms noise in electrons in each readout."""
 LARGEST_PHOTON_NUMBER = 200  # Values of an unbinned pixel
 READ_NOISES = MappingProxyType(
     {MODEL: READ_NOISE, "C15550-22UP": READ_NOISE | {"ultra_quiet": 0.3, "photon_number": 0.3}}
 )
-"""For each model; the value of C15550-22UP in photon number resolving is assumed to be that of ultra quiet."""
+"""For each model. The value of the C15550-22UP in photon number resolving is assumed to be equal to the value in ultra
+quiet."""
 DARK_CURRENT = 0.0036
 """Electrons per second and pixel, measured on two C15550-20UP.
 

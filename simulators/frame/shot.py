@@ -45,7 +45,7 @@ class Detector:
         return cls(shape, pitch, (shape[1] - 1) / 2, (shape[0] - 1) / 2, sod)
 
     def aimed(self, row: float, col: float) -> Detector:
-        """The rays at this offset, in pixels, from the rays through the pixels' middles."""
+        """The rays at this offset, in pixels, from the rays through the middles of pixels."""
         return replace(self, axis_col=self.axis_col - col, axis_row=self.axis_row - row)
 
     def u(self) -> NDArray[np.float64]:
@@ -61,7 +61,8 @@ class Pose:
 
     The laboratory's axes are u (along the rows), b (along the beam, away from the source) and v (up the columns'
     index). A point p = (x, y, z) of the sample at angle θ is at u = x cos θ + y sin θ, b = y cos θ - x sin θ, v = z.
-    The tilt rotates that about the laboratory's u and b through the origin, and the shift is added last.
+    The tilt rotates this point about the axes u and b of the laboratory through the origin, and the shift is added
+    last.
 
     Attributes:
         angle: float64 [row], radians.
@@ -75,19 +76,19 @@ class Pose:
 
     @classmethod
     def turned(cls, angle: ArrayLike, rows: int) -> Pose:
-        """Rotation only; `angle` in radians, one for the frame or one a row [row]."""
+        """Rotation only; `angle` in radians, one for the frame or one per row [row]."""
         return cls(np.ascontiguousarray(np.broadcast_to(np.asarray(angle, dtype=np.float64), (rows,))))
 
     def turned_by(self, angle: ArrayLike) -> Pose:
-        """Turned further by `angle` radians, one for the frame or one a row."""
+        """The pose after a further rotation by `angle` radians, one for the frame or one per row."""
         return Pose(self.angle + np.asarray(angle, dtype=np.float64), self.shift, self.tilt)
 
     def shifted_by(self, shift: ArrayLike) -> Pose:
-        """Shifted further by `shift` mm, [3] or [row, 3]."""
+        """The pose after a further shift by `shift` mm, [3] or [row, 3]."""
         return Pose(self.angle, _added(self.shift, shift, (self.angle.size, 3)), self.tilt)
 
     def tilted_by(self, tilt: ArrayLike) -> Pose:
-        """Tilted further by `tilt` radians, [2] or [row, 2]; small tilts add up, to second order."""
+        """The pose after a further tilt by `tilt` radians, [2] or [row, 2]; small tilts add up, to second order."""
         return Pose(self.angle, self.shift, _added(self.tilt, tilt, (self.angle.size, 2)))
 
     def frames(self) -> tuple[Reals, Reals]:
@@ -111,7 +112,7 @@ class Pose:
 
 
 def _matrices(entries: list[list[Reals]]) -> Reals:
-    """[row, 3, 3] of entries each [row]."""
+    """An array [row, 3, 3] from entries that are each [row]."""
     return np.moveaxis(np.array(entries), 2, 0)
 
 
@@ -121,7 +122,7 @@ def _added(present: Reals | None, more: ArrayLike, shape: tuple[int, int]) -> Re
 
 
 class CannotExposeError(ValueError):
-    """The scene cannot be exposed, although each of its values is allowed; the message says what would help."""
+    """The scene cannot be exposed, although each of its values is allowed. The message says what would help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,25 +130,18 @@ class Shot:
     """The conditions of one exposure.
 
     Attributes:
-        detector: the frame's pixels (after ROI and binning).
-        exposure: s.
-        time: s since the Unix epoch, at the trigger.
+        detector: the pixels of the frame (after ROI and binning). exposure: exposure time in s. time: time of the
+            trigger, s since the Unix epoch.
         angle: radians, true angle of the stage at which a frame without effects of motion shows the sample.
-        angle_at: true angle of the stage in radians at a time in s; called by effects of motion only.
-        elapsed: s since the camera was connected; the time of all drifts.
-        row_period: s by which each row starts later than the one above.
-        roi: (row0, col0, rows, cols) of the sensor.
-        binning: sensor pixels summed per side.
-        readout: the camera's mode: "standard", "ultra_quiet" or "photon_number".
-        conversion: electrons a count.
-        beam: the shutter is open (otherwise a dark).
-        sample: the sample is in the beam (otherwise a flat).
-        radius: mm from the rotation axis to the farthest matter of the sample.
-        seed: of all random numbers.
-        frame: number since the camera was connected, of any kind.
-        view: projections exposed before this frame.
-        model: of the camera.
-        aside: mm by which the sample is moved sideways, towards higher columns.
+        angle_at: function that returns the true angle of the stage in radians at a time in s; only effects of motion
+            call it. elapsed: s since the camera was connected; the time of all drifts. row_period: s by which each row
+            starts later than the row above. roi: (row0, col0, rows, cols) of the sensor. binning: number of sensor
+            pixels summed per side. readout: mode of the camera: "standard", "ultra_quiet" or "photon_number".
+            conversion: electrons per count. beam: True if the shutter is open (otherwise the frame is a dark). sample:
+            True if the sample is in the beam (otherwise the frame is a flat). radius: mm from the rotation axis to the
+            farthest material of the sample. seed: seed of all random numbers. frame: number of the frame since the
+            camera was connected, of any kind. view: number of projections exposed before this frame. model: model of
+            the camera. aside: mm by which the sample is moved sideways, towards higher columns.
     """
 
     detector: Detector
@@ -197,12 +191,13 @@ class Moments:
 
 
 def frame_rng(effect: str, shot: Shot) -> np.random.Generator:
-    """The generator of (seed, effect, frame), so that any frame can be computed alone, independent of other effects."""
+    """The generator of (seed, effect, frame). With it any frame can be computed alone, and independently of other
+    effects."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
 def fixed_rng(effect: str, seed: int) -> np.random.Generator:
-    """The generator of (effect, its own seed), for everything that is the same in all frames.
+    """The generator of (effect, seed of the effect), for everything that is the same in all frames.
 
     It has a spawn key: numpy ignores zeros at the end, so (seed, effect) would equal (seed, effect, frame 0)."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

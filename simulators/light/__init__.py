@@ -10,7 +10,8 @@ from typing import Annotated
 from recon.base.setting import Setting, setting
 from simulators.frame.mapping import NotNegative, Positive
 
-NEAREST, FARTHEST = 1e-6, 1e9  # mm, of a cone's source: squares of far larger distances overflow
+# mm, limits of the distances of the source of a cone: squares of much larger distances overflow
+NEAREST, FARTHEST = 1e-6, 1e9
 
 
 @dataclass(frozen=True)
@@ -36,15 +37,15 @@ class Beam:
     energies is part of the weights.
 
     Attributes:
-        photons_per_s: detected a second by each (unbinned) sensor pixel in the open beam.
+        photons_per_s: number of photons that each (unbinned) sensor pixel detects per second in the open beam.
         sod: mm from the source to the rotation axis; None for a parallel beam.
         sdd: mm from the source to the detector.
-        energy_kev: of a monochromatic beam, or the middle of its bandwidth.
-        bandwidth: full width at half maximum over energy of a Gaussian line: 1e-4 behind Si 111, 0.01 to 0.05 for pink
-        beams. None: a single energy.
+        energy_kev: energy of a monochromatic beam, or the middle of its bandwidth. bandwidth: full width at half
+            maximum of a Gaussian line, divided by the energy: 1e-4 behind Si 111, 0.01 to 0.05 for pink beams. None: a
+            single energy.
         harmonics: shares of the light at multiples of the energy: {3: 0.01}. None: no harmonics.
-        spectrum: [keV, weight] pairs of any sum, instead of energy_kev.
-        tube: instead of energy_kev.
+        spectrum: [keV, weight] pairs with any sum of weights; it replaces energy_kev. tube: an X-ray tube; it replaces
+            energy_kev.
     """
 
     photons_per_s: NotNegative
@@ -85,5 +86,5 @@ class Beam:
 
     @property
     def has_energy(self) -> bool:
-        """True if it states its energies, as materials need."""
+        """True if the beam has energies; materials need them."""
         return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

@@ -1,9 +1,9 @@
 """Broad blur: a wide, round blur, computed on a smaller image because the result has no fine detail.
 
-Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of
-(ω width)², with the angular frequency ω. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
-(2 - 2 cos ω_y). Each transfer function of this module is a mixture of Gaussians, so that its kernel is a mixture of
-discrete Gaussians (Lindeberg 1990). These are nonnegative at any width, and so are the photons.
+Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of (ω
+width)², with the angular frequency ω. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) + (2 - 2
+cos ω_y). Each transfer function of this module is a mixture of Gaussians, so that its kernel is a mixture of discrete
+Gaussians (Lindeberg 1990). These Gaussians are nonnegative at any width, so the number of photons is nonnegative, too.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from simulators.pixels.bands import share_rows
 Image = NDArray[np.float64]
 Transfer = Callable[[Image], Image]
 COARSE = 4
-"""Least width of a blur in pixels of the smaller image; larger is finer and slower."""
+"""Least width of a blur in pixels of the smaller image; a larger value is finer and slower."""
 FAR = 1e6
-"""Largest width of a blur in frames: the light is even then."""
+"""Largest width of a blur, in widths of the frame: with this width the intensity is even."""
 
 
 def gaussian(s: Image) -> Image:

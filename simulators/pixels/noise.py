@@ -1,8 +1,8 @@
 """Noise: exact Poisson and normal noise of a frame, row by row; each row has its own random stream.
 
-A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: without
-rejection, so that rows can be vectorised. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
-"Algorithm 955"). The expansion may be closer to a whole number than its error. In that case, one in thousands, the
+A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution. No number
+is rejected, so rows can be vectorised. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
+"Algorithm 955"). The expansion may be closer to a whole number than its error. In this case (one in thousands), the
 distribution itself is summed. For expectations below 2 a uniform number is looked up in the distribution.
 """
 
@@ -28,9 +28,9 @@ LARGEST = 1e9
 
 @njit(cache=True, nogil=True, inline="always")
 def expansion(w, mean, root):
-    """x with Q(x, mean) = Φ(w), where Q is the regularised upper incomplete gamma function: the Poisson quantile is its
-    integer part; `root` is √mean. And a bound of its error: twice Giles's where |w| <= 3 (from an expectation of 30 on
-    where |w| <= 5), none elsewhere."""
+    """x with Q(x, mean) = Φ(w), and a bound of its error. Q is the regularised upper incomplete gamma function; the
+    Poisson quantile is the integer part of x; `root` is √mean. The bound is twice the bound of Giles for |w| <= 3 (for
+    |w| <= 5 from an expectation of 30 on); there is no bound for other w."""
     s = 1.0 / root
     ww = w * w
     x = mean + root * w + (1 / 3 + ww / 6) - s * w * (1 / 36 + ww / 72)
@@ -41,8 +41,8 @@ def expansion(w, mean, root):
 
 @njit(cache=True, nogil=True)
 def summed(w, mean):
-    """The Poisson quantile of Φ(w) by the sum of the distribution, from its nearer end. It is the lower tail for w < 0,
-    the upper for w > 0, so that no digits are lost in either; `mean` >= LEAST."""
+    """The Poisson quantile of Φ(w) by the sum of the distribution, from its nearer end. The sum is over the lower tail
+    for w < 0 and over the upper tail for w > 0, so that no digits are lost; `mean` >= LEAST."""
     tail = 0.5 * math.erfc(abs(w) / math.sqrt(2.0))
     k = max(int(expansion(w, mean, math.sqrt(mean))[0]), 0)
     share = math.exp(k * math.log(mean) - mean - math.lgamma(k + 1.0))
@@ -90,7 +90,7 @@ def searched(u, mean):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _poisson_rows(key, first, end, image):  # pragma: no cover
-    """Replaces image[row, col] by a Poisson number of this expectation, for the rows of a band."""
+    """Replaces image[row, col] by a Poisson number with this expectation, for the rows of a band."""
     cols = image.shape[1]
     w, u, k = np.empty(cols), np.empty(cols), np.empty(cols)
     for row in range(first, end):
@@ -115,7 +115,7 @@ def _poisson_rows(key, first, end, image):  # pragma: no cover
 @njit(cache=True, nogil=True)
 def _small(state, mean, u, k):  # pragma: no cover
     """Draws uniform numbers u [col] and sets k [col] to their quantiles for the small expectations of a row, or to -1
-    where that exceeds EASY. Other columns of k are unchanged."""
+    where the quantile exceeds EASY. Other columns of k are unchanged."""
     share = np.empty(mean.size)
     for col in range(mean.size):
         share[col] = math.exp(-mean[col])

@@ -23,11 +23,11 @@ _30, _27, _31, _11, _8 = (np.uint64(n) for n in (30, 27, 31, 11, 8))
 _SIGN, _LAYER = np.uint64(256), np.uint64(255)
 
 TAIL = 3.6541528853610088
-"""Where the ziggurat's tail begins, for 256 layers (Marsaglia & Tsang 2000)."""
+"""The number at which the tail of the ziggurat begins, for 256 layers (Marsaglia & Tsang 2000)."""
 
 
 def layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Edges x [257], falling from the base's to 0, and exp(-x²/2) [257], of layers of equal area."""
+    """Edges x [257] of layers of equal area, falling from the edge of the base to 0, and exp(-x²/2) [257]."""
     area = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(math.pi / 2) * math.erfc(TAIL / math.sqrt(2))
     edges = [area * math.exp(TAIL**2 / 2), TAIL]
     while len(edges) < 256:
@@ -49,7 +49,7 @@ def mix(state):
 
 @njit(cache=True, nogil=True, inline="always")
 def begin(key, number):
-    """State of the stream `number` (a row, a pixel) among those of a key."""
+    """State of the stream `number` (a row, a pixel) among the streams of a key."""
     return mix(key ^ mix(np.uint64(number) * STEP + STEP))
 
 
@@ -112,7 +112,7 @@ def binned(pixels: Image, binning: int) -> Image:
 def places(
     effect: str, seed: int, fraction: float, shot: Shot
 ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
-    """Random sensor pixels, a `fraction` of all, as far as they are in the frame.
+    """The sensor pixels of the frame among a random `fraction` of all sensor pixels.
 
     Returns:
         Their (rows, columns) in the frame, and for each a uniform number in 0 ... 1. A binned pixel occurs as often

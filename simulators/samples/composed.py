@@ -60,7 +60,7 @@ class Battery:
 
 
 def labels_of(solids: Sequence[Solid]) -> list[str]:
-    """The label of each solid of a battery: "tube" is the can's wall, "cylinder" the electrolyte."""
+    """The label of each solid of a battery: "tube" is the wall of the can, "cylinder" is the electrolyte."""
     particles = ("octahedron" if isinstance(solid, Polyhedron) else kind_of(solid) for solid in solids[2:])
     return ["tube", "tube", *particles]
 
@@ -74,8 +74,8 @@ def battery(
     """Solids of a cylindrical cell that fits into the field of view, with air on all sides.
 
     Half of the particles are ellipsoids, a third octahedra and the rest boxes (the habits of LiCoO2 crystals), in any
-    orientation. Their sizes are log-normal. A particle's attenuation is its contrast to the electrolyte. The wall
-    is a cylinder and, with its negative attenuation, its bore.
+    orientation. Their sizes are log-normal. A particle's attenuation is its contrast to the electrolyte. The wall is a
+    cylinder and its bore, a cylinder with the negative attenuation.
 
     Args:
         field_of_view: (width, height) in mm.
@@ -173,7 +173,7 @@ class _Keys:
 
 
 def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    """The sample of a phantom's `solids`, grey where no key asks for the module of a folder."""
+    """The sample of the `solids` of a phantom. It is grey if no key needs the module of another folder."""
     keys = build(_Keys, where, mapping)
     entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
     used = {*mapping, *(key for _, entry in entries if isinstance(entry, Mapping) for key in entry)}
@@ -201,7 +201,7 @@ def _grey(where: str, entry: Any) -> tuple[Solid, str]:
 def _read(
     name: str, module: str, where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None
 ) -> Sample:
-    """A phantom that is read from a file, such as by `volume_sample` of VolumeSettings in the module."""
+    """A phantom that the module reads from a file, for example with `volume_sample` of VolumeSettings."""
     found = import_module(module)
     settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
     if read is None:
@@ -213,7 +213,7 @@ def _read(
 def _built(
     name: str, module: str, where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None
 ) -> Sample:
-    """A phantom out of pieces, by `phantom` of the module."""
+    """A phantom of pieces, made with `phantom` of the module."""
     sample: Sample = import_module(module).phantom(name, where, mapping, beam)
     return sample
 

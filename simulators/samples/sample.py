@@ -16,7 +16,7 @@ from simulators.frame.shot import Detector, Pose
 class Sample(Protocol):
     @property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter; the blur of a turning sample is largest there."""
+        """mm from the rotation axis to the farthest material; the blur of a turning sample is largest there."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -30,8 +30,8 @@ class Sample(Protocol):
         """
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
-        """True attenuation in 1/mm, float32 [z, y, x]; voxels on a surface are weighted by the filled share, counted on
-        supersample³ points."""
+        """True attenuation in 1/mm, float32 [z, y, x]. Voxels on a surface are weighted by the filled share, which is
+        counted with supersample³ points."""
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
         """Label at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
@@ -81,8 +81,8 @@ class Stored:
 
 
 ReadVolume = Callable[[str, str | None], Stored]
-"""Reads the file that a scene names, and a dataset in it. The caller of `load_scene` provides it, since simulators open
-no files; its errors pass through."""
+"""Reads the file that a scene names, and a dataset in this file. The caller of `load_scene` provides this function,
+because simulators open no files. Errors of this function are not caught."""
 
 
 def sample_at(sample: Sample, seconds: float) -> Sample:

@@ -37,10 +37,9 @@ class Scan:
     """A scan of a scene. Created by `Scan.of`.
 
     Attributes:
-        seed: of all random numbers.
-        start: s since the Unix epoch, of the first frame.
-        views: number of projections, spread over the scene's range. In a fly scan fewer views have longer periods:
-        the speed of the stage stays, so that each view has the scene's blur.
+        seed: seed of all random numbers. start: time of the first frame, s since the Unix epoch. views: number of
+            projections, spread over the range of the scene. In a fly scan with fewer projections, periods are longer.
+            The speed of the stage stays, so each projection has the blur of the scene.
     """
 
     scene: Scene
@@ -50,7 +49,7 @@ class Scan:
 
     @classmethod
     def of(cls, scene: Scene, seed: int = 0, views: int | None = None, start: float = 0.0) -> Scan:
-        """`views` replaces the number in the scene. Raises ValueError if it is below one."""
+        """`views` replaces the number in the scene. Raises ValueError if `views` is below one."""
         if views is not None and views < 1:
             raise ValueError(f"a scan needs at least one view, got {views}")
         return cls(scene, seed, start, scene.scan.views if views is None else views)
@@ -84,7 +83,7 @@ class Scan:
         return settings.period_s * (max(settings.views / self.views, 1.0) if settings.fly else 1.0)
 
     def angle(self, view: int) -> float:
-        """Radians at the trigger of a view."""
+        """Angle in radians at the trigger of a projection."""
         return math.radians(self.scene.scan.range_deg) * view / self.views
 
     def frame(self, number: int) -> PlannedFrame:

@@ -39,13 +39,9 @@ Seconds = Annotated[float, Setting(gt=0, le=1e6)]
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """Attributes:
-    shape: (rows, cols) of the frame, after binning.
-    pixel_size_um: of an unbinned pixel, at the sample.
-    exposure_s: of a frame.
-    binning: sensor pixels summed per side.
-    readout: the camera's mode.
-    electrons_per_count: None: the camera's.
+    """Attributes: shape: (rows, cols) of the frame, after binning. pixel_size_um: size of an unbinned pixel at the
+    sample. exposure_s: exposure time of a frame. binning: number of sensor pixels summed per side. readout: mode of the
+    camera. electrons_per_count: conversion; None: the value of the camera.
     """
 
     shape: tuple[Annotated[int, Setting(ge=1)], Annotated[int, Setting(ge=1)]] = (512, 512)
@@ -65,12 +61,9 @@ class DetectorSettings:
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """Attributes:
-    views: evenly spaced over the range, its end excluded.
-    range_deg: degrees.
-    period_s: s from one trigger to the next.
-    fly: the stage turns steadily; false: it stands while a view is exposed.
-    darks, flats: taken before the views.
+    """Attributes: views: number of projections, evenly spaced over the range, whose end is excluded. range_deg: range
+    of angles in degrees. period_s: s from one trigger to the next. fly: true: the stage turns steadily; false: it is at
+    rest while a projection is exposed. darks, flats: numbers of frames before the projections.
     """
 
     views: int = setting(180, ge=1, le=1_000_000)

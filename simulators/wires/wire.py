@@ -1,8 +1,7 @@
 """Wire: the other end of a serial cable, bytes in and bytes out; and `sim://name`, which opens it.
 
-pyserial opens such a URL by the same code path as a real port. It finds the scheme in
-`simulators.wires.protocol_sim`
-once this module is imported. Names are process-wide, as the ports of a computer are.
+pyserial opens such a URL by the same code path as a real port. After this module is imported, pyserial finds the scheme
+in `simulators.wires.protocol_sim`. Names are valid in the whole process, like the ports of a computer.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class Controller(Wire, Protocol):
 
 
 class BytesWire:
-    """A simulated device with bytes on their way from and to the host; one call at a time."""
+    """A simulated device with bytes in transit from and to the host; it processes one call at a time."""
 
     def __init__(self, clock: Clock, latency: float = 0.0) -> None:
         """`latency`: s until a reply can be read."""
@@ -91,7 +90,7 @@ class BytesWire:
 
 
 class Build(Protocol):
-    """How a simulated controller is built, and its faults: a frozen dataclass in each controller's folder."""
+    """Build of a simulated controller, and its faults: a frozen dataclass in the folder of each controller."""
 
     @classmethod
     def matching(cls, settings: Any) -> Self:
@@ -112,7 +111,7 @@ if "simulators.wires" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("simulators.wires")
 
 
-# pyserial gives its handler only the URL, so that the devices plugged in, and the open ports, are kept here by name.
+# pyserial gives its handler only the URL, so the registered devices and the open ports are kept here by name.
 _WIRES: dict[str, Wire] = {}
 _OPEN: dict[str, Wire] = {}
 _LOCK = threading.Lock()
@@ -127,7 +126,7 @@ def register(name: str, wire: Wire) -> str:
 
 
 def plugged(url: str) -> Wire | None:
-    """The simulated device of a URL, for drivers that exchange no bytes; None if nothing is plugged in there."""
+    """The simulated device of a URL, for drivers that exchange no bytes; None if no device is registered for it."""
     with _LOCK:
         return _WIRES.get(url[len(SCHEME) :])
 

@@ -31,7 +31,7 @@ RowState = Literal["waiting", "done", "poor", "failed"]
 TABLE, RECIPE = "batch.csv", "recipe.yaml"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
 COMMAND = (sys.executable, "-m", "beamline.cli.main")
-_SILENCE = 1800.0  # real s without an event, after which a reconstruction counts as hanging
+_SILENCE = 1800.0  # real time in s without an event, after which a reconstruction counts as hanging
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class BatchRow:
 
     Attributes:
         name: name of the folder with its results, inside the folder of the batch.
-        state: "done"; "poor": the residual of the volume is above --max-residual of the recipe; "failed": no volume;
-            "waiting": not tried yet.
+        state: "done": there is a volume. "poor": the residual of the volume is above --max-residual of the recipe.
+            "failed": there is no volume. "waiting": the scan was not tried yet.
         residual: residual of the volume, in the held-out projections if there are any.
         warnings: number of warnings of the reconstruction. Read them before you trust the volume.
-        message: why it failed or is poor, then the warnings.
+        message: why the reconstruction failed or is poor, then the warnings.
     """
 
     name: str
@@ -62,10 +62,10 @@ class BatchRow:
 
 
 def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Sink, clock: Clock) -> list[BatchRow]:
-    """Reconstruct the scans that have no volume in the folder yet; the table is written after each scan.
+    """Reconstruct the scans that have no volume in the folder yet. The table is written after each scan.
 
-    The folder with the results of a scan appears only when it is complete. If a scan fails, it gets no folder, the
-    next scan is reconstructed, and the next call tries the failed one again. Ctrl-C discards the scan in progress and
+    The folder with the results of a scan appears only when it is complete. If a scan fails, it gets no folder, and the
+    next scan is reconstructed. The next call tries the failed scan again. Ctrl-C discards the scan in progress and
     keeps the others.
 
     Args:
@@ -77,7 +77,7 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
 
     Raises:
         DataError: the folder is not that of a batch, or is that of a batch with another recipe. Nothing was changed.
-        KeyboardInterrupt: stopped; the table lists the scans that are done.
+        KeyboardInterrupt: Ctrl-C was pressed. The table lists the scans that are done.
     """
     _begin(folder, b"" if recipe is None else recipe.read_bytes())
     how = [] if recipe is None else ["--config", str(folder / RECIPE)]
@@ -105,8 +105,8 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
 
 
 def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[str]:
-    """A safe and unique name for each file: its stem, preceded by as many of its folders as are needed to distinguish
-    it from the other files and from earlier rows. A number follows if names are still equal."""
+    """A safe and unique name for each file. The name is the stem of the file, preceded by as many of its folders as are
+    needed to distinguish it from the other files and from earlier rows. If names are still equal, a number follows."""
     paths = [*(Path(row.scan) for row in earlier), *scans]
     parts = [(*path.absolute().parent.parts[1:], Path(SCAN if path.name == JOINED else path).stem) for path in paths]
     names = [safe_name(own[-1]) for own in parts]
@@ -125,7 +125,7 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
-    """Make the folder if needed. Raises DataError for a folder that does not belong to a batch with this recipe."""
+    """Create the folder if needed. Raises DataError if the folder does not belong to a batch with this recipe."""
     if not folder.exists():
         with atomic_file(folder) as partial:
             partial.mkdir()
@@ -145,7 +145,8 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     """The earlier rows, and a row for each new scan. Rows without a volume get the new scan file of a resumed run."""
     from beamline.storage.interrupted import whole_scan  # imported here because help does not need it
 
-    by_name = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
+    # in the form in which the table shows them
+    by_name = {printable(str(path)): path for path in map(whole_scan, scans)}
     rows = [
         row if row.has_volume else replace(row, scan=str(whole_scan(by_name.get(row.scan, Path(row.scan)))))
         for row in earlier
@@ -156,7 +157,7 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
 
 
 def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Clock) -> BatchRow:
-    """Reconstruct a scan into the folder `place`, with these options."""
+    """Reconstruct a scan with these options, and write the results to the folder `place`."""
     began, last, warned = clock.now(), dict[str, Any](), list[str]()
 
     def pass_on(line: str) -> None:
@@ -192,7 +193,7 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
             if code not in _WITH_VOLUME or not (work / RECON).is_file():
                 raise DataError(reason or f"no volume: its process ended with code {code}")
         state, why = _WITH_VOLUME[code], [reason] if code else []
-    except DataError as error:  # also if another program made a folder of this name
+    except DataError as error:  # also happens if another program made a folder of this name
         state, why = "failed", [str(error)]
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
@@ -202,7 +203,7 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
 
 
 def _with_command(message: str, row: BatchRow) -> str:
-    """A message of a reconstruction; if it mentions options, the command that takes them is added."""
+    """A message of a reconstruction. If it mentions options, the command that takes these options is added."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
     return message + (
         f" Give these options to `beamline recon {row.scan}`, or add them to the recipe if they apply to all scans."
@@ -212,7 +213,7 @@ def _with_command(message: str, row: BatchRow) -> str:
 
 
 def _read(folder: Path) -> list[BatchRow]:
-    """The table of an earlier call; a row whose volume no longer exists is waiting again.
+    """The table of an earlier call. A row whose volume no longer exists gets the state "waiting" again.
 
     Raises:
         DataError: the table cannot be read.

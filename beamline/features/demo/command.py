@@ -73,10 +73,8 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     The event `done` is the last one.
 
     Args:
-        config: of simulated devices.
-        runs: the folder in which the folder of this run is created; None: the configured one.
-        sinks: event sinks in addition to those of the run.
-        stop: request to stop it early.
+        config: configuration with simulated devices. runs: folder in which the folder of this run is created; None: the
+            configured folder. sinks: event sinks in addition to those of the run. stop: request to stop the scan early.
         command: the command line, which the report shows.
 
     Raises:
@@ -95,10 +93,10 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     follow = follow_command(config)
 
     def without_report(scan: Path, output: Path) -> Sequence[str]:
-        return [*follow(scan, output), "--no-report"]  # because the demonstration writes its own report
+        return [*follow(scan, output), "--no-report"]  # off, because the demonstration writes its own report
 
     def all_but_done(event: Event) -> None:
-        if not isinstance(event, RunDone):  # the scan is done, but the demonstration is not
+        if not isinstance(event, RunDone):  # the scan is done, but the demonstration continues
             outside(event)
 
     with connect(config) as instrument:

@@ -25,14 +25,13 @@ _TYPES = {"str": "s", "int": "l", "float": "d", "tuple[str, ...]": "as", "tuple[
 
 
 class RunServer:
-    """Serves the newest run of a folder, also one that begins later, until it is closed.
+    """Serves the newest run of a folder until the server is closed. If a newer run begins, the server switches to it.
 
     Args:
         prefix: prefix of each name, such as "2bma:splatline:".
         address: network address at which the server listens.
         control: True if the server accepts commands and decisions from everybody who can reach the address.
-        say: function that gets a line for each command.
-        now: a clock, s since the Unix epoch.
+        say: function that gets a line of text for each command. now: a clock in s since the Unix epoch.
 
     Raises:
         ConfigError: p4p is not installed.
@@ -59,7 +58,8 @@ class RunServer:
             ) from error
         self._say, self._now, self._beats = say, now, 0
         self._run = FollowedRun(runs, now)
-        self._asked: deque[tuple[Any, Any, Asked]] = deque()  # PVs whose clients wait, with their operations
+        # process variables (PVs) whose clients wait, with the operations of the clients
+        self._asked: deque[tuple[Any, Any, Asked]] = deque()
         provider, self._shown = StaticProvider("splatline"), dict[str, Any]()
         for each in SHOWN:
             about = {"display.description": each.metadata["about"], "display.units": each.metadata["unit"]}
@@ -75,7 +75,8 @@ class RunServer:
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
-        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))  # kept: a PV alone loses its handler
+        # kept in a list, because a PV without a reference loses its handler
+        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))
         self._decide.put(self._take_answer)
         if control:
             provider.add(prefix + "Decide", self._decide)
@@ -93,8 +94,8 @@ class RunServer:
         return dict(self._server.conf())
 
     def look(self) -> None:
-        """Answer clients whose commands are done. Read the state of the run, and post every value that has changed,
-        with its time and its alarm."""
+        """Answer clients whose commands are done. Then read the state of the run, and post every value that has
+        changed, with its time and its alarm."""
         for _ in range(len(self._asked)):
             self._answer(*self._asked.popleft())
         before, now = self._run.stamped, self._run.look()
@@ -112,8 +113,8 @@ class RunServer:
         self._run.close()
 
     def _verb(self, verb: Verb) -> Callable[[Any, Any], None]:
-        """A handler of a PV: true sends the verb to the run at once, and the PV is false again. `look` answers the
-        client when the verb is done: a verb never waits for another one."""
+        """The handler of a PV for a command: writing true sends the command to the run at once, and the PV becomes
+        false again. `look` answers the client when the command is done, so a command never waits for another one."""
 
         def put(pv: Any, op: Any) -> None:
             if bool(op.value()):
@@ -124,11 +125,12 @@ class RunServer:
         return put
 
     def _take_answer(self, pv: Any, op: Any) -> None:
-        """The handler of the PV whose text answers the scan: one of its options, while it asks."""
+        """The handler of the PV for decisions. A client writes one of the options that the scan offers, while the scan
+        waits for a decision."""
         self._send(pv, op, lambda: choice_of(self._run.stamped.values, op.value().raw.value))
 
     def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb | Choice]) -> None:
-        """Send a verb, or an answer to what the scan asks, to the run at once; `look` answers the client."""
+        """Send a command, or a decision, to the run at once. `look` answers the client later."""
         try:
             verb = verb_of()
             self._say(f"{verb} from {op.peer()}")
@@ -137,7 +139,8 @@ class RunServer:
             self._end(pv, op, error)
 
     def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
-        """Answer the client of a verb that is done; one that is not yet waits for the next look."""
+        """Answer the client of a command that is done. If the command is not done yet, the client waits for the next
+        call of `look`."""
         try:
             done = asked.state() is not None
         except (BeamlineError, OSError) as error:
@@ -149,7 +152,8 @@ class RunServer:
             self._asked.append((pv, op, asked))
 
     def _end(self, pv: Any, op: Any, error: Exception | None = None) -> None:
-        """Post what a PV held before it was written to, with the error as its alarm, and answer the client."""
+        """Restore the value that a PV had before the client wrote to it, with the error as its alarm, and answer the
+        client."""
         stamp = Stamp(self._now(), *(() if error is None else (Severity.MAJOR, user_message(error))))
         pv.post(_posted("" if pv is self._decide else False, stamp))
         op.done(error=stamp.message or None)

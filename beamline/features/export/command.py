@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import ReconRecord
 
 _PLY, _CSV = ".ply", ".csv"
-_SLICES, _VALUES = 9, 2**20  # slices of a volume, and values of a slice, that are read at most to suggest a window
+_SLICES, _VALUES = 9, 2**20  # largest number of slices, and of values per slice, that are read to suggest a window
 
 
 def window_of(text: str) -> tuple[float, float]:
@@ -127,7 +127,7 @@ def export(request: ExportRequest) -> None:
 
 
 def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None] | None:
-    """The function that exports what --gaussians or --poses ask for; None if voxels are exported."""
+    """The function that exports Gaussians (--gaussians) or poses (--poses); None if voxels are exported."""
     parts = {
         "--gaussians": (request.gaussians, _PLY, _export_gaussians),
         "--poses": (request.poses, _CSV, _export_poses),
@@ -186,7 +186,8 @@ def _export_voxels(request: ExportRequest) -> None:
 
 
 def _of_material(record: ReconRecord, number: int) -> ReconRecord:
-    """The probability of each voxel that it is a certain material. Needs memory for two volumes more than materials.
+    """The probability, for each voxel, that it is a certain material. With n materials, this needs memory for n + 2
+    volumes.
 
     Raises:
         DataError: the volume has no such material.
@@ -225,8 +226,7 @@ def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
 def _write_ply(path: Path, model: Model) -> None:
     """The Gaussians as a binary PLY: x y z, scale_0..2 (standard deviations), rot_0..3 (w x y z), density.
 
-    Raises:
-        DataError: `path` exists, or the disk cannot take it. No file is left.
+    Raises: DataError: `path` exists, or the disk is full or fails. No incomplete file remains.
     """
     import numpy as np
 
@@ -275,7 +275,7 @@ def _suggestion(record: ReconRecord) -> str:
     if not values.size:
         return "The slices that were read have no finite value. Nothing was written."
     low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
-    if low == high:  # only a few voxels have material, or values differ only in the last digits
+    if low == high:  # only a few voxels contain material, or values differ only in the last digits
         low, high = float(values.min()), float(values.max())
     if low == high:
         return (

@@ -96,7 +96,7 @@ def info(
 
 
 def _described(facts: Mapping[str, Any]) -> list[str]:
-    """The facts of a scan or a volume in lines."""
+    """The facts about a scan or a volume as lines."""
     from beamline.storage.flag_legend import counted
 
     apart = ("attributes", "not_used", "findings")

@@ -1,8 +1,9 @@
-"""ingest: copies any scan, frame by frame, into one of our files, with statistics of each frame.
+"""ingest: copies a scan of any format, frame by frame, into a file of this program, with statistics of each frame.
 
-Integer frames become an NXtomo. Float frames (such as float32 stacks) cannot become an NXtomo, because its data are
-integers and rounding would lose information. They keep their type and have the same paths, under the definition
-`splatline_float_projections`, so that no program takes them for counts. open_scan reads both kinds of files.
+Integer frames become an NXtomo. Float frames (such as float32 stacks) cannot become an NXtomo, because data of an
+NXtomo are integers, and rounding would lose information. Float frames keep their type and have the same paths in the
+file. The definition of their file is `splatline_float_projections`, so that no program mistakes them for counts.
+open_scan reads both kinds of files.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Rows, ScanEn
 
 @dataclass(frozen=True)
 class Ingested:
-    """The written copy. `definition`: NXtomo, or float projections; `invalid_frames`: frames without a valid pixel.
+    """The written copy. `definition`: NXtomo, or float projections. `invalid_frames`: number of frames without a valid
+    pixel.
 
-    `doubts`: values in the input that may change the volume but are neither used nor stored in the copy.
+    `doubts`: values in the input that may change the volume, but are neither used nor stored in the copy.
     """
 
     path: Path
@@ -54,12 +56,12 @@ def ingest(
     no_data: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Ingested:
-    """Copy a scan into the new file `out`, one frame in memory at a time.
+    """Copy a scan into the new file `out`. Only one frame at a time is in memory.
 
     Args:
         pixel_size_mm, energy_kev, sample: values to store if the input does not state them.
-        no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
-        progress: called with (frames written, frames in all) after each.
+        no_data: value of pixels without data; such pixels count as invalid in the statistics. progress: function called
+            after each frame with the number of frames written and of all frames.
 
     Raises:
         DataError: the input cannot be read, `out` exists, or the disk fails. No incomplete file remains.
@@ -96,7 +98,8 @@ def ingest(
 
 
 def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
-    """Raise DataError for unknown angles, displaced views, altered rows and oblong pixels."""
+    """Raise DataError for a scan with unknown angles, displaced projections, altered rows or oblong pixels, which the
+    copy could not store."""
     n = source.table.views.size
     if unknown := n - source.table.views_with_angles.size:
         raise DataError(
@@ -163,7 +166,8 @@ def _copy(
 
 
 def _ending_of(source: ScanSource) -> ScanEnding:
-    """How the scan ended. DataError while it runs: what it lacks is not known yet."""
+    """How the scan ended. Raises DataError if the scan is still running, because it is not known yet which frames will
+    be missing."""
     if source.ending.status != RUNNING:
         return source.ending
     if held(source.path) or time.time() - source.path.stat().st_mtime < QUIET:

@@ -1,4 +1,5 @@
-"""validate and describe: all findings about the file of a scan or a volume, and its facts as plain values.
+"""validate lists all findings about the file of a scan or a volume; describe returns facts about the file as plain
+values.
 
 The rules of storage.rules check a scan of any format. The rules at the end of this module use the frame counter of the
 camera and the times to find frames that are lost, repeated or out of order.
@@ -37,11 +38,11 @@ from recon.base.arrays import F32, I64
 from recon.base.views import spread
 from recon.prep.overshoot import MOST_VIEWS, SEARCH, Overshoot
 
-Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
+Progress = Callable[[int, int], None]  # Function that gets the number of frames done, and of all frames
 
 
 def volume_findings(record: ReconRecord) -> Iterator[Finding]:
-    """Findings in a volume; every slice is read."""
+    """Findings about a volume. Every slice is read."""
     data, n = record.volume.data, record.volume.grid.shape[0]
     bad, first, low, high = 0, None, np.inf, -np.inf
     for z in range(n):
@@ -77,7 +78,7 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
     """All findings in a file, the most severe first; [] for a valid scan.
 
-    Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
+    Faults of the file never raise an error: a file that cannot be opened is a finding. Volumes have separate rules.
 
     Args:
         deep: function that gets the number of frames read and their total number; if it is given, every frame is read
@@ -175,7 +176,7 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
 
 
 LOOK = 15.0
-"""Seconds in which frames are looked at for faults."""
+"""Time limit in seconds for the search for faults in frames."""
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
@@ -214,9 +215,9 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and the findings of the rules; None for what is unknown.
 
-    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
-    contains the numbers that the file states but this program does not use, by path. `findings` are the messages of
-    errors and warnings, `reconstructable` is True if no error prevents a reconstruction.
+    Angles are in degrees. `flags` has the number of frames by check and level, also of projections that were taken
+    again. `not_used` has, by path, the numbers that the file states but this program does not use. `findings` are the
+    messages of errors and warnings, `reconstructable` is True if no error prevents a reconstruction.
     """
     kinds = {kind.name.lower(): source.table.of_kind(kind).size for kind in FrameKind}
     until = clock() + LOOK
@@ -224,7 +225,8 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     findings = source_findings(ScanEvidence(brief))
     attributes = dict(source.attributes)
     if not source.finished:
-        dead = not held(source.path) if "status" in attributes else abandoned(source.path)  # our writer has a lock
+        # the writer of this program holds a lock
+        dead = not held(source.path) if "status" in attributes else abandoned(source.path)
         attributes["status"] = "died" if dead else RUNNING
     optional: dict[str, Any] = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
     if source.cone is not None and source.pixel_size_mm is not None:
@@ -262,7 +264,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
 
 
 def _fringes(source: ScanSource) -> list[str]:
-    """A sentence on fringes, where outer edges in the middle rows of some views show them."""
+    """A sentence on phase fringes, if outer edges of the sample show them in the middle rows of some projections."""
     rows = slice(*np.clip(source.shape[0] // 2 + np.array([-16, 16]), 0, source.shape[0]).tolist())
 
     def read(kind: FrameKind) -> F32:
@@ -284,7 +286,7 @@ def _fringes(source: ScanSource) -> list[str]:
 
 def _angles(source: ScanSource) -> dict[str, float | None]:
     views = source.table.views
-    if (replaces := source.table.replaces) is not None:  # in the order in which they were planned
+    if (replaces := source.table.replaces) is not None:  # the frames in the order in which they were planned
         views = views[np.argsort(np.where(replaces[views] >= 0, replaces[views], views))]
     angles = np.degrees(source.table.angles[views])
     if angles.size == 0 or not np.isfinite(angles).all():
@@ -330,8 +332,9 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
     if stamps.size < 2 or (stamps < 0).any():
         return
     steps, rows = np.diff(stamps), np.arange(key.size)
-    passes = np.searchsorted(table.pass_ends, rows, "right")  # one may be repeated
-    aside = np.zeros(key.size) if table.aside is None else table.aside  # offset views count on, as retakes do
+    passes = np.searchsorted(table.pass_ends, rows, "right")  # a framestamp may be repeated
+    # for laterally offset projections the counter continues, as for projections taken again
+    aside = np.zeros(key.size) if table.aside is None else table.aside
     new = np.zeros(key.size, np.bool_)
     new[np.unique(np.stack([key, triggers, passes, aside]), axis=1, return_index=True)[1]] = True
     new[table.part_starts] = True
@@ -357,7 +360,7 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
 
 
 def _taken_again(source: ScanSource, row: int, step: I64) -> bool:
-    """Whether each trigger between a frame and the next has its frame elsewhere in the file."""
+    """Whether all triggers between a frame and the next frame have their frames elsewhere in the file."""
     triggers, key = source.table.triggers, source.table.kinds
     between = np.arange(triggers[row] + 1, triggers[row + 1])
     return between.size == step - 1 and bool(np.isin(between, triggers[key == key[row]]).all())

@@ -46,7 +46,7 @@ COOKIE = "splatline_look_"
 ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
-_KEPT = 64  # answers kept for the next client
+_KEPT = 64  # number of answers kept for the next client
 _NO_VERB = "an unknown command"
 _ONLY_WATCHES = (
     "This address can only watch the scan. To control the scan, open the address that `beamline scan --page` "
@@ -67,18 +67,19 @@ _HEADERS = {
 class Access:
     """Host names and tokens of a page: who may watch, and who may control the scan."""
 
-    hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
-    look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
-    act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
+    hosts: Sequence[str]  # names under which a browser may call this server, each with the port, as in `localhost:8642`
+    look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for viewing
+    act: str | None = None  # the token for commands to the scan; None: nobody may control the scan from the page
     ended: Event = field(default_factory=Event)  # set when the server ends
 
 
 KNOWN = "splatline.known"
-"""In the scope of a request with the viewing token, which its connection reads, too."""
+"""Key in the scope of a request that has the viewing token. The connection of the request reads this key, too."""
 
 
 class Guard:
-    """Sets the headers of every response, and refuses requests for another host, or without the viewing token."""
+    """Sets the headers of every response, and answers with an error to requests for another host or without the viewing
+    token."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
@@ -96,7 +97,7 @@ class Guard:
             await send(message)
 
         request = Request(scope)
-        if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
+        if request.headers.get("host") not in self._access.hosts:  # another host name that resolves to this computer
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
         elif _same(request.cookies.get(self._cookie, ""), self._access.look):
             scope[KNOWN] = True
@@ -120,13 +121,13 @@ def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlett
 
 
 def viewer(volumes: Sequence[ShownVolume], access: Access, scan: ShownScan | None = None) -> Starlette:
-    """The application for one volume, or two to compare, or for the stack of a scan's views."""
+    """The application for one volume, for two volumes to compare, or for the projections of a scan."""
     do = reader_of(volumes)
     return guarded("view.html", viewer_routes(do) + ([] if scan is None else scan_routes(do, scan)), access)
 
 
 def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> list[BaseRoute]:
-    """Routes of the page of a run; below `view/` its newest volume, alone and in the viewer."""
+    """Routes of the page of a run. The routes below `view/` show its newest volume, alone and in the viewer."""
     server = _Server(reader, access, log)
     return [
         Mount("/view", begins_with("view.html", viewer_routes(reader.on_volumes))),
@@ -143,13 +144,13 @@ def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> l
 
 
 def guarded(start: str, routes: Sequence[BaseRoute], access: Access) -> Starlette:
-    """An application with these routes that starts with a page of `static`, behind the guard."""
+    """An application with these routes, whose start page is a page of `static`. All requests pass the guard."""
     static = Mount("/static", StaticFiles(directory=str(_STATIC)))
     return begins_with(start, [static, *routes], [Middleware(Guard, access=access)])
 
 
 def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
-    """An application with these routes that starts with a page of `static`."""
+    """An application with these routes, whose start page is a page of `static`."""
     text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
     first = Route("/", lambda request: HTMLResponse(text))
     return Starlette(routes=[first, *routes], middleware=middleware, exception_handlers={BeamlineError: _refused})
@@ -161,7 +162,7 @@ def _refused(request: Request, error: Exception) -> Response:
 
 
 class _Server:
-    """Answers requests; Starlette calls functions that are no coroutines in separate threads."""
+    """Answers requests. Starlette calls functions that are not coroutines in separate threads."""
 
     def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
         self._reader, self._access, self._log = reader, access, log
@@ -177,7 +178,8 @@ class _Server:
         return JSONResponse({**facts, "run": what.name, "path": path, "may_act": self._access.act is not None})
 
     async def feed(self, request: Request) -> Response:
-        """Server-sent events: each event of the run with its number as id, `state` whenever it changes, and `end`."""
+        """Server-sent events: each event of the run with its number as id, `state` whenever the state changes, and
+        `end`."""
         last = request.headers.get("last-event-id", request.query_params.get("last", ""))
         first = int(last) + 1 if last.isdecimal() and len(last) < 10 else 0
         return StreamingResponse(self._feed(first), media_type="text/event-stream")
@@ -185,7 +187,7 @@ class _Server:
     async def _feed(self, first: int) -> AsyncIterator[str]:
         sent, ended = "", False
         while not ended:
-            ended = self._access.ended.is_set()  # then what came last is still told
+            ended = self._access.ended.is_set()  # after that, the last events are still sent
             state = await self._now(at_once=ended)
             lines = self._reader.events.lines
             for number in range(first, len(lines)):
@@ -200,9 +202,9 @@ class _Server:
         yield "event: end\ndata: {}\n\n"
 
     async def _now(self, *, at_once: bool) -> dict[str, Any]:
-        """The state, looked at once for all clients."""
+        """The state, read once for all clients."""
         async with self._looking:
-            if at_once or time.monotonic() - self._looked >= _PERIOD:  # so that all ask for the same frame
+            if at_once or time.monotonic() - self._looked >= _PERIOD:  # so that all clients ask for the same frame
                 self._state = await run_in_threadpool(self._reader.state)
                 self._looked = time.monotonic()
         return self._state
@@ -240,11 +242,12 @@ class _Server:
         )
 
     def _of_now(self, make: Callable[[Recording], Response], *asked: object) -> Response:
-        """An answer that stays valid until there are more frames."""
+        """An answer that is valid until there are more frames."""
         return self._once(make, lambda file: (file.progress(), *asked))
 
     def _once(self, make: Callable[[Recording], Response], key: Callable[[Recording], tuple[object, ...]]) -> Response:
-        """One answer for all clients that ask for the same at the same time; the reading thread makes it."""
+        """One answer for all clients that make the same request at the same time. The reading thread makes the
+        answer."""
 
         def kept(file: Recording) -> Response:
             identity = key(file)
@@ -270,7 +273,7 @@ class _Server:
         folder, act = self._reader.what.folder, self._access.act
         client = request.client.host if request.client else "?"
         verb = next((verb for verb in (*Verb, *Choice) if verb == request.path_params["verb"]), None)
-        name = _NO_VERB if verb is None else str(verb)  # never what was sent
+        name = _NO_VERB if verb is None else str(verb)  # the text that the client sent is never shown
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
             self._log(

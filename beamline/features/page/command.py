@@ -64,7 +64,8 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 you pressed Ctrl-C, 2 there is no run or no port is free, 5 the file is not a scan of this program.
     """
-    from beamline.features.page.app import page  # these load HDF5 and the server, which help does not need
+    # imported here, because these modules load HDF5 and the server, which help does not need
+    from beamline.features.page.app import page
     from beamline.features.page.serve import open_port, start
     from beamline.page.run_files import Reader, watched
     from beamline.scan.runs import newest, runs_in
@@ -82,7 +83,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
         click.echo(advice, err=True)
     reader = Reader(what)
     try:
-        reader.state()  # stops with an error for a scan of another program, which the page cannot show
+        reader.state()  # raises an error for a scan of another program, which the page cannot show
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
         click.echo("Press Ctrl-C to close the page. The scan continues.", err=True)
         if tethered:
@@ -105,7 +106,7 @@ def serve_shown(server: PageServer, browse: bool) -> None:
 
 
 def _end(server: PageServer) -> None:
-    """End this process; open pages show it within 3 s."""
+    """End this process. Open pages show within 3 s that the server has ended."""
     server.stop()
     time.sleep(ENDS_WITHIN)
     os._exit(0)
@@ -155,8 +156,8 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
 
 
 def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """Serve the list of runs. tethered: the program that runs the scans writes their folders to stdin, one a line, and
-    its page may control them."""
+    """Serve the list of runs. tethered: True if the program that runs the scans started this process. It writes the
+    folders of the scans to stdin, one per line, and its page may control these scans."""
     from beamline.features.page.serve import (
         RunBrowser,  # these load HDF5 and the server
         open_port,
@@ -249,7 +250,7 @@ def view(
     with ExitStack() as opened:
         source = None if named[0][1] is not None else _scan(named[0][0], scan_facts)
         if source is not None:
-            from beamline.page.shown_scan import ShownScan  # it loads corrections and FBP
+            from beamline.page.shown_scan import ShownScan  # imported here, because it loads the corrections and FBP
 
             if other is not None:
                 source.close()
@@ -266,7 +267,7 @@ def view(
 
 
 def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
-    """The scan in a file, opened; None if the file is a volume. Raises DataError for a scan that cannot be read."""
+    """The opened scan of a file; None if the file is a volume. Raises DataError if a scan cannot be read."""
     from beamline.storage import hdf5
     from beamline.storage.readers.open import SourceOptions, open_scan, scan_format
     from beamline.storage.volume_file import SUFFIXES
@@ -292,7 +293,8 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
 
 
 def _named(text: str) -> tuple[Path, str | None]:
-    """FILE::NAME split into file and array, unless a file has this whole name; of the folder of a run, its volume."""
+    """Split FILE::NAME into file and array, unless a file has this whole name. For the folder of a run, the file is its
+    volume."""
     from beamline.storage.interrupted import volume_file
 
     path, separator, name = text.rpartition("::")

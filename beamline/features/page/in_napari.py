@@ -21,9 +21,8 @@ from beamline.storage.volumes.files import opened_volume
 def show(volumes: Sequence[Path], labels: Path | None) -> None:
     """Open a window, and return when it is closed.
 
-    Raises:
-        ConfigError: napari is not installed.
-        DataError: a file holds no volume, or the labels are not those of the first.
+    Raises: ConfigError: napari is not installed. DataError: a file does not contain a volume, or the labels do not
+    belong to the first volume.
     """
     try:
         napari: Any = import_module("napari")
@@ -40,18 +39,20 @@ def show(volumes: Sequence[Path], labels: Path | None) -> None:
         if label_layer is not None:
             viewer.add_labels(label_layer[0], name=str(labels), **label_layer[1])
         if model := records[0].model:
-            place = _place(records[0])  # in voxels, for napari takes the points of a slice by whole numbers
+            place = _place(records[0])  # in voxels, because napari assigns points to slices by whole numbers
             centres = (np.asarray(model["centres"])[:, ::-1] - place["translate"]) / place["scale"]
             size = 2 * np.asarray(model["widths"]).mean(axis=1) / records[0].volume.grid.voxel_size
             viewer.add_points(
                 centres, size=size, name="Gaussians", features={"density": np.asarray(model["densities"])},
-                face_color="density", border_width=0, opacity=0.7, visible=False, **place,  # they would hide the volume
+                # hidden at first, because they would cover the volume
+                face_color="density", border_width=0, opacity=0.7, visible=False, **place,
             )  # fmt: skip
         napari.run()
 
 
 def _values(record: ReconRecord) -> Any:
-    """What napari slices along any axis: a dataset and a mapped file as they are, other files read."""
+    """Data that napari can slice along any axis. Datasets and memory-mapped files are used as they are; other files are
+    read."""
     data = record.volume.data
     return data if isinstance(data, h5py.Dataset | np.ndarray) else data[:]
 
@@ -63,7 +64,8 @@ def _place(record: ReconRecord) -> dict[str, Any]:
 
 
 def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:
-    """Labels, and their place: that of the volume, or of a part of it where their file states it (`structure`)."""
+    """Labels, and their position. It is that of the volume, or that of a part of the volume, if the file of the labels
+    states it (`structure`)."""
     with opened_volume(path) as record:
         values, place = np.asarray(record.volume.data[:]), _place(volume)
     if values.shape != volume.volume.grid.shape and h5py.is_hdf5(path):

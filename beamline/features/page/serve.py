@@ -1,6 +1,6 @@
 """Web server for a run or a folder of runs. By default only this computer can reach it; each start makes new tokens.
 
-The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`.
+The page of a folder is a table of its runs. The page of a run is below `/run/NUMBER/`.
 """
 
 from __future__ import annotations
@@ -36,16 +36,19 @@ from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, cells, describe, runs_in
 
 SILENT, STRANGERS = 96, 32
-"""Connections that wait until they send something, and with requests without the token: beyond these the oldest is
-closed. With those that are served, they stay below the 256 files that a process of macOS may open."""
-_QUEUE, _AT_ONCE = 1024, 128  # connections that wait in the system, and that are accepted before others are served
-_TURN = 0.01  # s from one stranger to the next; an answer takes a millisecond or two
-_SOON, _LATE = 0.002, 0.05  # s from one look at silent connections to the next: after a new one, and at last
-_HEAD = 65536  # bytes of a request in which the token is looked for
+"""Largest numbers of connections that have not sent anything, and of connections with requests without the token. If
+there are more, the oldest is closed. Together with the connections that are served, they are fewer than the 256 files
+that a process may open on macOS."""
+# number of connections that wait in the system; number that are accepted before others are served
+_QUEUE, _AT_ONCE = 1024, 128
+_TURN = 0.01  # s between two connections without the token; an answer takes a millisecond or two
+# s between two checks of connections that have not sent anything: after a new connection, and later
+_SOON, _LATE = 0.002, 0.05
+_HEAD = 65536  # number of bytes of a request in which the token is searched
 
 
 class Entrance:
-    """The listening socket of a page, until `close`: requests with the token are served before all others.
+    """The listening socket of a page, until `close`. Requests with the token are served before all others.
 
     The event loop accepts only some hundred connections per second if each one becomes a protocol at once. Other
     connections wait in the queue of the operating system. If this queue is full, a connection is dropped, and the
@@ -53,14 +56,14 @@ class Entrance:
     thousands of connections per second are possible.
 
     Args:
-        protocol: makes the protocol of a connection that is handed on.
-        token: connections whose first bytes contain this token are handed on at once, others one after the other.
+        protocol: function that makes the protocol of a connection that is passed on. token: connections whose first
+            bytes contain this token are passed on at once; other connections are passed on one after the other.
     """
 
     def __init__(self, listening: socket.socket, protocol: Callable[[], asyncio.Protocol], token: bytes) -> None:
         self._listening, self._protocol, self._token = listening, protocol, token
         self._loop = asyncio.get_running_loop()
-        self._silent = list[socket.socket]()  # oldest first, as the strangers
+        self._silent = list[socket.socket]()  # oldest first, like the connections without the token
         self._strangers = list[socket.socket]()
         self._look: asyncio.TimerHandle | None = None
         self._turn: asyncio.TimerHandle | None = None
@@ -84,13 +87,16 @@ class Entrance:
                 self._silent.append(self._listening.accept()[0])
             except BlockingIOError:
                 break
-            except OSError:  # it was reset, or no file is left to be opened: one that waits gives way
+            except (
+                OSError
+            ):  # the connection was reset, or the process cannot open more files: then a waiting connection is closed
                 _close_oldest(self._silent, len(self._silent) - 1)
                 break
         self._hear(_SOON)
 
     def _hear(self, soon: float) -> None:
-        """Take the connections that have sent something from those that are silent; look again so soon, then later."""
+        """Find the waiting connections that have sent something. Check again after this time, and later at longer
+        intervals."""
         for connection in select.select(self._silent, (), (), 0)[0] if self._silent else ():
             self._silent.remove(connection)
             self._take(connection)
@@ -100,13 +106,13 @@ class Entrance:
         self._look = self._loop.call_later(soon, self._hear, min(2 * soon, _LATE)) if self._silent else None
 
     def _take(self, connection: socket.socket) -> None:
-        """With the token it is handed on, otherwise it waits for its turn."""
+        """A connection with the token is passed on; a connection without it waits for its turn."""
         connection.setblocking(False)
         try:
             sent = connection.recv(_HEAD, socket.MSG_PEEK)
         except OSError:
             sent = b""
-        if not sent:  # the other side has closed it
+        if not sent:  # the other side has closed the connection
             connection.close()
         elif self._token in sent:
             self._hand_on(connection)
@@ -122,7 +128,7 @@ class Entrance:
 
     def _hand_on(self, connection: socket.socket) -> None:
         async def serve() -> None:
-            with suppress(OSError):  # it was reset
+            with suppress(OSError):  # the connection was reset
                 await self._loop.connect_accepted_socket(self._protocol, connection)
 
         task = self._loop.create_task(serve())
@@ -131,39 +137,39 @@ class Entrance:
 
 
 def _close_oldest(connections: list[socket.socket], most: int) -> None:
-    """Close connections until so many are left."""
+    """Close connections until this number is left."""
     while len(connections) > max(most, 0):
         connections.pop(0).close()
 
 
 CONNECTIONS = 96
-"""Beyond so many, the oldest one in which nothing is answered is closed for a new one. A browser opens six, and a
-process of macOS may open 256 files."""
+"""Largest number of open connections. If there are more, the oldest idle one is closed for a new one. A browser opens
+six connections, and a process may open 256 files on macOS."""
 _KNOWN_STAYS = 3600  # s without a request
 OPEN_RUNS = 8
-"""Runs whose files stay open without anybody who watches."""
+"""Number of runs whose files stay open although nobody watches them."""
 
 
 @dataclass
 class _Opened:
     reader: Reader
     app: ASGIApp
-    requests: int = 0  # being answered; the feed of an open page is one
+    requests: int = 0  # requests that are being answered; the feed of an open page is one of them
 
 
 class RunBrowser:
-    """The runs of a folder, numbered: no name from a client reaches the file system.
+    """The runs of a folder. They are numbered, so that no name from a client reaches the file system.
 
     Args:
-        own: runs of the program to which this page belongs, the newest one last; more may follow. The table links to
-            the newest one, and no other run can be controlled.
+        own: runs of the program to which this page belongs, the newest one last. More runs may be added. The table
+            links to the newest of these runs. Only these runs can be controlled.
     """
 
     def __init__(self, folder: Path, own: Sequence[Path] = ()) -> None:
         self._folder, self._own, self._lock = folder, own, threading.Lock()
         self._access = Access(())
         self._numbers: dict[Path, int] = {}
-        self._opened: dict[tuple[int, bool], _Opened] = {}  # by number, and whether it is an own one
+        self._opened: dict[tuple[int, bool], _Opened] = {}  # by number, and whether the run is one of `own`
 
     def close(self) -> None:
         for opened in self._opened.values():
@@ -176,7 +182,8 @@ class RunBrowser:
         return guarded("runs.html", routes, access)
 
     def table(self, request: Request) -> Response:
-        """Head and rows, newest first, each with its page's number and the next step; that of the newest own run."""
+        """Head and rows of the table, newest run first. Each row has the number of its page and the next step. The
+        number of the newest run of `own` is returned, too."""
         with self._lock:
             rows = [
                 {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(it), "next": it.next_step}
@@ -187,7 +194,7 @@ class RunBrowser:
         return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows, "newest": newest})
 
     async def page_of(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request as the page of a run does."""
+        """Answer a request to the page of a run."""
         opened = self._open(scope["path_params"]["number"])
         opened.requests += 1
         try:
@@ -196,7 +203,7 @@ class RunBrowser:
             opened.requests -= 1
 
     def _open(self, number: int) -> _Opened:
-        runs = list(self._numbers)  # by number; a copy, since `table` adds to it in another thread
+        runs = list(self._numbers)  # by number; a copy, because `table` adds to it in another thread
         if number >= len(runs):
             raise DataError(f"This page has no run {number}.")
         opened = number, (is_own := runs[number] in self._own)
@@ -212,17 +219,17 @@ class RunBrowser:
 
 @dataclass(frozen=True)
 class Addresses:
-    """Addresses for a browser: one to watch, and one that also allows control (None: not allowed)."""
+    """Addresses for a browser: one to watch the scan, and one that also allows control (None: control is not
+    allowed)."""
 
     look: str
     act: str | None
 
 
 def open_port(bind: str, port: int) -> socket.socket:
-    """A listening socket at a port, or at the next free one of the ten after it.
+    """A listening socket at a port, or at the next free port among the ten after it.
 
-    Raises:
-        ConfigError: not an address of this machine, or no port is free.
+    Raises: ConfigError: the address is not one of this machine, or no port is free.
     """
     try:
         family = socket.AF_INET6 if ipaddress.ip_address(bind).version == 6 else socket.AF_INET
@@ -238,10 +245,11 @@ def open_port(bind: str, port: int) -> socket.socket:
 
 
 class _Connection(H11Protocol):
-    """A connection that gives way to newer ones while it is idle, so that nobody who sends nothing locks others out.
+    """A connection that may be closed for a newer one while it is idle. So a client that sends nothing cannot keep
+    others out.
 
-    One by which somebody with the token has asked stays open for an hour, and gives way last: a stop then needs no new
-    connection, which may take seconds while thousands of others are made.
+    A connection that has sent the token stays open for an hour, and is closed last. So a command to stop the scan needs
+    no new connection, which may take seconds if thousands of others are being made.
     """
 
     @property
@@ -262,7 +270,7 @@ class _Connection(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """A server behind an entrance, which says when it ends, so that feeds of open pages end by themselves."""
+    """A server behind an entrance. It announces its end, so that the feeds of open pages end by themselves."""
 
     def __init__(self, config: uvicorn.Config, access: Access) -> None:
         super().__init__(config)
@@ -270,7 +278,8 @@ class _Server(uvicorn.Server):
         self._entrances: list[Entrance] = []
 
     def handle_exit(self, sig: int, frame: Any) -> None:
-        if sig != signal.SIGINT or not self._ignored:  # as of a process that a script started in the background
+        # for example in a process that a script started in the background
+        if sig != signal.SIGINT or not self._ignored:
             super().handle_exit(sig, frame)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -286,7 +295,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """A server bound to its port; `run` serves."""
+    """A server that is bound to its port. `run` starts serving."""
 
     def __init__(self, app: Starlette, listening: socket.socket, access: Access) -> None:
         self._listening = listening
@@ -302,7 +311,8 @@ class PageServer:
 
     def run(self) -> None:
         """Serve until `stop`, or Ctrl-C in the main thread."""
-        selecting = asyncio.SelectorEventLoop  # that of Windows cannot wait until a connection has sent something
+        # the default event loop of Windows cannot wait until a connection has sent something
+        selecting = asyncio.SelectorEventLoop
         with closing(self._listening), asyncio.Runner(loop_factory=selecting) as runner:
             runner.run(self._server.serve(sockets=[self._listening]))
 
@@ -312,7 +322,7 @@ class PageServer:
 
 
 def start(app: Callable[[Access], Starlette], listening: socket.socket, *, control: bool = False) -> PageServer:
-    """A server of an application, with new tokens.
+    """Make a server for an application, with new tokens.
 
     Args:
         control: allow commands from the page, at the address for control.
@@ -322,7 +332,7 @@ def start(app: Callable[[Access], Starlette], listening: socket.socket, *, contr
 
 
 def _names(listening: socket.socket) -> list[str]:
-    """Names of the server at this socket for a browser, with the port; the first one is printed."""
+    """Names, with the port, under which a browser can reach the server at this socket. The first name is printed."""
     host, port = listening.getsockname()[:2]
     address = ipaddress.ip_address(host)
     if address.is_unspecified:

@@ -23,13 +23,14 @@ _Result = TypeVar("_Result")
 
 
 class OnVolumes(Protocol):
-    """Calls a function with the volumes, in the one thread that reads them, and returns its result."""
+    """Function that calls a given function with the volumes, in the single thread that reads them, and returns the
+    result."""
 
     def __call__(self, read: Callable[[Sequence[ShownVolume]], _Result]) -> _Result: ...
 
 
 def viewer_routes(do: OnVolumes) -> list[Route]:
-    """Routes of the page of one volume, or of two to compare."""
+    """Routes of the page of one volume, or of two volumes to compare."""
     server = _Viewer(do)
     return [
         Route("/api/volumes", server.facts),
@@ -41,7 +42,7 @@ def viewer_routes(do: OnVolumes) -> list[Route]:
 
 
 def scan_routes(do: OnVolumes, scan: ShownScan) -> list[Route]:
-    """Routes of the page of a scan, besides the slices of its views."""
+    """Routes of the page of a scan, in addition to those for the slices of its projections."""
     server = _Scan(do, scan)
     return [
         Route("/api/scan", server.facts),
@@ -52,12 +53,12 @@ def scan_routes(do: OnVolumes, scan: ShownScan) -> list[Route]:
 
 
 def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
-    """A thread that reads these volumes ahead of requests."""
+    """A thread that reads these volumes before they are requested."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
     def read_more() -> None:
-        """Read one more slice of a volume that is not completely read; then requests that arrived in the meantime are
-        answered first."""
+        """Read one more slice of a volume that is not read completely. Requests that arrive in the meantime are
+        answered before the next slice is read."""
         if any(volume.read_more() for volume in volumes):
             thread.submit(read_more)
 
@@ -66,7 +67,7 @@ def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
 
 
 def tile_of_volume(tile: VolumeTile) -> Response:
-    """A tile of a slice; if `ready` is below 1, the tile improves while the volume is read."""
+    """A tile of a slice. If `ready` is below 1, the volume is still being read, and a later tile will be better."""
     return tile_of(tile.values, {"region": astuple(tile.region), "bin": tile.bin, "ready": tile.ready})
 
 
@@ -91,7 +92,7 @@ class _Viewer:
             return [volume.cut(axis, index, region, time) for volume in volumes]
 
         first, second = self._do(cuts)
-        if first.values.shape != second.values.shape:  # one of them has scales
+        if first.values.shape != second.values.shape:  # one of the volumes has several resolutions
             raise DataError(
                 "The slices of the two volumes have different resolutions here, so no difference can be shown: zoom in."
             )
@@ -134,7 +135,7 @@ class _Scan:
         return JSONResponse(self._do(lambda _: self._scan.axis(int(request.path_params["row"]))))
 
     def fbp(self, request: Request) -> Response:
-        """A slice by FBP with an axis and a tilt; `fast`: while a slider moves."""
+        """A slice computed with FBP, with a given axis and tilt. `fast` is True while the user moves a slider."""
         row, (axis, tilt) = int(request.path_params["row"]), numbers_of(request, "axis", 2, "column, degrees of tilt")
         region, fast = region_of(request), number_of(request, "fast") > 0
         tile = self._do(lambda _: self._scan.fbp(row, axis, tilt, region, fast=fast))
@@ -143,5 +144,5 @@ class _Scan:
 
 
 def _place(request: Request) -> tuple[int, int, int]:
-    """Axis, index, and the number of the time, 0 without one."""
+    """Axis and index of a slice, and the number of its time (0 if there is only one)."""
     return int(request.path_params["axis"]), int(request.path_params["index"]), number_of(request, "time")

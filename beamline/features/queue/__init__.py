@@ -1,4 +1,4 @@
 """Queue: `beamline scan` runs several scans one after the other."""
 
 QUEUES = {"scan": f"{__name__}.scans"}
-"""Command -> the module that takes its queue."""
+"""For each command, the module that runs its queue."""

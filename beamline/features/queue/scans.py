@@ -27,7 +27,7 @@ from drivers.base.clock import SystemClock
 
 
 class QueueStatus(StrEnum):
-    """How a scan of a queue ended."""
+    """The outcome of a scan of a queue."""
 
     COMPLETE = "complete"
     ALARMS = "alarms"
@@ -42,7 +42,7 @@ Taken = tuple[Path, Sequence[str]]
 
 @dataclass(frozen=True)
 class ScanOutcome:
-    """How a scan of a queue ended, where its files are, and why it is incomplete."""
+    """Outcome of a scan of a queue: how it ended, where its files are, and why it is incomplete."""
 
     name: str
     status: QueueStatus
@@ -66,7 +66,7 @@ class RunNotes:
 
 
 class QueueError(BeamlineError):
-    """Some scans of a queue are incomplete; the exit code is that of the first of them."""
+    """Some scans of a queue are incomplete. The exit code is that of the first incomplete scan."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -84,8 +84,8 @@ def run_queue(
     The queue ends if the operator stops a scan (Ctrl-C, a signal, `beamline stop`), or if a device does not respond.
 
     Args:
-        take: function that runs a scan, given its number from 0 on; it sends its events to its last argument, and
-            raises the errors of `run_scan`.
+        take: function that runs the scan with a given number (from 0). It sends events to its last argument, and raises
+            the errors of `run_scan`.
     """
     outcomes: list[ScanOutcome] = []
     ended = ""
@@ -117,7 +117,7 @@ def summary(outcomes: Sequence[ScanOutcome]) -> list[str]:
 
 
 def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
-    """Raise QueueError if a scan is incomplete; AlarmError if all are complete, and some have alarms."""
+    """Raise QueueError if a scan is incomplete. Raise AlarmError if all scans are complete, but some have alarms."""
     bad = [outcome for outcome in outcomes if outcome.status not in (QueueStatus.COMPLETE, QueueStatus.ALARMS)]
     alarmed = [outcome for outcome in outcomes if outcome.status is QueueStatus.ALARMS]
     if bad:
@@ -158,7 +158,7 @@ def take_all(request: ScanRequest) -> None:
 
 
 def _show(plan: QueuePlan, json_sink: Sink, as_json: bool) -> None:
-    """Print the plan. Raises ConfigError if a scan cannot run; the event of the error then has the plan, too."""
+    """Print the plan. Raises ConfigError if a scan cannot run. The event of this error also has the plan."""
     if not as_json:
         click.echo("\n".join(plan.lines()))
     try:
@@ -172,7 +172,7 @@ def _show(plan: QueuePlan, json_sink: Sink, as_json: bool) -> None:
 def _take_next(
     request: ScanRequest, of: int, json_sink: Sink, n: int, config: Config, stop: StopRequest, run: RunNotes
 ) -> Taken:
-    """Take the n-th scan of a queue of so many."""
+    """Run the n-th of the scans of a queue."""
     if request.wait and n:
         ask_operator(f"Scan {n + 1} of {of}: put the sample {config.sample.name} in place.")
     click.echo(f"Scan {n + 1} of {of}: {config.sample.name}", err=True)

@@ -36,8 +36,8 @@ from simulators.effects.catalogue import CATALOGUE, load_effect
 
 
 def effects_text() -> str:
-    """Each effect that a scene can use, in the order of physics: parameters with defaults, what it acts on, what
-    happens, and what the parameters mean. This imports all effects."""
+    """Description of each effect that a scene can use, in the order of the physics: its parameters with defaults, the
+    quantity that it changes, what happens, and the meaning of the parameters. This function imports all effects."""
     lines = []
     for name, row in sorted(CATALOGUE.items(), key=lambda item: item[1].domain):
         effect = load_effect(name)
@@ -117,7 +117,7 @@ class SimulateRequest:
 
 
 class Output:
-    """Prints results as lines for people, and sends them as events for programs."""
+    """Prints results as lines for people, and also sends them as events for programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
         self._sink, self._clock, self._plain = sink, clock, plain

@@ -67,10 +67,11 @@ def check_output(scan: Scan, out: Path) -> None:
 def write_scan(
     scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
 ) -> SimulatedScan:
-    """Compute every frame of `scan` and write it to `out`, with the labels next to it, even if it ends early.
+    """Compute every frame of `scan` and write it to `out`. The labels are written next to `out`, even if the work ends
+    early.
 
     Args:
-        should_stop: called before each frame; true ends the scan with a valid file and labels.
+        should_stop: function called before each frame. If it returns True, the scan ends with a valid file and labels.
 
     Raises:
         DataError: a file exists or cannot be written, or the disk is too small.
@@ -95,7 +96,7 @@ def write_scan(
                     reported = now
                     sink(replace(_progress(n, len(scan), now, scan.detector.shape, planned.kind), time=clock.now()))
     except BaseException:
-        with suppress(DataError):  # the first error is the one to report
+        with suppress(DataError):  # the first error is reported
             write_labels(labels, log.runs(), n)
         raise
     runs = log.runs()
@@ -157,7 +158,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
 
 
 def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
-    """The scan of a scene, see Scan.of. Its last frame is computed once, so that an impossible scene raises its error
+    """The scan of a scene, see Scan.of. The last frame is computed first, so that an impossible scene raises its error
     early.
 
     Raises:
@@ -178,7 +179,8 @@ def exposure_errors(scene: str) -> Iterator[None]:
 
 
 def steps_of(scene: Scene) -> list[tuple[str, str, str]]:
-    """Steps of a frame of a scene in order: name, what it acts on, and what happens."""
+    """The steps in which a frame of a scene is computed, in order. Each has a name, the quantity that it changes, and
+    what happens."""
     effects = [(e.domain, (e.name, e.domain.words, CATALOGUE[e.name].summary)) for e in scene.chain.effects]
     return [
         ("line_integrals", "", "rays through the sample"),
@@ -204,9 +206,10 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     """A contact sheet as PNG. Its frames are computed again, so that no file is needed.
 
     Args:
-        marked: frames to include, such as those with anomalies.
+        marked: frames that must be included, such as frames with anomalies.
     """
-    from beamline.report.sheets import FlaggedFrame, contact_sheet  # here: matplotlib takes a second
+    # imported here, because matplotlib takes a second to load
+    from beamline.report.sheets import FlaggedFrame, contact_sheet
 
     numbers, shape = _chosen(scan, marked), scan.detector.shape
     step, shown, views = max(1, -(-max(shape) // MOST)), list[FlaggedFrame](), list[F32]()
@@ -228,7 +231,8 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
 
 
 def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:
-    """A dark and a flat, if any, marked frames, and views spread over the scan."""
+    """The frames of the picture: a dark and a flat (if there are any), the marked frames, and projections spread over
+    the scan."""
     settings = scan.scene.scan
     first_view = settings.darks + settings.flats
     numbers = [0] if settings.darks else []

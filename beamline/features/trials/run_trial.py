@@ -1,4 +1,5 @@
-"""Runs one trial: reconstructs and measures. Also the data that all trials of a scan share."""
+"""Runs one trial: reconstructs a volume and measures its quality. The module also has the data that all trials of a
+scan share."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ _UNWATCHED = RunControl()
 
 
 class TrialRun(NamedTuple):
-    """What a trial runs: a method on projections, for a volume on this grid."""
+    """The work of a trial: a method, the projections, and the grid of the volume."""
 
     method: Method
     views: Views
@@ -43,22 +44,22 @@ class TrialRun(NamedTuple):
 
 
 class TrialScan(Protocol):
-    """The scan of some trials: what each trial runs, and how good its volume is.
+    """The scan that trials reconstruct. It gives the work of each trial, and measures the quality of its volume.
 
     Attributes:
-        truth: the volume [z, y, x] of all trials, if it is known.
+        truth: the ground truth [z, y, x] of all trials, if it is known.
     """
 
     truth: F32 | None = None
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
-        """What a trial runs. Raises ValueError for a setting or projections that do not exist."""
+        """The work of a trial. Raises ValueError if a setting or the projections do not exist."""
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """Figures of merit of a volume by name, and the squared residual of each held-out projection."""
+        """Figures of merit of a volume by name, and the squared residual in each held-out projection."""
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with the conclusions from all of its trials."""
+        """The table with the conclusions from all trials added."""
         return table
 
 
@@ -70,7 +71,7 @@ class TrialData(TrialScan):
         views: the projections that may be used, and the held-out projections that no trial uses. They have no weights
             from the monitor, because trials are compared with equal weight for all rays.
         truth: the ground truth [z, y, x] on Grid.matching(geometry).
-        references: further volumes on the same grid that trials are compared with, by method.
+        references: further volumes on the same grid, by method, with which trials are compared.
         regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None if there are none.
         seed: random seed of all trials.
     """
@@ -111,8 +112,8 @@ class TrialData(TrialScan):
 def averaged(views: Views, choice: ViewChoice) -> Views:
     """The projections of a row of a study, each the mean of a window of projections.
 
-    The transmissions are averaged, -log(mean(exp(-p))), not the logarithms, as in a longer exposure. The weight of a
-    ray is the smallest weight in its window.
+    As in a longer exposure, the transmissions are averaged and not their logarithms: -log(mean(exp(-p))). The weight of
+    a ray is the smallest weight in its window.
     """
     groups = np.array(choice.groups)
     middle = views.using(groups[:, choice.window // 2])
@@ -132,7 +133,8 @@ def run_trial(
     control: RunControl = _UNWATCHED,
     cpu: Callable[[], float] = time.process_time,
 ) -> tuple[Outcome, F32 | None]:
-    """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x] (None if it failed)."""
+    """Reconstruct the volume of a trial and measure it. Returns the outcome, and the volume [z, y, x] (None if the
+    trial failed)."""
     try:
         method, views, grid, seed, device = data.asked_by(trial)
         geometry = views.seen.geometry

@@ -41,7 +41,7 @@ class ComparedScan:
     """The scan of a trade-off or a study, and settings that apply to all of its reconstructions.
 
     Attributes:
-        methods: names in `recon.methods`; empty: the methods that suit the comparison.
+        methods: names in `recon.methods`; empty: the default methods of the comparison.
         truth: ground truth for the comparison, as FILE or FILE:first:end.
         seconds: time limit of each reconstruction, the same for all methods; None: no limit.
         command: the command line of this call, which the page states.
@@ -65,7 +65,8 @@ class Planned:
     """What a comparison will do.
 
     Attributes:
-        data: gives the data of the scan, after running the reconstructions that trials are compared with.
+        data: function that returns the data of the scan. It first makes the reconstructions with which trials are
+            compared.
         table: the table before any trial is done.
         slices: the sheet of slices before any trial is done.
     """
@@ -76,13 +77,14 @@ class Planned:
 
 
 Plan = Callable[[Sink, Clock], Planned]
-"""Reads and corrects the projections of a scan, and plans the trials. ConfigError, DataError: nothing was written."""
+"""Function that reads and corrects the projections of a scan, and plans the trials. If it raises ConfigError or
+DataError, nothing was written."""
 
 
 def opened_scan(
     asked: ComparedScan, name: str, title: str, sink: Sink, clock: Clock, *, held_out: bool
 ) -> tuple[TrialData, TrialTable]:
-    """Read and correct the views, after all inputs were checked; the table has no trials yet.
+    """Check all inputs, then read and correct the projections. The table has no trials yet.
 
     Args:
         name, title: name and title of the table.
@@ -117,10 +119,11 @@ def _run_and_show(slices: SliceSheet, data: TrialScan, trial: MethodTrial) -> tu
 def _run_all(
     table: TrialTable, run: Callable[[MethodTrial], tuple[Outcome, F32 | None]], path: Path, sink: Sink, clock: Clock
 ) -> TrialTable:
-    """Run the trials in turn, and write the table to a CSV file after each; after Ctrl-C it is `stopped`.
+    """Run the trials one after the other, and write the table to a CSV file after each. After Ctrl-C the table is
+    `stopped`.
 
     Args:
-        run: the outcome and the volume [z, y, x] of a trial; None if it failed.
+        run: function that returns the outcome and the volume [z, y, x] of a trial (None if the trial failed).
 
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
@@ -144,7 +147,8 @@ def _run_all(
 
 
 def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
-    """A trial that has ended, the n-th of so many; `gaussians` are those at its start, as in its settings."""
+    """The event of a trial that has ended, the n-th of all trials. `gaussians` is the number at the start, as in the
+    settings of the trial."""
     trial = outcome.trial
     figures = {
         **{name: getattr(trial, name) for name in ("group", "method", "views")},
@@ -162,8 +166,7 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
 def compare(plan: Plan, file: Path | str, folder: Path, *, as_json: bool) -> TrialTable:
     """Run a comparison, and print its table.
 
-    Raises:
-        ScanStopped: it was stopped after some trials.
+    Raises: ScanStopped: the comparison was stopped after some trials.
     """
     with answering(as_json) as answer:
         table = run_comparison(plan, file, folder, answer.sink, answer.clock)
@@ -181,12 +184,11 @@ def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock
     `stopped`. A folder without results is removed.
 
     Args:
-        plan: reads the scan and says which trials to run.
-        file: of the scan, for the event.
-        folder: must not exist.
+        plan: function that reads the scan and decides which trials to run. file: file of the scan, which the event
+            states. folder: new folder; it must not exist.
 
     Raises:
-        ConfigError, DataError: nothing was written, or the table of the trials that were done.
+        ConfigError, DataError: nothing was written; or, if some trials were done, the table with these trials.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
     refuse_not_utf8(file)
@@ -203,7 +205,7 @@ def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock
             planned.slices.add("truth", data.truth)
         table = data.concluded(_run_all(table, partial(run, data), path, sink, clock))
     finally:
-        with suppress(OSError):  # it has results; without any the next run would refuse it
+        with suppress(OSError):  # the folder has results; an empty folder would prevent the next run
             folder.rmdir()
     write_table(path, table.records)
     write_page(folder, table, planned.slices)

@@ -39,7 +39,9 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import squares_left
 from recon.voxels.resolution import ViewResolution
 
-_LEAST_CHANGE = 0.05  # share of the residual of a direct method: 0.03 named an axis that was 0.7 columns off
+# share of the residual of a direct method that counts as no difference; with 0.03, an axis that was wrong by 0.7
+# columns was called the best
+_LEAST_CHANGE = 0.05
 _NUMBER = re.compile(rf"[-+]?{NUMBER}")
 _NO_SCORE = (
     "No scores: these values change the pixels or the selection of projections, so the slices cannot be "
@@ -54,11 +56,10 @@ _OTHER_VIEWS = (
 
 @dataclass(frozen=True)
 class SweptTrial(MethodTrial):
-    """A reconstruction with one value of each option.
+    """A trial of a sweep: a reconstruction with one value of each option.
 
     Attributes:
-        settings: the values, by the name of the option.
-        options: of `beamline recon`.
+        settings: the values by the name of the option. options: the options of `beamline recon`.
     """
 
     options: ReconOptions = field(kw_only=True, hash=False)
@@ -70,7 +71,7 @@ class SweptTrial(MethodTrial):
 
     @property
     def shown(self) -> str:
-        """The label: every slice is shown."""
+        """The label of the trial, because every slice is shown."""
         return self.label
 
 
@@ -78,10 +79,10 @@ class UnseenViews(NamedTuple):
     """The held-out projections of a trial, and the forward projection of its volume.
 
     Attributes:
-        ids: their rows in the file.
-        data: [view, col, row], as the trial corrects them; pixels without data are NaN.
+        ids: rows of the projections in the file. data: [view, col, row], the projections after the corrections of this
+            trial; pixels without data are NaN.
         model: [view, col, row], forward projection of the volume at this resolution.
-        views: the projections that the trial used; trials with the same projections have the same data.
+        views: the projections that the trial used. Trials with the same projections have the same data.
     """
 
     ids: I64
@@ -100,7 +101,7 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     """The same reconstruction options for a few rows around the middle.
 
     A direct method needs only the row of the slice; total variation and fits need some rows around it. For a cone beam,
-    and if the user gave rows, all of them are reconstructed.
+    or if the user gave rows, all rows are reconstructed.
 
     Raises:
         ConfigError, DataError: the scan or the selection cannot be used.
@@ -122,10 +123,11 @@ def _middle(trial: ReconOptions, halo: int) -> Selection:
 
 
 class SweptScan(TrialScan):
-    """The scan of a sweep. Projections are corrected only once for all values that do not affect the correction.
+    """The scan of a sweep. If the values do not affect the correction, the projections are corrected only once for all
+    values.
 
-    The rotation axis is found only once, so that slices differ only by the options. If the axis is swept, projections
-    are corrected with the middle axis.
+    The rotation axis is determined only once, so that slices differ only by the options. If the axis is swept, the
+    projections are corrected with the middle one of the axes.
 
     Attributes:
         unseen: held-out projections of the finished trials, by label.
@@ -141,7 +143,7 @@ class SweptScan(TrialScan):
         self.unseen: dict[str, UnseenViews] = {}
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
-        """What a trial runs. Raises ConfigError, DataError: see `beamline recon`."""
+        """The work of a trial. Raises ConfigError and DataError as `beamline recon` does."""
         assert isinstance(trial, SweptTrial)
         options, asked = trial.options, trial.options.selection
         views = self._corrected(options)
@@ -166,7 +168,8 @@ class SweptScan(TrialScan):
         return self._views[2]
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
-        """The residual of the held-out projections, as this trial corrects them, and its square in each projection."""
+        """The residual in the held-out projections after the corrections of this trial, and its square in each
+        projection."""
         used = self._used
         assert used is not None and self._views is not None
         apart = used.unseen
@@ -182,7 +185,8 @@ class SweptScan(TrialScan):
         return {HELD_OUT: squares.residual}, squares.left.tolist()
 
     def concluded(self, table: TrialTable) -> TrialTable:
-        """The table with scores instead of the residuals in each trial's own projections, with verdicts and remarks.
+        """The table in which scores replace the residuals of the trials in their own projections, with verdicts and
+        remarks.
 
         Raises:
             DataError: no slice was made, or the held-out projections show no sample.
@@ -221,8 +225,8 @@ class SweptScan(TrialScan):
 def middle_axis(selections: Sequence[Selection]) -> float | None:
     """The axis with which all projections are corrected if the axis itself is swept; None if it is not swept.
 
-    Some corrections compare projections on both sides of the axis. If each trial used its own axis, some trials would
-    apply such a correction and others would not.
+    Some corrections compare the two sides of the axis. If each trial were corrected with its own axis, some trials
+    would apply such a correction and others would not.
     """
     axes = sorted(each.axis_col for each in selections if each.axis_col is not None)
     return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
@@ -236,15 +240,16 @@ def _about(views: Views, selection: Selection) -> Views:
 
 
 def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tuple[TrialChoice, bool] | None:
-    """The residual of each slice's volume in the held-out projections, as a fraction of these projections, and True if
-    all options give the same projections. None if slices differ in their pixels or in the held-out projections.
+    """The residual of the volume of each slice in the held-out projections, as a fraction of these projections; and
+    True if all options give the same projections. None if slices differ in their pixels or in their held-out
+    projections.
 
-    A correction also changes the held-out projections: if it smooths, its volume would be compared with smoother
-    projections. Therefore each volume is compared with the held-out projections as every value corrects them, and the
-    mean is the score.
+    A correction also changes the held-out projections: a correction that smooths would compare its volume with smoother
+    projections. Therefore each volume is compared with the held-out projections after the correction of every value,
+    and the mean of these residuals is the score.
 
     Args:
-        direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
+        direct: True if a direct method made the volumes. Their residual is mostly the blur of the filter.
 
     Raises:
         DataError: the held-out projections show no sample.
@@ -253,7 +258,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
     if len({each.model.shape[1:] for each in slices.values()}) > 1 or not common.size:
         return None
     unseen = [each.of(common) for each in slices.values()]
-    judges = {id(each.views): each for each in reversed(unseen)}.values()  # one resolution for all geometries
+    judges = {id(each.views): each for each in reversed(unseen)}.values()  # the same resolution for all geometries
     if not all(np.isfinite(judge.data).any(axis=(1, 2)).all() for judge in judges):
         return None
     same = all(np.array_equal(judge.data, unseen[0].data, equal_nan=True) for judge in judges)
@@ -267,16 +272,16 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
 
 
 def shares_of(choice: TrialChoice) -> list[float]:
-    """[candidate] the residual in all held-out projections, as in `recon.judgement`."""
+    """[candidate] the residual in all held-out projections together, as in `recon.judgement`."""
     return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
 
 
 Trials = Sequence[tuple[Mapping[str, str], ReconOptions]]
-"""Values by option, and the options of `beamline recon` with these."""
+"""The values by option, and the options of `beamline recon` that have these values."""
 
 
 def planned_sweep(trials: Trials, command: str, sink: Sink, clock: Clock) -> Planned:
-    """Cut the rows of the slice, and plan a trial for each combination of values.
+    """Select the rows for the slice, and plan a trial for each combination of values.
 
     Raises:
         ConfigError, DataError: nothing was written.

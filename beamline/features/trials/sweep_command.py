@@ -33,15 +33,9 @@ _OF_A_VOLUME = frozenset(
 """Options of `beamline recon` that have no effect on a single slice."""
 
 MOST = 64
-"""Most slices in one picture: 16 rows of four, 3200 pixels high as `sheets` draws them."""
-_AXIS = (
-    "center",
-    "centre",
-    "center-of-rotation",
-    "centre-of-rotation",
-    "cor",
-    "rotation-axis",
-)  # names of the option axis in other programs
+"""Largest number of slices in one picture: 16 rows of four slices, which `sheets` draws 3200 pixels high."""
+# names that other programs use for the option axis
+_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"
 _SIGNED = rf"[-+]?{NUMBER}"
 _RANGE = re.compile(rf"({_SIGNED}):({_SIGNED}):({_SIGNED})")
 
@@ -64,8 +58,7 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
     Args:
         legal: long names of the options that can be swept; "_" in a name counts as "-".
 
-    Raises:
-        ValueError: another name (the message suggests the nearest one), or too few values.
+    Raises: ValueError: the name is unknown (the message suggests the most similar one), or there are too few values.
     """
     name, equals, values = text.partition("=")
     name = name.strip().lstrip("-").replace("_", "-")
@@ -105,8 +98,7 @@ def _values(name: str, text: str) -> tuple[str, ...]:
 def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
     """All combinations of values, by name; the last option varies fastest.
 
-    Raises:
-        ValueError: not one or two different options, or too many combinations.
+    Raises: ValueError: there are not one or two different options, or there are too many combinations.
     """
     names = [option.name for option in options]
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
@@ -171,7 +163,8 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
 
 
 def _parsed(words: Sequence[str]) -> tuple[list[SweptOption], list[str]]:
-    """The options with their values, and the words of `beamline recon` common to all slices, with the scan first."""
+    """The options with their values, and the words of the command `beamline recon` that are common to all slices. The
+    scan comes first."""
     with click.Context(recon, info_name="sweep") as context:
         taken, further, _ = recon.make_parser(context).parse_args(list(words))
     if (file := taken.get("file")) is None or not further:
@@ -199,8 +192,8 @@ def _as_words(name: str, value: str) -> list[str]:
 
 
 def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
-    """Each combination of values with the options of its reconstruction. Raises UsageError for values that are not
-    allowed, or that change nothing."""
+    """Each combination of values, with the options of its reconstruction. Raises UsageError for values that are not
+    allowed, or that have no effect."""
     trials: Trials = []
     for values in combinations(options):
         own = [word for item in values.items() for word in _as_words(*item)]
@@ -224,7 +217,7 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
 
 
 def _options(context: click.Context) -> ReconOptions:
-    """The options of one reconstruction whose volume is not written."""
+    """The options of a reconstruction whose volume is not written."""
     from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):

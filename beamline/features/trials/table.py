@@ -1,4 +1,4 @@
-"""The results of trials: as text, pictures and a page, with sentences that say what follows."""
+"""The results of trials as text, pictures and a page, with sentences that state the conclusions."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _QUALITY = {
 _COSTS: dict[str, Callable[[Outcome], float]] = {
     "time (s)": lambda outcome: outcome.seconds,
     "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
-    "dose (frames)": lambda outcome: outcome.trial.frames,  # those that several views share are counted once
-}  # that a picture shows, by the label of their axis
-_SHOWN_DB = 12.0  # below the best; worse trials are drawn at the lower edge
-_COLOURS = {"best": "tab:red", "alike": "tab:orange"}  # of frames, by verdict
+    "dose (frames)": lambda outcome: outcome.trial.frames,  # frames that several projections share are counted once
+}  # quantities that a picture shows, by the label of their axis
+_SHOWN_DB = 12.0  # dB below the best trial; trials that are worse are drawn at the lower edge
+_COLOURS = {"best": "tab:red", "alike": "tab:orange"}  # colours of frames, by verdict
 _MARKS = {"front": "*", "best": "*", "alike": "~"}
 _LEGENDS = {
-    "front": "*: on the Pareto front: no faster trial is as good.",
+    "front": "*: on the Pareto front, that is, no faster trial is as good.",
     "best": "*: the smallest residual.",
     "alike": "~: not significantly larger than the smallest residual.",
 }
-_ALIKE_DB = 1.0  # dB below the best figure: a tenth more error
+_ALIKE_DB = 1.0  # dB below the best value; this is a tenth more error
 _WIDTH = 120  # characters
 
 
@@ -48,12 +48,12 @@ def columns(table: TrialTable) -> list[str]:
 
 
 def figures_of(table: TrialTable) -> list[str]:
-    """Names of the figures that any row has, in their usual order."""
+    """Names of the figures of merit that at least one row has, in the usual order."""
     return [name for name in METRICS if name in table.metrics]
 
 
 def cells(table: TrialTable, outcome: Outcome) -> list[str]:
-    """The values of a row under `columns`, as text."""
+    """The values of a row for `columns`, as text."""
     memory = "–" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
     figures = [
         _figure(name, outcome.metrics[name], 2 * table.asks_best) if name in outcome.metrics else "–"
@@ -63,7 +63,7 @@ def cells(table: TrialTable, outcome: Outcome) -> list[str]:
 
 
 def _figure(name: str, value: float, finer: int = 0) -> str:
-    """A figure with its digits, and so many more; "equal" for the PSNR of two equal volumes."""
+    """A figure of merit with its usual number of digits plus `more`; "equal" for the PSNR of two equal volumes."""
     if math.isfinite(value):
         return f"{value:.{METRICS[name].digits + finer}f}"
     return "equal" if name.startswith("psnr") and value > 0 else "undefined"
@@ -81,7 +81,7 @@ def _status(outcome: Outcome) -> str:
 
 
 def text(table: TrialTable) -> str:
-    """The table for people; a mark before a row is its verdict."""
+    """The table for people. A mark before a row shows its verdict."""
     head, verdicts = columns(table), [table.verdict(outcome) for outcome in table.outcomes]
     width = max(len(outcome.trial.label) for outcome in table.outcomes)
     wide = [max(8, len(name) + 2) for name in head]
@@ -105,7 +105,7 @@ def text(table: TrialTable) -> str:
 
 
 def write_page(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
-    """Write the pictures that have data, and the page."""
+    """Write the pictures for which there are data, and the page."""
     drawn = dict(_pictures(table, slices))
     for name, picture in drawn.items():
         write_whole(folder / name, picture.png, replace=True)
@@ -139,14 +139,14 @@ def to_html(table: TrialTable, drawn: Sequence[Picture]) -> str:
 
 
 def sentences(table: TrialTable) -> list[str]:
-    """What follows from the table, and what its figures mean."""
+    """The conclusions from the table, and the meaning of its figures."""
     if table.asks_costs:
         return _conclusions(table)
     return [*_draws(table), *table.notes]
 
 
 def _conclusions(table: TrialTable) -> list[str]:
-    """The trial that is best for its time, and the time of each further dB along the front."""
+    """The trial that is best for its time, and the time that each further dB costs along the Pareto front."""
     by, front = table.by, table.front
     if not front:
         return ["No trial has both a time and a quality."]
@@ -167,7 +167,7 @@ def _conclusions(table: TrialTable) -> list[str]:
 
 
 def _draws(table: TrialTable) -> Iterator[str]:
-    """Mean and range of the figures over the draws of one choice."""
+    """Mean and range of the figures over the random selections of one kind."""
     families: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in table.compared:
         if outcome.trial.choice is not None and outcome.trial.choice.family:
@@ -182,7 +182,7 @@ def _draws(table: TrialTable) -> Iterator[str]:
 
 
 def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Picture]]:
-    """Quality against each cost, and the slices of baselines or of all rows, by file name."""
+    """The pictures by file name: quality against each cost, and the slices of the baselines or of all rows."""
     if any(math.isfinite(outcome.quality(table.by)) for outcome in table.compared):
         caption = (
             "Each point is a trial, and each colour is a method. The line shows the best quality at each time. A "

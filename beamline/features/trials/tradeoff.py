@@ -1,7 +1,7 @@
-"""Trade-off and studies: the lists of trials that they compare.
+"""Trade-off and studies: makes the lists of trials that they compare.
 
-The registry of methods lists which numbers of iterations are tried for a method; a method without a list is tried with
-its defaults.
+The registry of methods lists the numbers of iterations that are tried for a method. A method without such a list is
+tried with its defaults.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def planned_study(
 
     Args:
         scan: the scan from whose projections the study selects.
-        settings: settings of the methods, by name; a method without an entry uses its defaults.
+        settings: settings of the methods, by the name of the method. A method without an entry uses its defaults.
         ramp: filter of each FBP, for the rows and for the volume from all projections.
         draws: number of random selections.
 
@@ -125,7 +125,7 @@ def planned_tradeoff(scan: ComparedScan, sink: Sink, clock: Clock, depth: Depth 
 
 
 def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:
-    """The settings that are tried on all projections, the baseline first.
+    """The trials that use all projections, the baseline first.
 
     Args:
         depth: "quick" has fewer trials, and shorter ones.
@@ -138,8 +138,8 @@ def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:
 
 
 def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTrial, ...]:
-    """The test reconstructions. For each method, the baseline comes first; each further one changes a single setting of
-    the baseline.
+    """The list of trials. For each method, the baseline comes first; each further trial changes a single setting of the
+    baseline.
 
     Args:
         methods: names in `recon.methods`, in the order wanted.
@@ -155,5 +155,5 @@ def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTria
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, seconds: float) -> tuple[MethodTrial, ...]:
-    """Each method once, all with the same time."""
+    """One trial for each method, all with the same time limit."""
     return tuple(trials_of(method, n_views, "quick")[0].in_time(seconds) for method in methods)

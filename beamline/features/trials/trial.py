@@ -1,4 +1,4 @@
-"""Trial (what to reconstruct), its outcome, the table of all trials, and their Pareto front."""
+"""Trial (a reconstruction to make), its outcome, the table of all trials, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from recon.methods import build, by_name
 Status = Literal["done", "failed", "interrupted", "not run"]
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
-_ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
+# number of standard errors, of the difference over the held-out projections, up to which a difference may be chance
+_ERRORS = 2.0
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class MethodTrial:
     """One reconstruction to make.
 
     Attributes:
-        group: the setting that the trial varies; "method" if none.
-        method: its name in `recon.methods`.
-        views: number of projections, evenly spread over those of the scan, or as many as `choice` has.
+        group: the setting that the trial varies; "method" if it varies none. method: name of the method in
+            `recon.methods`. views: number of projections, evenly spread over those of the scan; with `choice`, the
+            number of projections in the choice.
         settings: settings of the method by name, as for `recon.methods.build`.
         seconds_asked: time limit of the reconstruction in s; None: no limit.
         choice: selection of projections; None: `views` evenly spread ones.
@@ -48,14 +49,15 @@ class MethodTrial:
 
     @property
     def shown(self) -> str:
-        """The label under which the page shows a slice; in a study all rows are shown, otherwise only baselines."""
+        """The label under which the page shows a slice of the trial. In a study, all rows are shown; otherwise only
+        baselines."""
         if self.choice is not None:
             return self.label
         return by_name(self.method).label if self.group == "method" else ""
 
     @property
     def frames(self) -> int:
-        """Number of frames of the scan that the trial uses, each counted once: its dose."""
+        """The dose of the trial: number of frames of the scan that it uses, each counted once."""
         return self.views if self.choice is None else self.choice.frames
 
     def build(self) -> Method:
@@ -68,7 +70,7 @@ class MethodTrial:
         return build(method, {**self.settings, **({} if seconds is None else method.ended_by(seconds))})
 
     def in_time(self, seconds: float | None) -> MethodTrial:
-        """The trial with this time limit in s, if any; a direct method takes the time it needs."""
+        """The trial with this time limit in s, if its method has one. A direct method takes the time it needs."""
         method = by_name(self.method)
         if seconds is None or issubclass(method, Direct):
             return self
@@ -100,9 +102,10 @@ class Outcome:
         metrics: figures of merit by name: psnr, ssim3d (with a ground truth), residual_held_out, and with a reference
             psnr_all, ssim_all, snr, cnr.
         gaussians: number of Gaussians at the end; None for voxel methods.
-        cpu_seconds: CPU time of all threads of the reconstruction; compare this if other programs use the computer.
+        cpu_seconds: CPU time of all threads of the reconstruction. Compare this value if other programs use the
+            computer.
         squared_residuals: squared residual of each held-out projection.
-        verdict: "best"; "alike": not significantly worse than the best; empty: not compared in this way, or worse.
+        verdict: "best"; "alike": not significantly worse than the best; empty: worse, or not compared in this way.
     """
 
     trial: MethodTrial
@@ -132,14 +135,14 @@ class TrialTable:
         name: name of the command and of its CSV file.
         title: title of the page.
         outcomes: all outcomes in the order of the plan, including trials that are left out.
-        by: the metric of quality: psnr, psnr_all or residual_held_out.
+        by: the metric with which quality is compared: psnr, psnr_all or residual_held_out.
         scan: facts about the scan for people, by name.
         question: the question that the table answers; may be empty.
         stopped: True if it was interrupted before all trials were done.
         notes: sentences about the meaning of the figures.
-        asks_costs: True if the question is which trial is worth its time; the Pareto front is then marked.
-        asks_best: True if the question is which trial has the smallest residual in held-out projections; figures then
-            have more digits and are shown in the pictures.
+        asks_costs: True if the question is which trial is worth its time. The Pareto front is then marked. asks_best:
+            True if the question is which trial has the smallest residual in held-out projections. Figures then have
+            more digits, and the pictures show them.
         page: file name of the page.
     """
 
@@ -163,12 +166,12 @@ class TrialTable:
 
     @property
     def compared(self) -> tuple[Outcome, ...]:
-        """The trials that reconstructed the scan successfully."""
+        """The outcomes of trials that reconstructed the scan successfully."""
         return tuple(o for o in self.outcomes if o.status == "done")
 
     @property
     def best(self) -> dict[str, Plain] | None:
-        """The settings of the best trial; None if no trial is called the best."""
+        """The settings of the best trial; None if no trial has the verdict "best"."""
         return next((dict(each.trial.settings) for each in self.compared if each.verdict == "best"), None)
 
     @property
@@ -178,15 +181,15 @@ class TrialTable:
 
     @property
     def metrics(self) -> set[str]:
-        """Names of the figures that any row has."""
+        """Names of the figures of merit that at least one row has."""
         return {name for outcome in self.outcomes for name in outcome.metrics}
 
     @property
     def front(self) -> list[Outcome]:
         """The Pareto front: trials for which no faster trial is as good, in ascending order of time and of quality.
 
-        Times within 1 % count as equal. A slower trial is on the front only if it is better by more than `chance`. Of
-        equal trials, the first one is taken.
+        Times within 1 % count as equal. A slower trial is on the front only if it is better by more than `chance`. If
+        trials are equal, the first one is on the front.
         """
         front: list[Outcome] = []
         known = [o for o in self.compared if math.isfinite(o.seconds) and math.isfinite(o.quality(self.by))]
@@ -209,12 +212,13 @@ class TrialTable:
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
     def verdict(self, outcome: Outcome) -> str:
-        """The verdict of the outcome; "front" if it is on the Pareto front and the table asks for it."""
+        """The verdict of the outcome. It is "front" if the outcome is on the Pareto front and the table marks the
+        front."""
         return "front" if self.asks_costs and outcome in self.front else outcome.verdict
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The rows of the CSV file: all values of each trial, by name; None if only other rows have a value."""
+        """The rows of the CSV file: all values of each trial, by name. A value that only other rows have is None."""
         settings = [name for outcome in self.outcomes for name in outcome.trial.settings]
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:

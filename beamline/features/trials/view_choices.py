@@ -1,4 +1,4 @@
-"""The studies, and which projections of a scan each of their rows uses; pure values."""
+"""The studies, and the projections of a scan that each of their rows uses, as plain values."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from recon.base.views import parse_views
 
 COUNTS = 360, 180, 90, 45
 SECTORS = ((30, 150, 120), (45, 135, 90), (60, 120, 60))
-"""First and last degree, and views at one a degree: the counts fall with the sector."""
+"""First and last degree of each sector, and number of projections at one per degree: the numbers fall with the width of
+the sector."""
 EQUAL_COUNTS = 120, 60
 DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
-OVERLAPPING = 180  # Number of overlapping windows of each width
+OVERLAPPING = 180  # Number of overlapping windows for each width
 
 
 @dataclass(frozen=True, eq=False)
 class ViewChoice:
-    """A selection of projections; each one is the mean of some projections of the scan.
+    """A selection of projections. Each selected projection is the mean of some projections of the scan.
 
     Attributes:
         label: its name in tables.
         groups: [projection, window]: the projections of the scan that are averaged; None: the choice is left out.
-        family: choices of the same family are random selections of the same kind; empty: no family.
-        reason: why it is left out.
+        family: name that random selections of the same kind share; empty: the choice is not one of several random
+            selections. reason: why the choice is left out.
     """
 
     label: str
@@ -42,12 +43,12 @@ class ViewChoice:
 
     @property
     def frames(self) -> int:
-        """Number of frames of the scan that it uses, each counted once: its dose."""
+        """The dose of the choice: number of frames of the scan that it uses, each counted once."""
         return len({view for group in self.groups or () for view in group})
 
     @property
     def n_views(self) -> int:
-        """Number of projections; 0 if it is left out."""
+        """Number of projections; 0 if the choice is left out."""
         return len(self.groups) if self.groups else 0
 
 
@@ -57,9 +58,8 @@ class ViewSet:
 
     Attributes:
         angles: [view], radians.
-        period: radians after which views see the same rays, see `Geometry.period`.
-        seed: of the first random draw.
-        draws: how often a random choice is repeated.
+        period: angle in radians after which projections see the same rays, see `Geometry.period`. seed: seed of the
+            first random draw. draws: number of random selections for each number of projections.
     """
 
     angles: NDArray[np.float64]
@@ -70,11 +70,11 @@ class ViewSet:
 
 @dataclass(frozen=True)
 class Study:
-    """A question to a scan, and the rows that answer it.
+    """A study: a question about a scan, and the rows that answer it.
 
     Attributes:
         name: on the command line; `title`: of its page.
-        rows: all rows; if the scan has too few projections for a row, with the reason.
+        rows: all rows. If the scan has too few projections for a row, the row gives the reason.
     """
 
     name: str
@@ -89,8 +89,8 @@ def fixed_views(views: ViewSet) -> list[ViewChoice]:
 
 
 def sector(views: ViewSet) -> list[ViewChoice]:
-    """Sectors of decreasing width: first with proportionally fewer projections, then with equal numbers; the whole
-    range is included for comparison."""
+    """Sectors of decreasing width: first with proportionally fewer projections, then all with the same number. The
+    whole range is included for comparison."""
     falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
     equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, count in SECTORS if n != count]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
@@ -112,8 +112,8 @@ def _draws(views: ViewSet, n: int) -> list[ViewChoice]:
 
 
 def window_average(views: ViewSet) -> list[ViewChoice]:
-    """Means of neighbouring projections, first in windows that do not overlap, then in overlapping ones; single
-    projections come first for comparison."""
+    """Means of neighbouring projections, in windows that do not overlap and in overlapping windows. Single projections
+    come first, for comparison."""
     single = [_fixed(views, n) for n in (OVERLAPPING, 90, 60)]
     disjoint = [_windows(views, width, None) for width in DISJOINT_DEG]
     return [*single, *disjoint, *(_windows(views, width, OVERLAPPING) for width in OVERLAPPING_DEG)]
@@ -145,12 +145,13 @@ def _fixed(views: ViewSet, n: int) -> ViewChoice:
 
 
 def _sector(views: ViewSet, low: int, high: int, n: int) -> ViewChoice:
-    # A view and its mirror image half a turn apart see the same rays: a scan that begins at -90 degrees has them all.
+    # Two projections 180° apart see the same rays, mirrored, so a scan that begins at -90 degrees has all of them.
     return _chosen(f"sector {low}-{high}°, {n} views", f"sector:{low}-{high}:{n}", views, within=True)
 
 
 def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> ViewChoice:
-    """The row of a selection in the words of `parse_views`; `within`: its angles are those within a period."""
+    """The row for a selection, which is a text for `parse_views`. `within`: True if the angles are first reduced to one
+    period."""
     angles = np.mod(views.angles, views.period) if within else views.angles
     try:
         numbers = parse_views(spec, angles, period=views.period)
@@ -160,7 +161,7 @@ def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, fami
 
 
 def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
-    """Means over `width` degrees: `count` windows evenly spread, or as many as do not overlap (None)."""
+    """Means over `width` degrees, in `count` evenly spread windows. None: in as many windows as fit without overlap."""
     turn = 2 * np.pi
     angles = views.angles if np.ptp(views.angles) < turn else np.mod(views.angles, turn)
     order = np.argsort(angles, kind="stable")
@@ -185,7 +186,7 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
         )
     starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
     groups = order[starts[:, None] + np.arange(w)]
-    together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
+    together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # no window extends across a gap of the scan
     if together.sum() < 2:
         return ViewChoice(label, None, reason="the projections are spread too unevenly to average neighbours")
     groups = groups[together]

@@ -24,7 +24,7 @@ from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, mirror_mis
 from recon.prep.axis_wedge import FEWEST_BANDS
 from recon.prep.tilt import TiltEstimate, line_through
 
-BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
+BANDS = 12  # Largest number of bands of rows; no band has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8
 ROUNDS = 3
 
@@ -35,9 +35,8 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[Ax
     Args:
         p0, p180: float [row, col], line integrals.
 
-    Raises:
-        ValueError: the shapes differ, or values are not finite.
-        AxisError: no axis in the middle three quarters of the columns.
+    Raises: ValueError: the shapes differ, or values are not finite. AxisError: there is no axis in the middle three
+    quarters of the columns.
     """
     tilt, found = 0.0, None
     for _ in range(ROUNDS):
@@ -60,8 +59,8 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[Ax
 
 
 def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Width in pixels of the finest structure in a projection: its contrast divided by its slope, both computed from
-    two frames of the same projection, so that noise cancels.
+    """Width in pixels of the finest structure in a projection: the contrast divided by the slope. Both are computed
+    from two frames of the same projection, so that noise cancels.
 
     The sharper the image, the smaller this width, for the same sample at the same angle. NaN if there is only noise.
 
@@ -74,7 +73,7 @@ def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> 
 
 
 def _levelled(view: NDArray[np.floating], tilt: float) -> F64:
-    """The view turned about its middle, so that an axis with this tilt stands upright."""
+    """The projection, rotated about its middle so that an axis with this tilt becomes vertical."""
     data = np.asarray(view, np.float64)
     return data if tilt == 0 else rotate(data, -math.degrees(tilt), reshape=False, order=1, mode="nearest")
 
@@ -82,24 +81,26 @@ def _levelled(view: NDArray[np.floating], tilt: float) -> F64:
 N = 4
 """Darks, and flats."""
 TWICE = 2
-"""Frames of each view, whose noise differs and whose structure does not."""
+"""Number of frames at each angle. They differ only in their noise."""
 STRAIGHT = 0.5
-"""Columns: a smaller offset of the axis, or lean over the frame's height, is not corrected."""
+"""In columns: a smaller offset of the axis, or a smaller displacement from the first to the last row, need not be
+corrected."""
 _ROUNDING = 1e-9  # rad
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The findings from the pair. Lengths in mm are at the sample, angles in rad."""
+    """The results from two opposite projections. Lengths are in mm at the sample, angles in rad."""
 
     axis_col: float  # column of the axis at the middle row
     offset: float  # columns from the frame's middle to the axis; positive to the right, where columns are higher
     offset_mm: float
-    tilt: float  # the axis' column grows by tan(tilt) a row; NaN: not known
-    uncertainty: float  # of the tilt, one standard deviation
-    detail: float  # pixels over which views change, without noise: smaller is sharper; NaN: only noise
-    angle: float  # of the first view
-    rows: int  # of the frame
+    tilt: float  # the column of the axis grows by tan(tilt) per row; NaN: not known
+    uncertainty: float  # uncertainty of the tilt, one standard deviation
+    # width in pixels of the finest structure, without noise: smaller is sharper. NaN: there is only noise
+    detail: float
+    angle: float  # angle of the first projection
+    rows: int  # number of rows of the frame
 
     @property
     def lean(self) -> float:
@@ -107,7 +108,7 @@ class Alignment:
         return math.tan(self.tilt) * (self.rows - 1)
 
     def lines(self) -> list[str]:
-        """Lines of text, with the correction of each."""
+        """The results as lines of text, each with what to correct."""
         side, way = ("right", "lower") if self.offset > 0 else ("left", "higher")
         move = f"; move the axis {abs(self.offset_mm):.4g} mm towards {way} columns, or set"
         axis = (
@@ -119,7 +120,8 @@ class Alignment:
         else:
             turn, sure = math.degrees(self.tilt), math.degrees(self.uncertainty)
             tilt = f"{turn:.3f}° ± {sure:.3f}°, {abs(self.lean):.2f} px between the first and the last row; "
-            way = "clockwise" if turn > 0 else "anticlockwise"  # the axis' foot is right of its head
+            # the lower end of the axis is to the right of its upper end
+            way = "clockwise" if turn > 0 else "anticlockwise"
             turned = (
                 f"rotate the axis by {abs(turn):.3f}° {way} as seen in the frame, or the camera by the same angle "
                 "in the other direction"
@@ -139,17 +141,15 @@ class Alignment:
 def align(
     config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
 ) -> Alignment:
-    """Take darks, flats and two projections 180° apart, and evaluate them. Nothing is written.
+    """Take darks, flats and two projections 180° apart, and evaluate them. No file is written.
 
-    At the end the shutter is closed, and stage and sample are back where they were, as after a scan.
+    At the end, as after a scan, the shutter is closed, and stage and sample are back at their first positions.
 
     Args:
-        angle: angle of the first projection in rad; None: the first angle of the plan, or 180° before it if the limits
-            of the stage require it.
+        angle: angle of the first projection in rad. None: the first angle of the plan, or 180° before it if the limits
+            of the stage require this.
 
-    Raises:
-        ConfigError: the stage does not go to both angles.
-        QualityError: the projections do not show the axis.
+    Raises: ConfigError: the stage cannot reach both angles. QualityError: the projections do not show the axis.
         ScanStopped: a stop was requested. InstrumentError, DeviceError: a device failed.
     """
     plan, limits = plan_of(config), instrument.devices.stage.limits

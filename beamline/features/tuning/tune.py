@@ -1,8 +1,8 @@
 """Tune: takes a few darks, flats and projections at several exposures, and finds counts, noise and the best exposure.
 
-Pairs of frames separate noise from structure. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
-ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
-sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
+Pairs of frames separate noise from structure. The gain comes from photon transfer (Janesick 2007, Photon Transfer, ch.
+5): it is the variance of the counts divided by their mean. The noise of a line integral p = ln(flat / view) follows by
+propagation: sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
 """
 
 from __future__ import annotations
@@ -33,44 +33,50 @@ from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 
 F64 = NDArray[np.float64]
 
-SHORTER = (1.0, 1 / 8, 1 / 64)  # of the configured exposure: one does not saturate, unless it is off by 60
-TARGET = 0.8  # share of the range for the brightest pixels: room for top-up and drift; more light gains 1/10 of noise
-BRIGHTEST = 99.9  # percentile of the flat that must not saturate
-DARKEST = 1.0  # percentile of the transmission that is the darkest part
-UNLIT = 0.05  # fraction of the highest intensity: pixels with less are outside the beam
-BLOCK = 4  # pixels a side, whose mean has little noise
-ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 standard deviations: more is not noise
+# factors on the configured exposure. At least one does not saturate, unless the exposure is too long by more than a
+# factor of 60
+SHORTER = (1.0, 1 / 8, 1 / 64)
+# share of the range that the brightest pixels should reach. The rest is for top-up and drift; using it would lower the
+# noise by only 1/10
+TARGET = 0.8
+BRIGHTEST = 99.9  # percentile of the pixels of the flat that must not saturate
+DARKEST = 1.0  # percentile of the transmission that stands for the darkest part
+UNLIT = 0.05  # pixels below this fraction of the highest intensity are outside the beam
+BLOCK = 4  # pixels per side of a block, whose mean has little noise
+# factor on the median change of a pixel from frame to frame; it is 8 standard deviations. A larger change is not noise
+ZINGER = 12.0
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Results of the frames; counts per pixel and frame, exposures in s."""
+    """The results from the frames. Counts are per pixel and frame, exposures in s."""
 
     configured: float  # exposure of the configuration
-    exposure: float  # of the flats that were used: the longest that does not saturate
-    saturation: float  # the largest count
+    exposure: float  # exposure of the flats that were used: the longest exposure that does not saturate
+    saturation: float  # the largest count of the camera
     # dark, dark_noise: median of the darks, standard deviation of a pixel
     dark: float
     dark_noise: float
     # flat, brightest: median of the flat if there is beam, and 99.9th percentile of its means of 4 x 4 pixels
     flat: float
     brightest: float
-    saturated: float  # fraction of its pixels that are saturated at the configured exposure
-    gain: float  # counts of a photon; NaN if the frames have no noise
-    transmission: tuple[float, float]  # of the view, at its darkest hundredth and in the median
-    # advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
-    # where darks have light or flats none
+    saturated: float  # fraction of the pixels of the flat that are saturated at the configured exposure
+    gain: float  # counts per photon; NaN if the frames have no noise
+    transmission: tuple[float, float]  # transmission of the projection: in its darkest hundredth, and the median
+    # advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN if
+    # darks have beam or flats have none
     advised: float
-    # noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
+    # noise: noise of a line integral in one projection at the advised exposure: in the darkest hundredth, and in the
+    # median
     noise: tuple[float, float]
-    longest: float  # exposure that the period and the camera allow
-    angle: float  # of the view, rad
-    faults: tuple[str, ...]  # what is wrong with darks and flats at the configured exposure
-    x_rays: float = math.nan  # X-ray photons a count; NaN if optics.light_path is not known
+    longest: float  # longest exposure that the period and the camera allow
+    angle: float  # angle of the projection, rad
+    faults: tuple[str, ...]  # faults of darks and flats at the configured exposure
+    x_rays: float = math.nan  # X-ray photons per count; NaN if optics.light_path is not known
 
     @property
     def photons(self) -> float:
-        """Photons in a pixel of the flat, at its exposure."""
+        """Number of photons in a pixel of the flat, at the exposure of the flat."""
         return (self.flat - self.dark) / self.gain
 
     def lines(self) -> list[str]:
@@ -116,15 +122,14 @@ class Tuning:
 def tune(
     config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
 ) -> Tuning:
-    """Take darks, flats and projections at a few exposures and evaluate them. Nothing is written.
+    """Take darks, flats and projections at a few exposures, and evaluate them. No file is written.
 
     At the end the shutter is closed, and stage and sample are back where they were, as after a scan.
 
     Args:
         angle: angle of the projections in rad; None: the first angle of the plan.
 
-    Raises:
-        ScanStopped: it was requested. InstrumentError, DeviceError: a device failed.
+    Raises: ScanStopped: a stop was requested. InstrumentError, DeviceError: a device failed.
     """
     plan, camera = plan_of(config), instrument.devices.camera
     angle = float(plan.angles[0]) if angle is None else angle
@@ -140,7 +145,7 @@ def tune(
 def take(
     blocks: Sequence[Block], config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink
 ) -> tuple[list[Frame], CameraSettings]:
-    """Frames of these blocks, which are kept in memory, and the settings of the camera. Raises the errors of `tune`."""
+    """The frames of these blocks, kept in memory, and the settings of the camera. Raises the errors of `tune`."""
     plan, camera = plan_of(config), instrument.devices.camera
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
     frame_bytes = 2 * math.prod(camera.timing.shape)
@@ -157,7 +162,7 @@ def take(
 
 
 def static_block(kind: FrameKind, n: int, exposure: float) -> Block:
-    """Frames at no angle: darks or flats."""
+    """Settings of a block of frames without angles: darks or flats."""
     return Block(kind, Mode.STATIC, 0, np.full(n, np.nan), exposure, exposure)
 
 
@@ -172,7 +177,7 @@ def evaluate(
     """Evaluate the frames: two darks, and two flats and one projection at each exposure.
 
     Args:
-        longest: longest exposure in s that may be advised.
+        longest: longest exposure in s that the result may recommend.
     """
     darks = [frame for frame in frames if frame.kind is FrameKind.DARK]
     flats = [frame for frame in frames if frame.kind is FrameKind.FLAT]
@@ -222,7 +227,7 @@ def evaluate(
 
 
 def _noise(share: float, intensity: float, gain: float, of_darks: float, n_flats: int) -> float:
-    """Standard deviation of a line integral where a share of the light comes through; see the module."""
+    """Standard deviation of a line integral for this transmission; see the docstring of the module."""
     through = share * intensity
     if not through > 0:
         return math.inf
@@ -232,7 +237,7 @@ def _noise(share: float, intensity: float, gain: float, of_darks: float, n_flats
 
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
-    """The longest exposure among flats with few saturated pixels; else the shortest."""
+    """The longest exposure among flats with few saturated pixels. If no flat has few, the shortest exposure."""
     shares = {
         exposure: np.mean([(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure])
         for exposure in sorted({frame.exposure for frame in flats}, reverse=True)
@@ -241,7 +246,8 @@ def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLim
 
 
 def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
-    """Mean variance over pixels, from the difference of two frames, without zingers and changes of the whole light."""
+    """Mean variance over pixels, from the difference of two frames. Zingers, and changes of the intensity of the whole
+    frame, are left out."""
     one, other = (frame.counts[where].astype(np.float64) for frame in pair[:2])
     change = one - other
     change -= np.median(change)
@@ -250,7 +256,7 @@ def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
 
 
 def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> list[float]:
-    """The exposures that the camera takes, the longest first. DeviceRefused: it takes none."""
+    """The exposures that the camera accepts, the longest first. Raises DeviceRefused if the camera accepts none."""
     camera = instrument.devices.camera
     taken: list[float] = []
     for share in SHORTER:
@@ -274,7 +280,8 @@ def _blocks(exposures: Sequence[float], angle: float) -> list[Block]:
 
 
 def _longest(plan: ScanPlan, settings: CameraSettings, timing: CameraTiming) -> float:
-    """Exposure that leaves the camera its overhead within the period of a fly scan; a step scan may wait."""
+    """Longest exposure that, with the overhead of the camera, fits into the period of a fly scan. In a step scan the
+    camera may take longer."""
     if plan.mode is not Mode.FLY:
         return math.inf
     return plan.period - max(timing.min_period - settings.exposure, timing.readout)

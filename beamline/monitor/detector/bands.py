@@ -2,8 +2,8 @@
 
 The rotating sample changes the mean of a column from projection to projection, but hardly the mean of a row. The mean
 intensity of each row and column of the preview is compared with the value expected from the projections before. If all
-lines change, the beam has changed. A band begins where a few lines jump. It lasts as long as these lines differ from
-their neighbours as at its beginning.
+lines change, the beam has changed. A band begins if a few lines jump. The band lasts as long as these lines differ from
+their neighbours as much as at its beginning.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
 
-CALIBRATION = 5  # frames of a kind before a verdict
-BEFORE = 3  # frames whose mean step is a line's velocity
-MEMORY = 0.1  # weight of the newest frame in a line's usual change
+CALIBRATION = 5  # number of frames of a kind that are needed before frames are compared
+BEFORE = 3  # number of frames over which the velocity of a line is averaged
+MEMORY = 0.1  # weight of the newest frame in the usual change of a line
 SIGMAS = 10.0
 PATIENCE = 20  # flagged frames in a row after which the band is the new normal
 NARROW = 0.25  # share of the lines: if more lines jump, the beam or the sample changed
 REMAINS = 0.5  # share of the jump that remains while the band lasts
-STANDS_OUT = 0.25  # share of the jump from both neighbours: a passing edge is like one of them
+# share of the jump by which the lines must differ from both neighbours; an edge that passes is similar to one of them
+STANDS_OUT = 0.25
 LEAST_INTENSITY = 0.5  # counts
 
 Lines = NDArray[np.float64]
@@ -43,7 +44,7 @@ class Profile:
         last: logarithms of the intensity of each line in the last frames without a band, oldest first.
         change: usual change of each line that its velocity does not explain.
         blocks: [line, block] counts of the last frame without a band.
-        first, after: first line of the present band, and the line after its last; equal without a band.
+        first, after: first line of the present band, and the line after its last one; equal if there is no band.
         jump: change of the difference between the band and the lines next to it.
         flagged: number of frames in a row with this band.
     """
@@ -58,13 +59,14 @@ class Profile:
     flagged: int = 0
 
     def apart(self) -> Profile:
-        """Prepare for a frame that is not a neighbour of the last one: two frames must give velocities first."""
+        """Prepare for a frame that is not a neighbour of the last one. Velocities must then be computed again from two
+        frames."""
         return Profile((), self.change, min(self.seen, CALIBRATION - 3))
 
 
 @dataclass(frozen=True, eq=False)
 class BandsState:
-    """Profiles [kind, axis]: of projections and of flats, their rows and their columns."""
+    """Profiles [kind, axis] of the rows and of the columns, for projections and for flats."""
 
     projection: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))
     flat: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))
@@ -72,10 +74,10 @@ class BandsState:
 
 @dataclass(frozen=True)
 class BandsCheck(Logged):
-    """Score: fraction of intensity that a preview row or column has lost (negative: gained).
+    """Score: fraction of the intensity that a preview row or column has lost (negative: gained).
 
-    The default limit comes from two black rows that lie in two preview blocks of 8 rows: each block loses an eighth of
-    its intensity.
+    Reason for the default: if two black rows lie in two preview blocks of 8 rows, each block loses an eighth of its
+    intensity.
     """
 
     name: ClassVar[str] = "bands"
@@ -117,7 +119,7 @@ class BandsCheck(Logged):
         digest: FrameDigest,
         context: ScanContext,
     ) -> tuple[tuple[Profile, Profile], Flag | None]:
-        """Rows, then columns: the profiles after the frame, and the finding."""
+        """Check the rows, then the columns. Returns the profiles after the frame, and the finding."""
         dark = np.zeros((1, 1), np.float32) if context.dark is None else context.dark
         dark = np.broadcast_to(dark, digest.preview.shape)
         if not context.follows:
@@ -148,7 +150,8 @@ class BandsCheck(Logged):
     def _compare(
         self, profile: Profile, means: Blocks, blocks: Blocks, dark: Blocks
     ) -> tuple[Profile, tuple[int, int, float, float] | None]:
-        """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
+        """Compare the lines of a frame with earlier frames. Returns the profile after this frame, and (first, after,
+        loss, limit)."""
         lines = np.log(np.maximum(means.astype(np.float64), LEAST_INTENSITY))
         if not profile.last or profile.last[-1].shape != lines.shape:
             if profile.change is not None and profile.change.shape == lines.shape:
@@ -164,7 +167,7 @@ class BandsCheck(Logged):
         steps = len(profile.last) - 1
         velocity = (profile.last[-1] - profile.last[0]) / steps if steps else np.zeros_like(lines)
         change = lines - profile.last[-1] - velocity
-        change -= np.median(change)  # the beam dims all lines alike
+        change -= np.median(change)  # a weaker beam makes all lines darker by the same factor
         assert profile.change is not None
         limit = np.maximum(-math.log1p(-self.alarm), SIGMAS * profile.change)
         jumped = np.flatnonzero(np.abs(change) > limit)
@@ -185,7 +188,7 @@ class BandsCheck(Logged):
 
 
 def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
-    """First line, and the one after the last, of the unbroken run of `lines` around one of them."""
+    """First line, and the line after the last one, of the unbroken run of `lines` around one of them."""
     breaks = np.flatnonzero(np.diff(lines) > 1)
     starts, ends = np.append(0, breaks + 1), np.append(breaks, lines.size - 1)
     which = int(np.searchsorted(lines[ends], inside))
@@ -195,8 +198,8 @@ def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
 def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
     """Difference in log intensity between the darkest (or brightest) of some lines and the lines on both sides.
 
-    The value at an edge of the sample is between those of the two sides; at the edge of the frame there is only one
-    side. The outer lines of a band may be only partly in it.
+    At an edge of the sample, the value is between the values of the two sides; at the edge of the frame there is only
+    one side. The outer lines of a band may be only partly in the band.
     """
     left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
     beside = [float(side.mean()) for side in (left, right) if side.size]

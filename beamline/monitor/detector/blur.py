@@ -1,13 +1,13 @@
 """Check `blur`: loss of fine detail because of defocus or motion during the exposure.
 
 Sharpness is the contrast of second differences over two pixels, divided by the contrast of first differences over four
-pixels, along the rows and along the columns. It is 1 for a sharp edge, smaller for a blurred edge, and 0 for a slope.
-The contrast is the mean product of a difference and the same difference in the next line. Noise is independent from
-line to line and adds nothing on average, even with few photons; an edge continues in the next line. The intensity and
-smooth variations of the beam cancel.
+pixels, along the rows and along the columns. Sharpness is 1 for a sharp edge, smaller for a blurred edge, and 0 for a
+slope. Contrast is the mean product of a difference and the same difference in the next line. Noise is independent from
+line to line, so it adds nothing on average, even with few photons; an edge continues in the next line. The intensity
+and smooth variations of the beam cancel.
 
-Once per scan, the check also looks for phase fringes: edges that are sharper than any blurred edge, with rims brighter
-than the open beam.
+Once per scan, the check also looks for phase fringes: the rims of edges are then brighter than the open beam, which
+blur cannot cause.
 """
 
 from __future__ import annotations
@@ -28,42 +28,43 @@ from recon.base.setting import setting
 from recon.prep.overshoot import LEAST_SHARE, SEARCH, Overshoot
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
-STRIP = 6  # neighbouring rows that are used together
-FAR = 4  # pixels that a difference spans; even
+STRIP = 6  # number of neighbouring rows that are used together
+FAR = 4  # number of pixels that a difference spans; even
 STEEPEST = 0.5  # share of the open beam: a larger difference is a zinger or a hot pixel
 SIGMAS = 8.0
-LEAST = 0.9  # highest useful limit; above it there are too few photons or edges
-GONE = 0.5  # share of the limit below which sharpness is back
-PATIENCE = 40  # views after which it is the new normal
-VIEWS_FOR_EDGES = 32  # whose outer edges are looked at
+LEAST = 0.9  # highest useful limit; if the limit is higher, there are too few photons or edges
+GONE = 0.5  # the sharpness is normal again if the loss is below this share of the limit
+PATIENCE = 40  # number of projections after which the loss is the new normal
+VIEWS_FOR_EDGES = 32  # number of projections whose outer edges are examined
 DARKEST = 0.05  # share of the flat's mean: pixels with less intensity are not used
 
 
 @dataclass(frozen=True, eq=False)
 class BlurState:
-    # kind, counted: of the latest group of frames
+    # kind, counted: kind and number of the frames of the latest group
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
-    # dark, flat: float32 [line, col], means of the latest groups on the lines that are looked at; None before any
+    # dark, flat: float32 [line, col], means of the latest groups on the lines that are used; None if there are none yet
     dark: CellValues | None = None
     flat: CellValues | None = None
-    # across, down: the usual figures along the rows and along the columns
+    # across, down: the usual sharpness along the rows and along the columns
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
-    first: tuple[FrameScatter, FrameScatter] | None = None  # the same of the first views, which stay
-    blurred: int = 0  # views in a row that are flagged
-    reported: bool = False  # the slow loss was reported
-    views: tuple[CellValues, ...] | None = ()  # the first ones, as counts; None: their edges were looked at
+    # the same for the first projections; these values do not change
+    first: tuple[FrameScatter, FrameScatter] | None = None
+    blurred: int = 0  # number of successive projections that are flagged
+    reported: bool = False  # True if the slow loss was reported
+    views: tuple[CellValues, ...] | None = ()  # the first projections as counts; None: their edges were examined
 
 
 @dataclass(frozen=True)
 class BlurCheck(Logged):
     """Score: fraction of fine contrast that a projection has lost relative to the projections before.
 
-    The default: a blur of 0.7 pixels (sigma) takes 0.3 of the fine contrast of round particles, and 0.4 of flat faces.
-    A slow loss is reported as info if both directions have it, because a sample with flat faces also turns its sharp
-    edges away. Phase fringes are reported as info, too: their score is how far line integrals next to an outer edge
-    fall below the air, as a fraction of the step at the edge.
+    Reason for the default: a blur of 0.7 pixels (sigma) removes 0.3 of the fine contrast of round particles, and 0.4 of
+    that of flat faces. A slow loss is reported as info, and only if both directions have it, because a sample with flat
+    faces also loses sharp edges by rotation. Phase fringes are reported as info, too. Their score is the depth of the
+    line integrals next to an outer edge below the air, as a fraction of the step at the edge.
     """
 
     name: ClassVar[str] = "blur"
@@ -91,12 +92,12 @@ class BlurCheck(Logged):
         return CheckResult(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
 
     def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> CheckResult[BlurState]:
-        """The loss of sharpness of the frame relative to the projections before."""
+        """The loss of sharpness of the frame, relative to the projections before."""
         if frame.kind is not FrameKind.PROJECTION:
             return CheckResult(_with_reference(state, frame))
         if context.view is None:
             return CheckResult(state)
-        if not context.follows:  # a sample may be less sharp from that side
+        if not context.follows:  # a sample may be less sharp when seen from that side
             state = replace(state, across=FrameScatter(), down=FrameScatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
@@ -124,7 +125,7 @@ class BlurCheck(Logged):
         return max(self.warn, SIGMAS * usual.sigma / usual.mean) if usual.mean > 0 else 1.0
 
     def _slow(self, state: BlurState, row: int) -> CheckResult[BlurState]:
-        """A fact, once: both directions are less sharp than in the first views."""
+        """Information that is given once: both directions are less sharp than in the first projections."""
         assert state.first is not None
         losses = [_loss(now.mean, first) for now, first in zip((state.across, state.down), state.first, strict=True)]
         limit = max(self._limit(first) for first in state.first)
@@ -138,7 +139,7 @@ class BlurCheck(Logged):
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
-    """Ratio of fine to coarse contrast, along rows and along columns; NaN without contrast.
+    """Ratio of fine to coarse contrast, along rows and along columns; NaN if there is no contrast.
 
     Args:
         lines: counts [line, col] of strips of `STRIP` neighbouring rows.
@@ -158,7 +159,7 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
 
 
 def _lines(frame: Frame) -> NDArray[Any]:
-    """The rows that are used: all of a small frame, strips of STRIP rows of a large one."""
+    """The rows that are used: all rows of a small frame, or strips of STRIP rows of a large frame."""
     counts = frame.counts if frame.counts.dtype == np.uint16 else frame.counts.astype(np.float32)
     rows, cols = counts.shape
     strips = max(1, min(rows // STRIP, PIXELS // (STRIP * cols)))
@@ -190,7 +191,8 @@ def _loss(now: float, usual: FrameScatter) -> float:
 
 
 def _ratio(intensity: CellValues, lit: NDArray[np.bool_]) -> float:
-    """Contrast of second differences along the last axis, over that of first ones; NaN without any."""
+    """Contrast of second differences along the last axis, divided by that of first differences; NaN if there is no
+    contrast."""
     n = max(intensity.shape[-1] - FAR, 0)
     first, middle, last = (intensity[..., i : i + n] for i in (0, FAR // 2, FAR))
     known = lit[..., :-FAR] & lit[..., FAR // 2 : -FAR // 2] & lit[..., FAR:]

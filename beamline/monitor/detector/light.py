@@ -18,16 +18,16 @@ from recon.base.setting import setting
 
 SIGMAS = 8.0
 PARTS = 5  # number of parts of the field of view, from left to right
-ALIKE = 0.5  # allowed difference between the parts, as a fraction of the change; a ghost is only in some parts
+ALIKE = 0.5  # allowed difference between the parts, as a fraction of the change; a moving shadow is only in some parts
 
 
 @dataclass(frozen=True)
 class GainCheck(Logged):
     """Score: uniform relative change of the intensity since the previous projection (beamline.monitor.change).
 
-    The default: a change is corrected only if flats are taken again. 1 % of intensity is 0.01 of line integral in every
-    ray, a fifth of what 50 um of electrolyte absorb. A top-up of the ring every few minutes changes the intensity by
-    less. The noise of the score is 1e-4 for 128 x 512 pixels with 5000 photons.
+    Reason for the default: such a change is corrected only if flats are taken again. 1 % of the intensity changes the
+    line integral of every ray by 0.01, a fifth of the absorption of 50 um of electrolyte. A top-up of the ring every
+    few minutes changes the intensity by less. The noise of the score is 1e-4 for 128 x 512 pixels with 5000 photons.
     """
 
     name: ClassVar[str] = "gain"
@@ -59,7 +59,8 @@ class GainCheck(Logged):
 
 
 def _everywhere(change: SampleChange, view: CellView | None) -> float:
-    """The gain, if it is equal in all fifths of the field, from left to right; otherwise 0, because it is a ghost."""
+    """The gain, if it is equal in all fifths of the field of view, from left to right. Otherwise 0, because the change
+    is a moving shadow."""
     assert view is not None
     weighted = change.residual * view.weight, view.weight
     extra, intensity = (sums_of_places(part, 1, PARTS)[0] for part in weighted)
@@ -70,12 +71,12 @@ def _everywhere(change: SampleChange, view: CellView | None) -> float:
 
 
 VIEWS = 20  # projections after which the number of zingers is reported
-FEW = 10  # zingers in a projection that are never too many
+FEW = 10  # number of zingers in a projection that is never too large
 
 
 @dataclass(frozen=True)
 class ZingersState:
-    """Number of views so far, and of their zingers."""
+    """Number of projections so far, and number of their zingers."""
 
     views: int = 0
     zingers: int = 0
@@ -83,10 +84,11 @@ class ZingersState:
 
 @dataclass(frozen=True)
 class ZingersCheck(Logged):
-    """Score: zingers of the frame over its pixels. Their number is reported once, as a fact.
+    """Score: number of zingers of the frame, divided by its number of pixels. The number of zingers is reported once,
+    as info.
 
-    The default: at 1e-4, a slice with 2000 columns and 2000 projections has 400 rays with a zinger. Each zinger makes a
-    streak if it is not removed.
+    Reason for the default: at 1e-4, a slice with 2000 columns and 2000 projections has 400 rays with a zinger. Each
+    zinger that is not removed makes a streak.
     """
 
     name: ClassVar[str] = "zingers"
@@ -94,7 +96,7 @@ class ZingersCheck(Logged):
     unit: ClassVar[str] = "zingers per pixel"
     meaning: ClassVar[str] = "many zingers: bright spots that are only in this frame"
 
-    warn: float = setting(1e-4, "zingers per pixel that a projection may have", ge=0, le=1)
+    warn: float = setting(1e-4, "largest number of zingers per pixel that a projection may have", ge=0, le=1)
 
     start = ZingersState
 

@@ -1,8 +1,9 @@
 """Check `floater`: a loose particle that crosses the field of view on a path that no point of the sample takes.
 
-Its track is found by the sum over all projections that show it (`track`), and compared with the sample: a point of the
-sample moves on a sine curve about the axis, within the radius of the sample. A particle absorbs the same in every
-projection. Edges and textures of the sample, which may lie on a line by chance, do not.
+The track of a particle is found from the sum over all projections that show it (`track`). The track is compared with
+the paths of points of the sample, which are sine curves about the axis, within the radius of the sample. A particle
+absorbs the same in every projection. Edges and textures of the sample may lie on a line by chance, but their absorption
+varies.
 """
 
 from __future__ import annotations
@@ -22,21 +23,26 @@ from beamline.monitor.view import CellGrid
 from drivers.base.frame import Frame
 from recon.base.setting import setting
 
-OCTAVES = 4  # steps of 1, 2, 4 and 8 views
-FASTEST_RIM = 4.0  # cells a step that the rim moves: with more the sample changes wholly from step to step
-EVEN = 0.5  # of a step: the next view comes as many steps, or up to MOST_STEPS, after the last
-COARSEST = math.radians(20)  # a view: more is no motion that could be followed
-WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
-MARGIN = 1.1  # the sample may be a little wider than the field
-CONE = 1.4  # likewise; nearer to the source it moves faster, by 1.3 at half a cone angle of 15 degrees
-OFF_MIDDLE = 0.05  # of the field: where the axis may be if it is not stated
-UNLIKELY = 36.0  # least difference of the squares of score and rival: 6 standard deviations, beyond what a search finds
+OCTAVES = 4  # steps of 1, 2, 4 and 8 projections
+# largest number of cells per step that the rim may move; with more, the sample changes completely from step to step
+FASTEST_RIM = 4.0
+# tolerance in steps: the next projection comes a whole number of steps, up to MOST_STEPS, after the last one
+EVEN = 0.5
+COARSEST = math.radians(20)  # largest step per projection; a larger motion cannot be followed
+WIDER = 2.2  # largest width of a truncated sample, as a multiple of the width of the field of view
+MARGIN = 1.1  # the sample may be slightly wider than the field of view
+# the same for a cone beam; nearer to the source the sample moves faster, by a factor of 1.3 for half a cone angle of 15
+# degrees
+CONE = 1.4
+OFF_MIDDLE = 0.05  # range of the axis, as a share of the field of view, if the axis is not stated
+# smallest difference of the squares of score and rival: 6 standard deviations, more than a search finds in noise
+UNLIKELY = 36.0
 RIVAL = 0.85  # of the score, at most: both grow with the depth, and so does what either misses
 UNEVEN = 2.5  # mean square deviation from one depth, at most; of noise 1, in a few steps up to 2
-NEAR = 3.0  # cells between two tracks of the same crumb
-BOX = 3.0  # cells from the middle of a floater to the edges of its region
-HALF = 0.5  # of the depth, above which a row belongs to the crumb
-HIGHEST = 8  # cells above and below the track in which its rows are sought
+NEAR = 3.0  # largest distance in cells between two tracks of the same particle
+BOX = 3.0  # distance in cells from the middle of a particle to the edges of its region
+HALF = 0.5  # share of the depth above which a row belongs to the particle
+HIGHEST = 8  # number of cells above and below the track in which the rows of the particle are searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +67,8 @@ class SeenCrumb:
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """The views since the last gap: time of the last one in views, angles of the first and the last, their step in
-    rad."""
+    """The projections since the last gap: time of the last one (in projections), angles of the first and the last one,
+    and their step in rad."""
 
     octaves: tuple[Octave, ...] = ()
     time: float = 0.0
@@ -114,7 +120,7 @@ class FloaterCheck(Logged):
         return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else CheckResult(state)
 
     def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> CheckResult[FloaterState]:
-        """The flag for the views that show the crumb, since the last flag for it."""
+        """The flag for the projections that show the particle and came after the last flag for it."""
         newest, oldest = track.steps[0], track.steps[-1]
         top, below = _rows(track)
         crumb = SeenCrumb(oldest.rows[0], newest.rows[1], newest.time, float(track.cols[0]), track.speed, top, below)
@@ -143,8 +149,8 @@ class FloaterCheck(Logged):
 
 
 def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:
-    """The state for the next projection. Tracks start again if it is not a neighbour of the last one, or at uneven
-    steps."""
+    """The state for the next projection. If it is not a neighbour of the last projection, or if steps are uneven,
+    tracks start again."""
     steps = 1.0
     if state.time > 0 and state.step != 0:
         steps = (angle - state.angle) / math.copysign(state.step, state.angle - state.start)
@@ -173,14 +179,14 @@ def _is_crumb(track: Track) -> bool:
 
 
 def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
-    """Whether a track continues the known one."""
+    """Whether a track continues the known track."""
     apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
     rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
     return rows and apart <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))
 
 
 def _rows(track: Track) -> tuple[int, int]:
-    """First row of cells of the crumb, and the row after the last."""
+    """First row of cells of the particle, and the row after the last one."""
     rows, cols = track.steps[0].change.shape
     at = np.clip(np.floor(track.cols + 0.5).astype(int), 0, cols - 1)
     depth = np.mean([step.change[:, col] for step, col in zip(track.steps, at, strict=True)], axis=0)

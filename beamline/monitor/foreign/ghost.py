@@ -1,8 +1,8 @@
 """Check `ghost`: a broad shadow or reflection that crosses the field of view from side to side.
 
-As in the check `floater`, filters suppress everything that rotates with the stage (`fan`). Here they use the mean of
-all rows in broad columns, because a ghost is as broad as a part of the field of view. In a single cell, 2 % of
-intensity are below the noise; in the mean of thousands of pixels they are a hundred times the noise.
+As in the check `floater`, filters suppress everything that rotates with the stage (`fan`). Here the filters use the
+mean of all rows in broad columns, because a moving shadow is as broad as a part of the field of view. In a single cell,
+2 % of the intensity are below the noise; in the mean of thousands of pixels, 2 % are a hundred times the noise.
 """
 
 from __future__ import annotations
@@ -23,50 +23,58 @@ from recon.base.arrays import median_deviation
 from recon.base.setting import setting
 
 Reals = NDArray[np.float64]
-REACH = 6  # cells of a window to either side of its middle
-FREQUENCIES = 120  # up to Nyquist, over which the covariance is summed
-ROUGHNESS = 0.05  # cycles-of-2-pi a cell below which the sample's spectrum is flat; above it falls as its third power
-CONSTANT = 1.0  # variance of constant differences: rings, flats that do not fit
-COLUMNS = 32  # broad columns of the field
+REACH = 6  # number of cells of a window on each side of its middle
+FREQUENCIES = 120  # number of frequencies, up to Nyquist, over which the covariance is summed
+# frequency (2 pi cycles per cell) below which the spectrum of the sample is flat; above it, the spectrum falls with the
+# third power
+ROUGHNESS = 0.05
+CONSTANT = 1.0  # variance of constant differences, such as rings or flats that do not match
+COLUMNS = 32  # number of broad columns in the field of view
 PARTS = 8  # of the rows
-MOST_PARTS = 25.0  # percentile of the parts that must have the change
-ALIKE = 0.25  # share of the mean: a ghost is as high as the frame, a floater is only in some parts
+MOST_PARTS = 25.0  # percentile of the parts that must show the change
+# share of the mean that these parts must have: a moving shadow is as high as the frame, a particle is only in some
+# parts
+ALIKE = 0.25
 LAGS = (-4, -3, -2, -1, 0)  # times the stride
-SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
+# rad: 3 projections at steps of 0.2 degrees; while the sample rotates by four times this angle, its points move on
+# nearly straight lines
+SWEEP = 0.0105
 MOST_STRIDE = 3
-WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
-CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first change in the field to its last
+WIDTHS = (1 / 7, 1 / 3.5)  # half width of the foot of the hump, as a share of the field of view
+CROSSINGS = (8, 14, 24, 40, 70)  # projections from the first change in the field of view by the hump to the last one
 STRUCTURE, COMMON = 0.3, 0.05**2
 MARGIN = 1.2
-WIDER = 2.2  # as for a floater
+WIDER = 2.2  # the same as for a loose particle
 FASTER = 1.3
-SHOWS = 4.0  # standard deviations that a hump at the limit must reach, or its filter is left out
+SHOWS = 4.0  # if a hump at the limit does not reach this many standard deviations, its filter is left out
 CALIBRATION = 24  # views
 LEAST_NOISE = 3e-4
 MEMORY, OUTLIER = 0.03, 3.0
 PEAK = 5.0
-SPAN, LEAST, SHARE = 10, 4, 0.6  # views that a trail takes at most, has a peak in at least, and what share has one
-OFF, SLACK = 2.5, 0.15  # broad columns: from a peak to its trail; a view, added to the sample's speed
+# largest number of projections of a trail, smallest number with a peak, and smallest share with a peak
+SPAN, LEAST, SHARE = 10, 4, 0.6
+# in broad columns: largest distance of a peak from its trail; per projection, added to the speed of the sample
+OFF, SLACK = 2.5, 0.15
 
 
 @dataclass(frozen=True)
 class Clutter:
-    """The signals that the filters suppress."""
+    """The signals other than moving shadows, which the filters suppress."""
 
-    speed: float  # cells a view that the sample's fastest point moves
-    structure: float  # variance of the sample's line integrals on the scale of the window
-    common: float  # variance of changes of a whole row or view, such as the beam's
-    noise: float  # variance of a cell's noise
+    speed: float  # cells per projection by which the fastest point of the sample moves
+    structure: float  # variance of the line integrals of the sample on the scale of the window
+    common: float  # variance of changes of a whole row or projection, such as changes of the beam
+    noise: float  # variance of the noise of a cell
 
 
 def window(lags: tuple[int, ...]) -> tuple[Reals, Reals]:
-    """View and column of each place of a window [lag, 2 REACH + 1], flattened, from its middle."""
+    """Projection and column of each place of a window [lag, 2 REACH + 1], flattened, relative to its middle."""
     views, cols = np.meshgrid(np.array(lags, float), np.arange(-REACH, REACH + 1.0), indexing="ij")
     return views.ravel(), cols.ravel()
 
 
 def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
-    """Covariance [place, place] of a window: patterns of all speeds in the fan, seen by square cells."""
+    """Covariance [place, place] of a window, for patterns of all speeds in the fan, measured in square cells."""
     frequency = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES * np.pi
     power = np.sinc(frequency / (2 * np.pi)) ** 2 / (frequency**2 + ROUGHNESS**2) ** 1.5
     power /= power.sum()
@@ -84,10 +92,11 @@ def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
 class Filters:
     """Matched filters for several signals."""
 
-    # weights: float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1
+    # weights: float32 [signal, lag, column]; for the assumed clutter and noise, the output of each filter has the
+    # variance 1
     weights: CellValues
     strength: Reals  # float64 [signal], output for a signal of amplitude 1
-    speeds: Reals  # float64 [signal], cells a view
+    speeds: Reals  # float64 [signal], cells per projection
 
 
 def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Reals) -> Filters:
@@ -106,7 +115,7 @@ def correlate(views: CellValues, weights: CellValues) -> CellValues:
 
 
 class Peak(NamedTuple):
-    """The highest output in a view: its broad column, and its score with its sign."""
+    """The largest output in a projection: its broad column, and its score with sign."""
 
     view: int
     col: float
@@ -114,7 +123,8 @@ class Peak(NamedTuple):
 
 
 class Trail(NamedTuple):
-    """Peaks on a straight line in time, faster than the sample could carry them: first view, broad columns a view."""
+    """Peaks on a straight line in time that move faster than any part of the sample: first projection, and broad
+    columns per projection."""
 
     first: int
     speed: float
@@ -122,18 +132,19 @@ class Trail(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GhostState:
-    profiles: tuple[CellValues, ...] = ()  # float32 [part of the rows, broad column] of the last views, oldest first
+    # float32 [part of the rows, broad column] of the last projections, oldest first
+    profiles: tuple[CellValues, ...] = ()
     angle: float = math.nan
     filters: Filters | None = None  # for the angle's `step` in radians
     step: float = math.nan
-    usual: CellValues | None = None  # usual output of the filters at each column, None before the first
-    peaks: tuple[Peak, ...] = ()  # of the last views, oldest first
+    usual: CellValues | None = None  # usual output of the filters at each column; None before the first output
+    peaks: tuple[Peak, ...] = ()  # peaks of the last projections, oldest first
 
 
 @dataclass(frozen=True)
 class GhostCheck(Logged):
-    """Score: absolute relative change of the intensity in the middle of the ghost. It has no sign, because in the few
-    projections of a window a ghost that leaves a place looks like a shadow that arrives."""
+    """Score: absolute relative change of the intensity in the middle of the shadow or reflection. It has no sign,
+    because in the few projections of a window, a reflection that leaves a place looks like a shadow that arrives."""
 
     name: ClassVar[str] = "ghost"
     bit: ClassVar[int] = 11
@@ -175,7 +186,7 @@ class GhostCheck(Logged):
     def _judge(
         self, state: GhostState, now: int, outputs: CellValues, turn: float, context: ScanContext
     ) -> CheckResult[GhostState]:
-        """The highest output, relative to the usual one there, and the peaks of earlier views."""
+        """The largest output, relative to the usual output at that place, and the peaks of earlier projections."""
         assert state.filters is not None and context.grid is not None
         parts, outputs = outputs, outputs.mean(axis=1)
         spread = np.sqrt(np.mean(outputs**2, axis=0))
@@ -217,7 +228,8 @@ def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
 
 
 def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
-    """Noise of a profile, including unsteady changes of the sample: from second differences over `stride` views."""
+    """Noise of a profile, including irregular changes of the sample, from second differences over `stride`
+    projections."""
     seen = np.stack([profile.mean(axis=0) for profile in profiles])
     second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
     return max(median_deviation(second) / math.sqrt(6.0), LEAST_NOISE)
@@ -242,10 +254,11 @@ def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
 
 
 def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
-    """The trail with the largest sum of scores that ends at the last of the peaks, one a view, if there is one.
+    """The trail with the largest sum of scores (one peak per projection) that ends at the last peak; None if there is
+    no trail.
 
-    A point of the sample at x from the middle moves by less than turn sqrt(radius² - x²) a view, `turn` in radians a
-    view; x and radius, half the field, are in broad columns.
+    A point of the sample at the distance x from the middle moves by less than turn sqrt(radius² - x²) per projection.
+    `turn` is in radians per projection; x and the radius (half the field of view) are in broad columns.
     """
     best, most, last = None, 0.0, peaks[-1]
     alike = [peak for peak in peaks if peak.score * last.score > 0]

@@ -1,16 +1,16 @@
-"""Find the path (`Track`) of a small absorber through the field of view, from the sum over all projections that show
+"""Finds the path (`Track`) of a small absorber through the field of view, from the sum over all projections that show
 it.
 
 The mean of the two neighbours is subtracted from each projection. The difference shows noise, and objects that move by
 their own size or more from one projection to the next. The differences are summed along lines in (projection, column)
-and divided by the standard deviation of the sum. This score grows as the square root of the number of projections if
-an absorber moves along the line, and does not grow in noise (track before detect; Barniv 1985, IEEE Trans. AES 21:144).
-A line ends at its largest score, which may be inside the field of view. Slower objects show in the means of 2, 4,
-8 ... projections; each of these numbers is an *octave*.
+and divided by the standard deviation of the sum. This score grows as the square root of the number of projections if an
+absorber moves along the line, and does not grow in noise (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A
+line ends at its largest score, which may be inside the field of view. Slower objects are visible in the means of 2, 4,
+8 ... projections. Each of these numbers is called an *octave*.
 
-A track does not belong to the sample if it fits no point that rotates with the stage within the radius of the sample.
-To decide, the squares of two scores are compared: their difference is twice the logarithm of the ratio of the
-likelihoods (Wilks 1938).
+A track does not belong to the sample if no point that rotates with the stage, within the radius of the sample, takes
+this path. To decide this, the squares of two scores are compared: their difference is twice the logarithm of the ratio
+of the likelihoods (Wilks 1938).
 
 Lengths are in cells, times in projections.
 """
@@ -28,13 +28,15 @@ from beamline.monitor.view import CellValues
 from recon.base.arrays import median_deviation
 from recon.base.jit import njit
 
-SEED = 4  # number of steps of an octave whose sum shows how a track may continue
-# cells per step: slower objects are mostly subtracted with the neighbours; faster ones are found in single projections
+SEED = 4  # number of steps of an octave from whose sum the continuation of a track is searched
+# cells per step: slower objects mostly disappear when the neighbours are subtracted; faster ones are found in single
+# projections
 SLOWEST, SLOW = 1.5, 4.0
 APART = 0.5  # cells per step between the speeds tried, so that the end of a seed is wrong by less than a cell
 MEMORY = 48  # steps; at the speed SLOWEST an object crosses 120 cells in them
-PROMISING = 4.0  # standard deviations of a seed; noise gives a few such seeds in a projection
-MOST_SEEDS = 8  # largest number of seeds of a step; more take time, and come from noise or from a sample that jumped
+PROMISING = 4.0  # smallest number of standard deviations of a seed; noise gives a few such seeds in a projection
+# largest number of seeds of a step; more seeds take time, and come from noise or from a sample that jumped
+MOST_SEEDS = 8
 CLIP = 5.0  # largest number of standard deviations that one step may add to a score
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
 KERNEL = np.exp(-0.5 * (np.arange(-2, 3) / SIZE) ** 2).astype(np.float32)
@@ -43,7 +45,8 @@ KERNEL_ROWS = KERNEL[1:4] / np.sqrt((KERNEL[1:4] ** 2).sum())
 SAMPLED = 3  # one of this many cells is enough to measure the noise
 SPIKE = 6.0  # standard deviations: if the neighbours differ more, the brighter one has a zinger, or an edge passes
 COMMON = 8  # number of cells of a row or column from which its common change is computed
-OUTLIER = 3.0  # most standard deviations that a cell adds to the common change of its row and to its usual deviation
+# largest number of standard deviations that a cell adds to the common change of its row and to its usual deviation
+OUTLIER = 3.0
 FORGET = 0.1  # weight of the newest step in the usual square
 LEAST_NOISE = 2e-3  # line integral: error of the flats and of the steps of the stage
 LIT = 1e-3  # weight of a cell with almost no intensity
@@ -71,7 +74,8 @@ class OctaveStep:
 
 
 class Mean(NamedTuple):
-    """Mean of the projections of a step: their rows in the file, the time of their middle, line integrals, weights."""
+    """Mean of the projections of a step: rows of the projections in the file, time of their middle, line integrals, and
+    weights."""
 
     rows: tuple[int, int]
     time: float
@@ -134,7 +138,7 @@ class Track(NamedTuple):
 
 
 def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: CellValues) -> Octave:
-    """The octave with the next projection added, which is in this row of the file."""
+    """The octave with the next projection added. `row` is the row of this projection in the file."""
     waiting = (*octave.waiting, Mean((row, row), time, depth, weight))
     if len(waiting) < octave.views:
         return replace(octave, waiting=waiting)
@@ -158,7 +162,8 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
 
 def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, float]:
     """The difference between a step and its neighbours, and the standard deviation of its noise in a cell of weight 1.
-    What whole rows and columns have in common is subtracted from the difference, which is then smoothed.
+    Changes that whole rows or columns have in common are subtracted from the difference, and the difference is
+    smoothed.
     """
     lit, root, apart = weight > LIT, np.sqrt(weight), before - after
     change = (own - 0.5 * (before + after)) * lit
@@ -180,7 +185,7 @@ def _noise(
     change: CellValues, weight: CellValues, noise: float, usual: CellValues | None, newest: float
 ) -> tuple[CellValues, CellValues]:
     """Standard deviation of the change in each cell, and the usual square of the change after this projection. Both are
-    larger at edges of the sample and next to them.
+    larger at the edges of the sample and next to these edges.
     """
     least = np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
     if usual is None:
@@ -231,7 +236,7 @@ def _fastest(steps: CellValues, offsets: NDArray[np.int64], col: int) -> int:
 
 
 def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMotion, least: float) -> Track | None:
-    """The best track through a seed; None if its score is not above `least`."""
+    """The best track through a seed; None if its score is at most `least`."""
     times = np.array([octave.steps[0].time - step.time for step in octave.steps])
     change = np.stack([step.change[row] for step in octave.steps])
     noise = np.stack([step.noise[row] for step in octave.steps])
@@ -263,7 +268,7 @@ def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> 
 
 
 def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
-    """Mean square deviation of the changes along a track from their mean, divided by that expected from noise and
+    """Mean square deviation of the changes along a track from their mean, divided by the value expected from noise and
     UNEVEN."""
     at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
     depth, weight = change[at].astype(float), noise[at].astype(float) ** -2
@@ -289,9 +294,8 @@ def _highest(steps, offsets, best):
 
 @njit(nogil=True, cache=True)
 def _place(x, v, time, turn, axis):
-    """Column of a point, `time` projections before it was at x and moved by v per projection. If `turn` is 0, it
-    moves on
-    a straight line."""
+    """Column of a point, `time` projections before it was at x with the speed v per projection. If `turn` is 0, the
+    point moves on a straight line."""
     if turn == 0.0:
         return x - v * time
     return axis + (x - axis) * np.cos(turn * time) - v / turn * np.sin(turn * time)
@@ -299,7 +303,7 @@ def _place(x, v, time, turn, axis):
 
 @njit(nogil=True, cache=True)
 def _longest(change, noise, times, x, v, motion, most):
-    """Score and number of steps of the best part of a track, of all parts that begin with its newest step."""
+    """Score and number of steps of the best part of a track, among all parts that begin with its newest step."""
     total, weight, best, steps = 0.0, 0.0, 0.0, 0
     cols = change.shape[1]
     for k in range(most):
@@ -317,7 +321,7 @@ def _longest(change, noise, times, x, v, motion, most):
 
 @njit(nogil=True, cache=True)
 def _grow(change, noise, times, seed, motion, fit):
-    """Fills `fit` with the score, place, speed and number of steps of the track that grows from a seed."""
+    """Fills `fit` with the score, position, speed and number of steps of the track that is extended from a seed."""
     x, v = seed
     most = min(SEED + 2, times.size)
     while True:
@@ -338,7 +342,8 @@ def _grow(change, noise, times, seed, motion, fit):
 
 @njit(nogil=True, cache=True)
 def _rival(change, noise, times, newest, turn, axis, radius):
-    """The largest score in these steps of a point that rotates within the radius and is near `newest` at the end."""
+    """The largest score, in these steps, of a point that rotates within the radius of the sample and ends near
+    `newest`."""
     cols, best = change.shape[1], 0.0
     span = times[-1] - times[0]
     for i in range(int(2 * REACH / FINE) + 1):

@@ -86,8 +86,9 @@ FAULTS = {  # bit of MSTA: its meaning, and advice
     0x0004: ("it is at its upper limit switch", "Move it away from the switch by hand or in the record's own screen"),
     0x2000: ("it is at its lower limit switch", "Move it away from the switch by hand or in the record's own screen"),
 }
-STILL = 1.0  # s without a change of RBV after which a motor with DMOV 1 that is not at its target counts as stopped
-CREEP = 10.0  # s; least time that such a motor gets to stop
+# if DMOV is 1 and the motor is not at its target, it counts as stopped when RBV has not changed for this time in s
+STILL = 1.0
+CREEP = 10.0  # s; shortest time that such a motor gets to stop
 GO, USE = "Go", "Use"
 """Labels of SPMG and SET with which a value written to VAL moves the motor."""
 
@@ -252,7 +253,7 @@ class EpicsStage(LineStage):
         return self._target is not None and abs(self._counts_of(status) - self._target) <= self._settings.tolerance
 
     def _hindrance(self) -> str:
-        """Why a move did not arrive, according to the record.
+        """The reason why a move did not reach its target, according to the record.
 
         "" if the record gives no reason or has no such fields.
         """
@@ -290,7 +291,7 @@ class EpicsStage(LineStage):
         return MotorStatus(float(place.value), bool(done.value), int(bits.value))
 
     def _read(self, *suffixes: str) -> list[PvValue]:
-        """Read values; only values that the IOC guarantees are accepted."""
+        """Read values. Raises an error for a value that the IOC does not guarantee."""
         values = self._channel.read(*suffixes)
         for suffix, value in zip(suffixes, values, strict=True):
             refuse_invalid(self.name, self._channel.name + suffix, value, "It is not known whether it is moving")

@@ -40,12 +40,11 @@ class StageKind:
 
     Attributes:
         width: a pulse width (s) of the output, at most 1 ms; None if the width is fixed.
-        no_width: a width that the output does not have, or that excludes other settings.
-        inverts: its pulses may be active low.
-        homes: it has a reference within its limits.
-        turning_back_ends: a train ends if the stage turns back inside it; otherwise its remaining pulses come later.
-        disarms_moving: a train can be ended while the stage moves.
-        triggers: it has a trigger output; without one its suite is `StepStageConformance`.
+        no_width: a width that the output does not have, or that excludes other settings. inverts: True if the pulses
+            may be active low. homes: True if the stage has a reference within its limits. turning_back_ends: True if a
+            train ends when the stage turns back inside it. If False, the remaining pulses come later. disarms_moving:
+            True if a train can be ended while the stage moves. triggers: True if the stage has a trigger output. For a
+            stage without one, the suite is `StepStageConformance`.
     """
 
     width: float | None = 100e-6

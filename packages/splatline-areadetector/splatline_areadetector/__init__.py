@@ -1,1 +1,2 @@
-"""EPICS areaDetector: record the scan of another program, serve a scan of ours to other programs, drive a camera."""
+"""EPICS areaDetector: records the scan of another program, publishes a scan of this program to other programs, and
+drives a camera."""

@@ -1,9 +1,9 @@
 """Frames of areaDetector as values: an NTNDArray becomes pixels [row, col] with number, time, window and attributes.
 
-Compressed pixels (NDPluginCodec) are decoded with the HDF5 filters that hdf5plugin brings. A frame is written,
-undecoded, as the only chunk of a dataset in memory, and read back. HDF5 filters begin their chunks with a header that
-areaDetector leaves out: for bslz4 and lz4 it is put before the pixels (bitshuffle, Masui et al. 2015; the LZ4 filter
-of the HDF Group).
+Compressed pixels (NDPluginCodec) are decoded with the HDF5 filters that hdf5plugin brings. To decode a frame, its
+compressed bytes are written as the only chunk of a dataset in memory, and the dataset is read. HDF5 filters begin their
+chunks with a header that areaDetector leaves out: for bslz4 and lz4 it is put before the pixels (bitshuffle, Masui et
+al. 2015; the LZ4 filter of the HDF Group).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class FrameRefusedError(ValueError):
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the sensor that a frame shows, after all plugins that it passed.
+    """The part of the sensor that a frame shows, after all plugins through which the frame has passed.
 
     Attributes:
         shape: rows and columns of the frame.
@@ -55,8 +55,8 @@ class ArrayFrame:
         time: s since the Unix epoch, when the driver received the frame, after readout.
         received: s since the Unix epoch, on this computer's clock.
         attributes: NDAttributes by name.
-        is_current: True if the server already had this frame when we connected; it is an old frame, unless its number
-            is new.
+        is_current: True if the server already had this frame at the time of connecting. It is then an old frame, unless
+            its number is new.
         codec: "" for raw pixels.
     """
 
@@ -88,8 +88,8 @@ class ArrayFrame:
 
 
 def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayFrame | None:
-    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet. The pixels are
-    not copied.
+    """The frame in an NTNDArray that p4p has delivered with `nt=False`; None if it contains no pixels yet. The pixels
+    are not copied.
 
     Raises:
         FrameRefusedError: colour, signed or real pixels, JPEG, or another codec or number of dimensions.
@@ -106,7 +106,7 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
             + ("changes the counts" if codec == "jpeg" else "this program cannot decode")
             + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
         )
-    # A codec's parameters are an `any`: an int with pvDatabase's servers, None without a codec.
+    # The parameters of a codec have the type `any`: an int from servers of pvDatabase, None without a codec.
     element = ELEMENTS.get(int(value.codec.parameters or 0), "") if codec else pixels.dtype.str[1:]
     dtype = np.dtype(element) if element else np.dtype(np.float64)
     _refuse_type(dtype, codec, element)
@@ -131,8 +131,8 @@ def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     if mode != _MONO or len(sizes) != 2:
         what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
-            "makes it 3D)"
+            f"its pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
+            f"makes it 3D)"
         )
 
 

@@ -1,7 +1,7 @@
 """AreaDetectorCamera: a camera of an EPICS areaDetector. Records control the camera, and frames come over PVAccess.
 
-The time of a frame is the time at which the driver received it, minus exposure and readout. It differs from that of the
-pulse by milliseconds.
+The time of a frame is the time at which the driver received it, minus exposure and readout. This time differs from the
+time of the pulse by milliseconds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LEAST_RING = 2  # frames
 
 @dataclass(frozen=True)
 class AreaDetectorSettings:
-    """Settings of the IOC and its camera, including what EPICS cannot tell."""
+    """Settings of the IOC and its camera, including values that EPICS does not report."""
 
     prefix: str = setting(..., "Prefix of the IOC's records, with ca:// or pva://, such as ca://2bmSP2:.")
     driver: Literal["spinnaker", "simdetector", "pco", "andor3", "hamamatsu", "eiger"] = setting(
@@ -59,8 +59,8 @@ class AreaDetectorCamera:
     """Implements drivers.base.protocols.Camera. See `AreaDetectorSettings`.
 
     Framestamps are the frame numbers of the driver, from 0 at arm, so that a lost frame leaves a gap. If the camera
-    counts them (spinnaker, hamamatsu), a loss of the very first frame shows at the end, because a frame is missing
-    there. One thread takes frames; another may call `disarm` or `close`, which end the wait for a frame.
+    counts them (spinnaker, hamamatsu), a loss of the very first frame is noticed only at the end, because a frame is
+    missing there. One thread takes frames; another may call `disarm` or `close`, which end the wait for a frame.
 
     Raises:
         DeviceTimeout, DeviceError: the IOC does not answer, or its image cannot be stored.
@@ -159,7 +159,8 @@ class AreaDetectorCamera:
         rows, cols = self.timing.shape
         with self._changed:
             self._ring.clear()
-            # Half of the memory is kept for arriving frames and for frames being written, so that the newest has room.
+            # Half of the memory is kept for arriving frames and for frames that are being written, so that the newest
+            # frame has space.
             self._ring_size = max(_LEAST_RING, self._own.ring // 2 // (2 * rows * cols))
             self._lost = self._overrun = 0
             self._problem, self._origin = None, 1 if labels.counted else None
@@ -275,7 +276,7 @@ class AreaDetectorCamera:
         row0, col0, height, width = wanted.roi or (0, 0, *self._own.sensor)
         n = wanted.binning
         across = n if labels.binned_region else 1
-        for record in ("MinX", "MinY"):  # first to the corner, because otherwise a larger region would not fit
+        for record in ("MinX", "MinY"):  # moved to the corner first, because otherwise a larger region would not fit
             records.write(f"cam1:{record}", 0)
         binnings = {"A3Binning": labels.binning.format(n)} if labels.binning else {"BinX": n, "BinY": n}
         region = {"SizeX": width // across, "SizeY": height // across, "MinX": col0 // across, "MinY": row0 // across}

@@ -102,12 +102,12 @@ class Records:
         self._channel(record).write("", value)
 
     def set(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Write a value, and wait for its readback; a number may differ by this fraction. Returns the readback."""
+        """Write a value, and wait for its readback. A number may differ by this fraction. Returns the readback."""
         self.write(record, value)
         return self.await_value(record, value, within)
 
     def await_value(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Wait until the readback has this value. Raises DeviceRefused if it does not get it."""
+        """Wait until the readback has this value. Raises DeviceRefused if the readback does not reach it."""
         deadline = self._clock.now() + self._timeout
         while not _is_near(shown := self.read(f"{record}_RBV"), value, within):
             if self._clock.now() > deadline:

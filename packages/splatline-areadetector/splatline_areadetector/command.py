@@ -66,13 +66,12 @@ def ride(
 ) -> None:
     """Record the next scan of another program: store the frames that an areaDetector sends over PVAccess.
 
-    CONFIG says where frames and angles come from. tomoscan, bluesky or another program runs the scan; this command
-    stores its frames in a run folder, with the monitor, the page and a live volume. It writes no process variable and
-    does not slow the scan down. The first Ctrl-C closes the file properly.
+    CONFIG states the sources of frames and angles. tomoscan, bluesky or another program runs the scan. This command
+    stores the frames in the folder of a run, checks them with the monitor, and makes a live volume. It writes no
+    process variable and does not slow the scan down. The first Ctrl-C closes the file properly.
 
-    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server answers,
-    4 stopped, 5 frames are missing (a message lists them, and says what lost them if that is known),
-    7 alarms of the monitor.
+    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server answers, 4
+    stopped, 5 frames are missing (a message lists them, with the cause if it is known), 7 alarms of the monitor.
 
     Example: beamline ride my.yaml --page
     """
@@ -112,7 +111,7 @@ def _ride(
     repeat: bool,
     output: Path | None,
 ) -> None:
-    """Record the next scan, or with `repeat` one scan after the other. Complete scans are added to `results`."""
+    """Record the next scan; with `repeat`, one scan after the other. Complete scans are added to `results`."""
     from beamline.scan.live_process import Standby
     from splatline_areadetector.ridden import Ride
     from splatline_areadetector.ride import NoScanError, opened, ride_scan
@@ -161,7 +160,7 @@ def _raise_worst(
     """Print how many scans were recorded, and raise the worst error.
 
     Args:
-        ended: why the last scan ended; "": no scan was running.
+        ended: why the last scan ended; "" if no scan was running.
     """
     n = n_whole + len(lacking)
     recorded = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")

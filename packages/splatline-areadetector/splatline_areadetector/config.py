@@ -1,4 +1,4 @@
-"""Configuration of `beamline ride`: where the frames, their angles and their kinds come from."""
+"""Configuration of `beamline ride`: the sources of the frames, of their angles and of their kinds."""
 
 from __future__ import annotations
 
@@ -75,19 +75,20 @@ Angles = Annotated[TomoscanAngles | PlanAngles | AttributeAngles | PandaAngles, 
 
 
 class RideSection(Section):
-    """The scan of the other program: where its frames and angles come from."""
+    """The scan of the other program: the sources of its frames and angles."""
 
     image: Annotated[str, Setting(problem=image_problem)] = setting(doc="Process variable of the image, over PVAccess.")
     angles: Angles
     kinds: str | None = setting(
         None,
-        f"NDAttribute that says whether a frame is a dark, a flat or a projection ({KINDS}); null: the status of "
-        "tomoscan says it, or, without tomoscan, the order of darks, projections and flats.",
+        f"NDAttribute with the kind of a frame: dark, flat or projection ({KINDS}). null: the kind comes from the "
+        f"status of tomoscan or, without tomoscan, from the order of darks, projections and flats.",
         min_length=1,
     )
     darks: Fields = setting(
         Fields(count=0),
-        "Darks of the scan, unless tomoscan says how many; without `kinds` they are recognised by their order.",
+        "Number of darks of the scan, if tomoscan does not give it. Without `kinds`, darks are recognised by their "
+        "order.",
     )
     flats: Fields = Fields(count=0)
     camera: Prefix | None = setting(
@@ -152,7 +153,8 @@ class RideConfig(Section):
 
     @property
     def as_scan(self) -> Config:
-        """This configuration, for functions that take a scan configuration: sections have the same names and types."""
+        """This configuration as one for a scan, for functions that take the configuration of a scan. The sections have
+        the same names and types."""
         return cast(Config, self)
 
     @property

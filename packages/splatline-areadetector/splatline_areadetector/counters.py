@@ -1,6 +1,6 @@
-"""Counters of the IOC's plugin and camera, which show where frames were lost and why no frame comes.
+"""Counters of the plugin and of the camera in the IOC. They show where frames were lost, and why no frame comes.
 
-They also show why frames cannot be stored. Each message says what to change."""
+The module also finds the reason why frames cannot be stored. Each message says what to change."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Gap:
     Attributes:
         ids: numbers of the missing frames.
         before, after: IOC's times of the frames around the gap.
-        still: s during which this process stalled in the gap.
+        still: time in s for which this process stalled during the gap.
     """
 
     ids: range
@@ -63,8 +63,8 @@ class Counters:
             self.close = opened.pop_all().close
 
     def counted(self, first: float, second: float | None) -> int | None:
-        """See `Witness`. The counter arrives somewhat later than the frame that it counts. Only its rise is used,
-        because the camera may have been in free run before."""
+        """See `Witness`. The counter arrives slightly later than the frame that it counts. Only the increase of the
+        counter is used, because the camera may have been in free run before."""
         if self.camera is None:
             return None
         time.sleep(_SETTLES)
@@ -80,7 +80,7 @@ class Counters:
         return rises[0] > 0 or rises[1] > n
 
     def blame(self, gap: Gap) -> str:
-        """What lost the frames, as the end of a sentence."""
+        """The cause of the loss of frames, as the end of a sentence."""
         margin = (gap.after - gap.before) / (len(gap.ids) + 1) / 2
         begin, end = gap.before + margin, gap.after + margin
         dropped = self.plugin.histories["DroppedArrays_RBV"].rise(begin, end)
@@ -146,7 +146,8 @@ class Silence:
         return time.monotonic() - self._since
 
     def look(self) -> None:
-        """Say why no frame has come, if none has for `seconds`. InstrumentError: the server does not answer."""
+        """If no frame has come for `seconds`, report the reason. Raises InstrumentError if the server does not
+        answer."""
         if self.lasted < self._seconds:
             return
         self.frame_came()
@@ -172,8 +173,8 @@ def silence_sentence(counters: Counters) -> str:
 
 
 def refuse_mistakes(config: RideConfig, counters: Counters, frame: ArrayFrame | None) -> None:
-    """Raise ConfigError if frames are skipped, or are not the camera's own frames and the configuration does not ask
-    for that.
+    """Raise ConfigError if the plugin skips frames, or if the frames are not those of the camera although the
+    configuration does not request other frames.
 
     Args:
         frame: a frame of the stream; None: there is none yet.

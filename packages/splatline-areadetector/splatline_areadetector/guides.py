@@ -1,4 +1,5 @@
-"""Guides: where plan, kinds and angles of another program's scan come from: tomoscan, frame numbers, a PandABox."""
+"""Guides: sources for the plan, the kinds and the angles of another program's scan: tomoscan, frame numbers, or a
+PandABox."""
 
 from __future__ import annotations
 
@@ -50,16 +51,16 @@ SKEW = 0.5  # s: if the clocks of two IOCs differ by less, they count as equal
 
 
 class Guide(Protocol):
-    """Knows the plan of a scan, and the kind and angle of each frame. It only reads."""
+    """A source for the plan of a scan, and for the kind and angle of each frame. A guide only reads."""
 
     def plan(self) -> RidePlan:
-        """The present plan. ConfigError: there is no possible plan."""
+        """The present plan. Raises ConfigError if no plan is possible."""
 
     def phase(self, frame: ArrayFrame) -> BlockKey:
-        """What the scan did while the frame was taken."""
+        """The phase of the scan in which the frame was taken."""
 
     unknown_angle: str
-    """Why `angle` is NaN, as a part of a sentence."""
+    """The reason why `angle` is NaN, as a part of a sentence."""
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         """Angle of a projection in radians; NaN: not known."""
@@ -185,7 +186,7 @@ class PandaGuide(_ByNumbers):
     """A fly scan whose angles are in the file of a PandABox: row n belongs to trigger n.
 
     Args:
-        wait: s to wait for a row that the file does not have yet.
+        wait: time in s to wait for a row that the file does not have yet.
 
     Raises:
         ConfigError: the file exists, but its rows are not angles in degrees, at most one for each projection.
@@ -202,8 +203,8 @@ class PandaGuide(_ByNumbers):
 
     @property
     def status(self) -> str:  # type: ignore[override]
-        """The number of rows with the first and the last angle: the operator sees whether the file is that of this
-        scan."""
+        """A sentence with the number of rows, and the first and the last angle. With it the operator can see whether
+        the file belongs to this scan."""
         if not self._rows.size:
             return f"{self._path} {'has no rows' if self._path.exists() else 'does not exist'} yet"
         ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
@@ -214,7 +215,7 @@ class PandaGuide(_ByNumbers):
         self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait
         while (problem := self._look()) and time.monotonic() < deadline:
             time.sleep(_POLL)
-        # otherwise the file may come after darks and flats
+        # otherwise the file may come only after darks and flats
         begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None
         if problem and (begins or self._path.exists()):
             raise ConfigError(f"{problem}. Nothing was recorded.")
@@ -237,7 +238,8 @@ class PandaGuide(_ByNumbers):
         return _angle(self._settings.offset_deg + self._settings.deg_per_unit * float(self._rows[row]))
 
     def _look(self) -> str:
-        """Read the present rows of the file. Returns what is wrong with it, without a full stop; "" if nothing is."""
+        """Read the present rows of the file. Returns the fault of the file, without a full stop; "" if it has no
+        fault."""
         name, views = self._settings.dataset, self._settings.views
         if not self._path.exists():
             return f"{self._path} (ride.angles.file) does not exist"
@@ -310,7 +312,7 @@ _TOMOSCAN = (
 _KINDS = {"dark": FrameKind.DARK, "flat": FrameKind.FLAT, "proj": FrameKind.PROJECTION}
 _COLLECTING = "collecting "
 _PREPARING = ("programming", "taxi", "moving", "homing", "setting")
-"""How ScanStatus begins between two blocks, or within a block; any other status ends the block."""
+"""Beginnings of ScanStatus between two blocks, or within a block. Any other status ends the block."""
 
 
 class TomoscanGuide:
@@ -395,9 +397,9 @@ class TomoscanGuide:
         return kind if not types or kind_of(types[-1]) in (kind, None) else None
 
     def _at(self, history: History, seconds: float) -> list[Any]:
-        """The values until a time of the camera's IOC. Its clock may differ from tomoscan's. The clocks count as
-        different only if they differ by more than the delays of frames do. On a busy computer delays differ a lot, and
-        the few values come late, too."""
+        """The values until a time of the camera's IOC, whose clock may differ from that of tomoscan. The clocks count
+        as different only if they differ by more than the delays of frames do. On a busy computer the delays differ a
+        lot, and values also come late."""
         skew = 0.0 if history.delay is None or math.isinf(self._delay) else self._delay - history.delay
         return [*history.until(seconds + (skew if abs(skew) > SKEW + self._longest - self._delay else 0.0))]
 

@@ -1,4 +1,5 @@
-"""RidePlan: the plan of another program's scan, as far as it is known at the first frame, in the form of our plans."""
+"""RidePlan: the plan of another program's scan, as far as it is known at the first frame, in the form of the plans of
+this program."""
 
 from __future__ import annotations
 
@@ -42,10 +43,9 @@ class RidePlan:
 
     Attributes:
         blocks: in the order of acquisition.
-        angles: float64 [view] radians; NaN if only the frames tell them.
-        exposures: s by kind; a kind that is not listed has that of projections.
-        period: s between frames; None: not known.
-        told_by: where the plan comes from, for the metadata.
+        angles: float64 [view] in radians; NaN if only the frames contain them. exposures: exposure in s by kind; a kind
+            that is not listed has the exposure of projections. period: time in s between frames; None: not known.
+            told_by: source of the plan, for the metadata.
     """
 
     blocks: tuple[PlannedBlock, ...]

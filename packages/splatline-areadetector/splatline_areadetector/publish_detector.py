@@ -144,12 +144,12 @@ def records(image: str) -> tuple[Record, ...]:
 
 
 class PublishedDetector:
-    """Camera and file plugin as clients see them. Calls may come from any thread.
+    """Camera and file plugin in the form that clients expect. Calls may come from any thread.
 
     Args:
-        put: shows a value in the record of this name, without calling the handler of a setpoint.
-        files: folder below which clients may request files; None: no files.
-        say: prints a sentence for the person who runs the server.
+        put: function that shows a value in the record of this name, without calling the handler of a setpoint. files:
+            folder below which clients may request files; None: no files are written. say: function that prints a
+            sentence for the person who runs the server.
     """
 
     def __init__(self, put: Callable[[str, Value], None], files: Path | None, say: Callable[[str], None]) -> None:

@@ -70,7 +70,8 @@ class PublishedFrame:
 
 
 class SendRate:
-    """Spreads frames that came into the file together, because the queue of a client usually holds only four."""
+    """Spreads in time frames that came into the file together, because the queue of a client usually has space for only
+    four frames."""
 
     def __init__(self) -> None:
         self._came, self._sent = deque[tuple[float, int]](), -math.inf  # times and frames
@@ -93,7 +94,7 @@ class SendRate:
 
 
 class RunFrames:
-    """The frames of the newest run of a folder, from now on, and of each run that begins later.
+    """The frames of the newest run of a folder from now on. If a newer run begins, its frames follow.
 
     If a run exists at the start, its newest frame comes first. Call it from one thread only.
 
@@ -102,9 +103,8 @@ class RunFrames:
         now: a clock, s.
 
     Attributes:
-        run: folder of the (part of the) run whose frames come; None: there is none yet.
-        shape: rows and columns of its frames; (0, 0) before.
-        dtype: type of the pixels.
+        run: folder of the run (or of the part of the run) whose frames are returned; None: there is no run yet. shape:
+            rows and columns of its frames; (0, 0) before the first run. dtype: type of the pixels.
     """
 
     def __init__(self, runs: Path, say: Callable[[str], None], now: Callable[[], float] = time.monotonic) -> None:
@@ -124,7 +124,7 @@ class RunFrames:
         return self._committed - self._next
 
     def next(self) -> PublishedFrame | None:
-        """The next frame that is due; None: none is due yet."""
+        """The next frame that is due; None if no frame is due yet."""
         now = self._now()
         if now - self._looked >= LOOK_EVERY and not self.waiting:
             self._look()

@@ -29,8 +29,8 @@ class ClientCount:
 
 
 class ImageServer:
-    """Serves one image over PVAccess until it is closed. A client that is slow or stalls loses frames; nobody waits for
-    it.
+    """Serves one image over PVAccess until it is closed. The server does not wait for clients: a client that is slow or
+    stalls loses frames.
 
     Args:
         name: name of the process variable.
@@ -110,7 +110,7 @@ def _configured(address: str, port: int | None) -> dict[str, str]:
 
 
 class RecordServer:
-    """Serves records until the process ends. EPICS has one IOC for each process, which cannot be stopped on its own.
+    """Serves records until the process ends. A process can have only one IOC, which cannot be stopped separately.
 
     Args:
         prefix: prefix of each name, with its colon.

@@ -23,19 +23,19 @@ from numpy.typing import NDArray
 
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
 
-# s between two reads of the clock; if they are farther apart by the second value, the process has stalled
+# s between two readings of the clock; if they are farther apart by more than the second value, the process has stalled
 _TICK, _STILL = 0.1, 0.4
 
 
 class Subscribed:
     """Subscriptions to process variables over PVAccess, until `close`. One thread takes the updates in their order.
 
-    p4p's own subscriptions fall silent for ever in two cases: if the first update comes before `monitor` has returned,
-    as happens on a busy computer, and if a callback raises.
+    The subscriptions of p4p itself stop for ever in two cases: if the first update comes before `monitor` has returned,
+    which happens on a busy computer; and if a callback raises an error.
 
     Args:
         takers: functions by the name of the variable. Each gets the updates (p4p's values, not unwrapped) and the
-            exceptions (the connection to the server was lost). A function that raises misses that update.
+            exceptions (the connection to the server was lost). If a function raises an error, it misses this update.
         request: pvRequest; None: that of p4p.
 
     Raises:
@@ -77,7 +77,7 @@ class Receiver:
     """Takes the updates of an image in one thread; another thread passes them on.
 
     Args:
-        room: most bytes of waiting frames. A single frame may always wait, however large.
+        room: largest number of bytes of waiting frames. A single frame may always wait, whatever its size.
     """
 
     def __init__(self, room: int, now: Callable[[], float] = time.time) -> None:
@@ -89,7 +89,7 @@ class Receiver:
     def take(self, value: Any) -> None:
         """Take an update, or p4p's exception for a lost connection.
 
-        It never raises, because the next update may be good.
+        The method never raises an error, because the next update may be good.
         """
         received = self._now()
         if isinstance(value, Exception):
@@ -128,7 +128,7 @@ class Receiver:
         )
 
     def pass_on(self, stream: IO[bytes]) -> None:
-        """Write the next item; waits for one.
+        """Wait for the next item and write it.
 
         Args:
             stream: without a buffer, because that of Python 3.11 loses bytes if the process is stopped while writing.

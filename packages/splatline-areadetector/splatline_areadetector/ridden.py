@@ -1,6 +1,7 @@
-"""RiddenFrames: the frames of another program's scan, in the order of our file, each with kind and angle.
+"""RiddenFrames: the frames of another program's scan, in the order of the file that is written, each with kind and
+angle.
 
-An epoch is a part of the scan in which the frame numbers do not restart; each epoch is a file.
+An epoch is a part of the scan in which the frame numbers do not restart. Each epoch is stored in one file.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class EpochEndedError(LedgerError):
 
 
 def outside_sentence(guide: Guide) -> str:
-    """The message about frames outside of a scan."""
+    """The message about frames that arrive outside of a scan."""
     status = f" ({guide.status})" if guide.status else ""
     return f"Frames that arrive outside of a scan{status} are not stored."
 
@@ -88,7 +89,7 @@ class RiddenFrames:
         self._last: ArrayFrame | None = None  # that has a place
         self._arrived: ArrayFrame | None = None  # the last one
         self._unplaced: dict[str, list[int]] = {}
-        self._unused: dict[str, list[int]] = {}  # numbers of frames that arrived and cannot be used, by reason
+        self._unused: dict[str, list[int]] = {}  # for each reason, numbers of frames that arrived and cannot be used
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._reported_outside = False
         self._reported_pause = self._epoch = ""
@@ -105,7 +106,7 @@ class RiddenFrames:
         return [given + first + trigger for i, first in firsts for trigger in self._sorter.missing(i)]
 
     def frames(self) -> Generator[Frame, None, None]:
-        """See `FrameSource`. LedgerError names the missing frames, and who lost them."""
+        """See `FrameSource`. LedgerError lists the missing frames and the causes of the loss."""
         yield from self._from_files()
         yield from self._from_stream()
         if not self._sorter.complete:  # otherwise the held frames belong to the next scan
@@ -182,7 +183,8 @@ class RiddenFrames:
         self._sink(Warned(sentence))
 
     def _placed(self, seen: Seen, place: Decision) -> Frame | None:
-        """The frame for the file; None: it belongs to no scan, cannot be decoded, or belongs to the next file."""
+        """The frame for the file. None: it does not belong to the scan, cannot be decoded, or belongs to the next
+        file."""
         frame: ArrayFrame = seen.frame
         if isinstance(place, NewEpoch):
             self._epoch = place.why or self._other_size(frame)
@@ -300,7 +302,7 @@ class RiddenFrames:
         self._measurement.pause.resume()
 
     def _loss_sentences(self, *, ended: bool) -> str:
-        """Sentences on the missing frames and on who lost them, each after a space.
+        """Sentences on the missing frames and the causes of the loss, each after a space.
 
         Args:
             ended: whether the scan ended by itself, without a stop and without a new epoch.
@@ -335,7 +337,8 @@ class RiddenFrames:
         """A sentence on frames that are missing at the end. "" if the number of the first projection is known, or if
         the recording began before the scan and was stopped while frames came, because that explains the missing frames.
 
-        The projections cannot show it: if all angles are rotated, they fit a rotated sample.
+        The projections cannot show whether the first frames are missing: if all angles are wrong by a constant, the
+        projections agree with a rotated sample.
         """
         angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
         if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
@@ -385,7 +388,7 @@ class RiddenFrames:
 
 
 def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:
-    """What is known of a frame.
+    """The known facts about a frame.
 
     Args:
         gone: the connection to the server was lost since the previous frame.

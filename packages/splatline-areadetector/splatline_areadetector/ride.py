@@ -41,10 +41,11 @@ class NoScanError(ScanAborted):
 
 
 def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> RunResult:
-    """Record the next scan of the stream in a run. If its frame numbers restart, each part is a run of its own.
+    """Record the next scan of the stream in a run. If the frame numbers restart, each part becomes a separate run.
 
     Args:
-        live: loads its code while waiting for a scan, then makes the live volume; None: no live volume.
+        live: process that loads its code while waiting for a scan, and then makes the live volume; None: no live
+            volume.
 
     Raises:
         ConfigError: the frames cannot be stored, or their angles are not known; nothing was recorded.
@@ -73,7 +74,8 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
 
 
 def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) -> tuple[ArrayFrame, Seen | None]:
-    """The first frame of a scan, which stays in the stream, and the frame before it. Earlier frames are dropped.
+    """Wait for the first frame of a scan. Returns this frame, which stays in the stream, and the frame before it.
+    Earlier frames are dropped.
 
     Args:
         began_within_scan: a file of this scan has been closed already.
@@ -123,7 +125,7 @@ def _begins(seen: Seen, ride: Ride, first_id: int | None) -> bool:
 
 
 def _is_alone(first: ArrayFrame, ride: Ride) -> bool:
-    """Whether the next frames have another size. ConfigError: they have the same number but other pixels."""
+    """Whether the next frames have another size. Raises ConfigError if they have the same number but other pixels."""
     ahead = [each for each in ride.stream.ahead(2, SECOND) if isinstance(each, ArrayFrame)]
     if ahead and ahead[0].unique_id == first.unique_id and not np.array_equal(ahead[0].payload, first.payload):
         raise ConfigError(f"{not_set(first.unique_id)}. Nothing was recorded.")
@@ -155,7 +157,7 @@ def _exposure(ride: Ride, planned: float | None, first: ArrayFrame) -> float | N
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
-    """The plan, completed by the exposure time of the projections."""
+    """The plan, with the exposure time of the projections added."""
     seconds = _exposure(ride, plan.exposures.get(FrameKind.PROJECTION), first)
     if seconds is None:
         raise ConfigError(

@@ -1,7 +1,7 @@
-"""Sorter: finds which dark, flat or projection each frame is, and how sure that is.
+"""Sorter: determines for each frame which dark, flat or projection it is, and how certain this is.
 
-It knows the number, size, kind, pixels and time of a frame, the planned length of each block, and the camera's own
-counter. The trigger of a frame is its number minus that of the first frame of its block. Four properties of the numbers
+It uses the number, size, kind, pixels and time of a frame, the planned length of each block, and the counter of the
+camera. The trigger of a frame is its number minus that of the first frame of its block. Four properties of the numbers
 are handled:
 
 - Neighbours may be exchanged: a frame whose number is ahead waits until some more have come.
@@ -9,7 +9,7 @@ are handled:
 - A plugin that averages n frames passes on every nth number.
 - Numbers may restart with each acquisition: after a complete block the next block begins, within a block the file ends.
 
-It computes with values only: no file, no server, no clock.
+The sorter only computes with values. It uses no file, no server and no clock.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _RUNNING = 3  # longest time between two frames of the same acquisition, in peri
 
 @dataclass(frozen=True)
 class BlockKey:
-    """What the scan does while a frame is taken.
+    """The phase of the scan in which a frame is taken.
 
     Attributes:
-        serial: differs between two blocks of darks or flats, even of the same kind.
-        kind: None: the frame belongs to no scan.
+        serial: number that differs between two blocks of darks or flats, even if they have the same kind. kind: kind of
+            the frame; None: the frame does not belong to a scan.
     """
 
     serial: int
@@ -58,7 +58,7 @@ UNPLANNED = 2**31
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What is known of a frame.
+    """The known facts about a frame.
 
     Attributes:
         time: s, on the clock of the IOC.
@@ -80,7 +80,8 @@ class Seen:
     count_restarts: int = 0
 
     def repeats(self, other: Seen, *, is_last: bool) -> bool:
-        """Whether it is the other frame of the same number, sent again: at once, or later with the same time."""
+        """Whether a frame is the same as another frame with this number, sent again: at once, or later with the same
+        time."""
         is_same = self.phase == other.phase and (is_last or self.time == other.time)
         return is_same and np.array_equal(self.pixels, other.pixels)
 
@@ -115,13 +116,12 @@ class Witness(Protocol):
 
 @dataclass(frozen=True)
 class FramePosition:
-    """Where a frame belongs in the plan.
+    """The place of a frame in the plan.
 
     Attributes:
-        trigger: within its block.
-        skipped: triggers lost just before this frame.
-        basis: how the number of the block's first frame was found.
-        note: a message on what had to be assumed; "": nothing.
+        trigger: trigger of the frame within its block. skipped: number of triggers that were lost just before this
+            frame. basis: how the number of the first frame of the block was found. note: message on assumptions that
+            had to be made; "": none were needed.
     """
 
     block: int
@@ -134,7 +134,8 @@ class FramePosition:
 
 @dataclass(frozen=True)
 class Outside:
-    """A frame that is not stored: outside of a scan, beyond the planned end of its block, or seen before.
+    """A frame that is not stored, because it is outside of a scan, beyond the planned end of its block, or a
+    repetition.
 
     Attributes:
         lost: numbers that are missing at the end of the block, given with the first frame beyond the end, if the
@@ -246,7 +247,7 @@ class Sorter:
         self.repeats = 0
 
     def take(self, seen: Seen) -> Iterator[tuple[Seen, Decision]]:
-        """Take the next frame. Yields the frames that need not wait any longer, see `decided`."""
+        """Add the next frame. Yields the frames that need not wait any longer, see `decided`."""
         newest = self.held[-1] if self.held else self._last
         number = self._unwrapped(seen.number, seen.time, is_anew=seen.reconnected)
         restarts = 0 if newest is None else newest.count_restarts
@@ -283,7 +284,7 @@ class Sorter:
         """The frames that need not wait any longer, in the order of their numbers, with where they belong.
 
         Args:
-            patience: 2: more frames are coming; 1: none has come for a while; 0: none will come.
+            patience: 2: more frames are coming; 1: no frame has come for a while; 0: no frame will come.
 
         Raises:
             DataError: all numbers are the same.
@@ -336,7 +337,7 @@ class Sorter:
         return not expected / 2 <= seen.time - last.time <= 2 * expected + 2 * period
 
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
-        """Why the file ends if numbers have restarted; "": the file does not end."""
+        """The reason why the file ends, if numbers have restarted; "" if the file does not end."""
         if (seen.number, seen.phase) == (last.number, last.phase) and not (seen.reconnected or block.is_over):
             raise DataError(f"{not_set(seen.number)}. Frames that came before are in the file.")
         is_same = seen.phase in (BY_ORDER, UNKNOWN_KIND) or (
@@ -350,8 +351,8 @@ class Sorter:
         )
 
     def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
-        """Find by how much numbers rise from frame to frame: by more than 1 if all of several do and no frame was
-        lost."""
+        """Find by how much numbers increase from frame to frame. The step is larger than 1 if it is the same for
+        several frames and no frame was lost."""
         following = [last, seen, *self.held]
         rises = [b.number - a.number for a, b in pairwise(following) if a.count_restarts == b.count_restarts]
         step = math.gcd(*rises)
@@ -384,11 +385,11 @@ class Sorter:
         return sum((each.number - block.first) % block.step > 0 for each in ahead) > 1
 
     def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
-        """Where a frame belongs, if the file does not end."""
+        """The place of a frame, if the file does not end."""
         kind, views = seen.phase.kind, self._views
         if seen.phase == UNKNOWN_KIND:
             if block is None or is_anew or block.closed or seen.number >= block.end:
-                return Unknown("it is not known whether it is a dark, a flat or a projection")
+                return Unknown("it is not known whether the frame is a dark, a flat or a projection")
         elif seen.phase == BY_ORDER:
             self._by_order(seen, block, is_anew)
         elif kind is None:
@@ -416,8 +417,8 @@ class Sorter:
         return FramePosition(self._now, block.kind, trigger, skipped, block.basis)
 
     def _outside(self, seen: Seen, block: _Taken | None) -> Outside:
-        """A frame that is not stored. Its number may show that the present block is over, whatever is missing at its
-        end."""
+        """Handle a frame that is not stored. Its number may show that the present block is over, even if frames are
+        missing at its end."""
         if block is None or block.closed or seen.number < block.end:
             return Outside()
         block.closed = True
@@ -538,7 +539,8 @@ class Sorter:
         return raw + self._wrapped
 
     def pass_over(self, raw: int) -> range:
-        """No frame up to this number of the present block will come any more. Returns the numbers that are missing."""
+        """Record that no frame of the present block up to this number will come any more. Returns the numbers that are
+        missing."""
         block, number = self._taken.get(self._now), self._unwrapped(raw)
         if block is None or block.closed or not block.last < number < block.end:
             return range(0)
@@ -547,7 +549,7 @@ class Sorter:
         return lost
 
     def lose(self, place: FramePosition) -> None:
-        """The frame that was assigned here cannot be used."""
+        """Record that the frame at this place cannot be used."""
         self._taken[place.block].triggers.discard(place.trigger)
 
     @property

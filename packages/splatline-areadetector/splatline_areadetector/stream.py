@@ -1,9 +1,10 @@
-"""FrameStream: a subscription to an areaDetector's image over PVAccess. Frames are copied to our own memory at once.
+"""FrameStream: a subscription to the image of an areaDetector over PVAccess. Frames are copied at once to memory of
+this program.
 
 The server keeps a queue for each client. If the queue is full, the server overwrites its newest entry without an error.
-So we request a queue of about a second, and a separate process (`receiver`) takes frames as soon as the server delivers
-them. With `pipeline=true` the server would wait for us, but today's servers of NDPluginPva then repeat frames. Lost
-frames show as a gap in the frame numbers.
+Therefore the stream requests a queue of about a second, and a separate process (`receiver`) takes frames as soon as the
+server delivers them. With `pipeline=true` the server would wait for the client, but present servers of NDPluginPva then
+repeat frames. Lost frames leave a gap in the frame numbers.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class Queues:
 
 
 def image_problem(url: str) -> str:
-    """What is wrong with the address of an image; "" if it is right."""
+    """The fault of the address of an image; "" if the address is right."""
     name = url.removeprefix(SCHEME)
     good = name and name != url and not any(letter.isspace() for letter in name)
     return "" if good else f"{url!r} is not the address of an image; expected pva://PREFIX:Pva1:Image"
@@ -108,7 +109,8 @@ class FrameStream:
 
     Attributes:
         name: name of the process variable.
-        first: the frame that the server had when we connected, later the last one of the scan; None: none yet.
+        first: the frame that the server had at the time of connecting, and later the last frame of the scan; None:
+            there is no frame yet.
         queue: length of the server's queue that was asked for, in frames.
         still: intervals of Unix time during which no frame could be received.
 
@@ -164,12 +166,12 @@ class FrameStream:
         return items
 
     def put_back(self, item: Item) -> None:
-        """Have `next` return this item again, before all others."""
+        """Put an item back, so that `next` returns it again, before all others."""
         with self._changed:
             self._items.appendleft(item)
 
     def answers(self) -> bool:
-        """Whether the server answers now; waits 1.5 s at most."""
+        """Whether the server answers now. The check takes at most 1.5 s."""
         try:
             self._get("field(uniqueId)", ANSWERS_WITHIN / 2)
         except (BeamlineError, DeviceTimeout):
@@ -240,7 +242,7 @@ class FrameStream:
         self._reader.join()
 
     def _read(self) -> None:
-        """Take what the receiver passes on, in a thread. If the receiver dies, start another one."""
+        """Take the items that the receiver passes on, in a separate thread. If the receiver dies, start another one."""
         while not self._over:
             process = self._process
             assert process.stdin is not None and process.stdout is not None
@@ -249,7 +251,7 @@ class FrameStream:
                 while line := stream.readline():
                     self._take(stream, *json.loads(line))
             code, self._died_at = process.wait(), time.time()
-            if self._over or not self._ready.is_set():  # the constructor waits for this, and raises
+            if self._over or not self._ready.is_set():  # the constructor waits for this, and raises the error
                 self._ready.set()
                 return
             self._put(Died(code))

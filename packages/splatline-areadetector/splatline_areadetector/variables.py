@@ -1,7 +1,7 @@
 """Variables: process variables of an IOC, subscribed to over PVAccess or Channel Access, each with its history.
 
-Nothing is written. Values and frames arrive by different ways, and a computer that has stalled gets all of them at
-once. So a value counts from the time stamp of its IOC.
+No variable is written. Values and frames arrive on different ways, and a computer that has stalled gets all of them at
+once. Therefore a value is valid from the time stamp of its IOC on.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LONGEST_DELAY = 60.0  # s; if the clock of an IOC is wrong by more, it was neve
 
 
 def url_problem(url: str) -> str:
-    """What is wrong with the address of process variables; "" if it is right."""
+    """The fault of the address of process variables; "" if the address is right."""
     scheme, _, name = url.partition("://")
     good = scheme in ("pva", "ca") and name and not any(letter.isspace() for letter in name)
     return "" if good else f"{url!r} is not a prefix of process variables; expected pva://PREFIX or ca://PREFIX"
@@ -69,7 +69,7 @@ class History:
         return self._stamps[-1] if self._stamps else 0.0
 
     def rise(self, begin: float, end: float) -> float | None:
-        """By how much a counter rose between two times of its IOC; None: not known."""
+        """The increase of a counter between two times of its IOC; None: not known."""
         try:
             before, after = (float(self.until(seconds)[-1]) for seconds in (begin, end))
         except (IndexError, ValueError):
@@ -77,8 +77,8 @@ class History:
         return max(0.0, after - before)
 
     def risen(self, end: float, rest: float) -> float | None:
-        """By how much a counter had risen at a time of its IOC, since it last fell (to 0) or paused for `rest` s; None:
-        it never fell or paused since we know it."""
+        """The increase of a counter until a time of its IOC, since it last fell (to 0) or paused for `rest` s. None:
+        the counter has neither fallen nor paused since it was first read."""
         n = bisect_right(self._stamps, end)
         values = [float(value) for value in self._values[:n]]
         for i in range(n - 1, 0, -1):
@@ -89,8 +89,8 @@ class History:
         return None
 
     def until(self, seconds: float) -> Sequence[Value]:
-        """The values that the IOC had set by then, oldest first. Always includes the first, which was there before
-        us."""
+        """The values that the IOC had set by this time, oldest first. They always include the first value, which was
+        set before the subscription."""
         return self._values[: max(1, bisect_right(self._stamps, seconds))]
 
 

@@ -298,7 +298,7 @@ def test_settings_that_are_refused(
 @pytest.mark.parametrize(
     ("value", "ride", "sentence"),
     [
-        ({"attributes": {"ColorMode": 2}}, {}, "are RGB1, not mono; set cam1:ColorMode to Mono"),
+        ({"attributes": {"ColorMode": 2}}, {}, "are RGB1, expected mono; set cam1:ColorMode to Mono"),
         ({"counts": np.zeros((4, 4), np.float32)}, {}, "pixels are float32, but they must be uint8 or uint16; set"),
         ({"counts": np.zeros((4, 4), np.int16)}, {}, "pixels are int16"),
         ({"codec": {"name": "jpeg", "parameters": 5}}, {}, "compressed with jpeg, which changes the counts"),

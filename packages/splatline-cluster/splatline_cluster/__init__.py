@@ -75,7 +75,7 @@ class Cluster:
         return result
 
     def _wait_for(self, future: Future) -> None:
-        """Return when the work is done. WorkersLostError: no worker for `patience`."""
+        """Wait until the work is done. Raises WorkersLostError if there is no worker for `patience` s."""
         look, alone, done = min(LOOK_EVERY, self.patience), 0.0, Event()
         # Do not use result(look): its TimeoutErrors form cycles with their frames, which keep the partial volume alive.
         future.add_done_callback(lambda _: done.set())

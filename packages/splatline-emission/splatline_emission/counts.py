@@ -1,4 +1,5 @@
-"""Counts along lines of response with the parts of their mean: the value, its file, line integrals with weights."""
+"""Counts along lines of response, with the parts of their mean: as a value, in a file, and as line integrals with
+weights."""
 
 from __future__ import annotations
 
@@ -178,7 +179,7 @@ def weighted_lines(emission: Emission) -> tuple[F32, F32]:
     To second order about an expected mean λ, the negative log-likelihood of y is ½ w (p - p~)² with p~ = (y - b) / s,
     whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed over neighbours: with
     the counts of a line alone, lines with many counts by chance would get the smallest weights, and the sum would be
-    too low. Lines of survival 0 have weight 0.
+    too low. Lines with survival 0 have weight 0.
     """
     survival, zeros = emission.survival, np.zeros_like(emission.counts)
     seen = survival > 0

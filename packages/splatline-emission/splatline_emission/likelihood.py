@@ -103,7 +103,7 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
 
 
 def passes_by_halves(emission: Emission, grid: Grid, subsets: int, most: int, rng: np.random.Generator) -> int:
-    """The number of iterations of `mlem`, up to `most`, for which held-out counts are predicted best.
+    """The number of iterations of `mlem`, up to `most`, after which the volume predicts held-out counts best.
 
     Each count goes to one of two halves at random. The halves are independent Poisson counts of half the mean (Kingman
     1993, Poisson Processes, section 5.1), for all lines. The activity x of one half is compared with the lines
@@ -113,7 +113,8 @@ def passes_by_halves(emission: Emission, grid: Grid, subsets: int, most: int, rn
 
     and the first sum on the right is |x - truth|², up to a factor (Natterer 1986, The Mathematics of Computerized
     Tomography, section II.1). Without |ω|, or with the likelihood, lines would be compared, and lines hardly show the
-    noise of a volume: two to three times as many iterations would then seem best. The search ends when the sum rises.
+    noise of a volume: two to three times as many iterations would then seem best. The search ends when the sum
+    increases.
 
     Returns:
         `most` if counts are not integers, because they are then not Poisson.

@@ -138,8 +138,8 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
 def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> None:
     """Write the surface of a volume as a watertight mesh.
 
-    Lengths are in the unit of the volume (mm if the voxel size is known). Where material reaches a face of the volume,
-    the surface is closed there. For a finer mesh use a volume of `beamline voxelise` with smaller voxels.
+    Lengths are in the unit of the volume (mm if the voxel size is known). If material reaches a face of the volume, the
+    surface is closed there. For a finer mesh use a volume of `beamline voxelise` with smaller voxels.
 
     Example: beamline surface recon.h5 -o sample.stl
     """

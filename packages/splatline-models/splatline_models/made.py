@@ -42,7 +42,8 @@ def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ..
 
 
 def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Volume:
-    """Voxelise the model on a grid, sixteen slices at a time. `count` is called with (slices done, all slices)."""
+    """Voxelise the model on a grid, sixteen slices at a time. `count` is called with the number of slices done, and of
+    all slices."""
     data = np.empty(grid.shape, np.float32)
     for first in range(0, grid.shape[0], _SLICES):
         part = slice(first, min(first + _SLICES, grid.shape[0]))

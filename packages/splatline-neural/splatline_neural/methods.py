@@ -7,8 +7,8 @@ published methods:
 - The hash grid ends when its cubes are a voxel. Published: 16 levels, most of them finer than a voxel of 256³.
 - Steps use any ray that has a weight. Published: pixels above zero, so that points that only rays through air meet are
   undetermined.
-- The density begins at the mean of the box. Published: at half of the highest density, from which a high rate ends at
-  zero.
+- The density begins at the mean of the box. Published: at half of the highest density; with a high rate, the density
+then ends at zero.
 """
 
 from __future__ import annotations

@@ -88,8 +88,8 @@ class XafsCurve:
     def contrast_to_noise(self) -> Reals | None:
         """|contrast| divided by noise, [n]; None if either is unknown or the noise is 0.
 
-        The noise from a few hundred pixels is uncertain by 5 %, and scatters by that between energies. So it is
-        smoothed over neighbouring energies.
+        The noise estimated from a few hundred pixels is uncertain by 5 %, and scatters by 5 % from energy to energy. So
+        the noise is smoothed over neighbouring energies.
         """
         if self.contrast is None or self.noise is None or not (self.noise > 0).all():
             return None
@@ -98,8 +98,8 @@ class XafsCurve:
 
     @property
     def best(self) -> int:
-        """Index of the energy with the highest contrast-to-noise; with the highest absorption if the noise is
-        unknown."""
+        """Index of the energy with the highest contrast-to-noise ratio. If the noise is not known, that of the highest
+        absorption."""
         by = self.contrast_to_noise
         return int(np.argmax(np.abs(self.absorption) if by is None else by))
 
@@ -133,7 +133,7 @@ def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
     pixels).
 
     Both are NaN if a region cannot be used: more than 1 % of its pixels are dark (+inf), or fewer than half of them
-    have a value. In this case the mean of the other pixels is not that of the region, and dark pixels have no noise.
+    have a value. The mean of the other pixels would then not be that of the region, and dark pixels have no noise.
     """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:

@@ -40,7 +40,8 @@ class Spectra:
     attenuation: NDArray[np.float64]
 
     def at(self, energy_kev: float | None, scan: Path) -> NDArray[np.float64]:
-        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError: no energy, or outside of the table."""
+        """Attenuation [material] in 1/mm, interpolated in energy. Raises ConfigError if the energy is unknown, or
+        outside of the table."""
         if energy_kev is None or not self.energies[0] <= energy_kev <= self.energies[-1]:
             stated = "not stated" if energy_kev is None else f"{energy_kev:g} keV"
             raise ConfigError(
@@ -85,10 +86,11 @@ def read_spectra(path: Path) -> Spectra:
 @click.option("-o", "--output", metavar="PATH.h5", type=_FILE, required=True,
               help="Where to write: one file for each material, PATH_NAME.h5.")  # fmt: skip
 @click.option("--register", is_flag=True,
-              help="Find and correct how the sample moved, and the magnification of each scan.")  # fmt: skip
+              help="Find and correct the motion of the sample between the scans, and the magnification of each "
+                  "scan.")  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="These two materials are states of one material, such as charged and discharged. Their sum does "
-              "not change; the fraction of each state becomes smooth in space.")  # fmt: skip
+              help="These two materials are states of one material, such as charged and discharged. The sum of both "
+                  "does not change; the fraction of each state becomes smooth in space.")  # fmt: skip
 @click.option(
     "--axis", type=float, metavar="COL", help="Column of the rotation axis. Default: found in the first scan."
 )
@@ -155,7 +157,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: boo
 
 
 def _move(move: Any) -> str:
-    """How the sample was displaced in a scan, for the terminal."""
+    """A line for the terminal on the displacement of the sample in a scan."""
     at = ", ".join(f"{1e3 * getattr(move, axis):+.2f}" for axis in "xyz")
     return (
         f"displaced   {at} µm along x, y, z, turned {math.degrees(move.turn):+.3f}°, magnified {move.magnification:.4f}"

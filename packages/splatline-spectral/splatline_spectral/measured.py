@@ -162,7 +162,7 @@ def counts_in(values: Any) -> Reals:
 
 
 def _order(path: Path, energies: Reals, span: tuple[float, float]) -> NDArray[np.intp]:
-    """Indices of the energies within the span, rising. DataError: an energy occurs twice."""
+    """Indices of the energies within the span, in rising order. Raises DataError if an energy occurs twice."""
     order = np.argsort(energies, kind="stable")
     order = order[(energies[order] >= span[0]) & (energies[order] <= span[1])]
     if not (np.diff(energies[order]) > 0).all():

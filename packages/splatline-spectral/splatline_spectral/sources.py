@@ -117,7 +117,7 @@ class _EnergyScan:
         return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
 
     def _counts(self, number: int, beam: bool = True, sample: bool = True) -> Reals:
-        """A frame with a standing stage, counts [row, col]; NaN: the sensor's largest count."""
+        """A frame with the stage at rest, as counts [row, col]. Pixels with the largest count of the sensor are NaN."""
         time = number * self.scan.scene.scan.period_s
         first = self.scan.frame(len(self.scan) - self.scan.views).shot
         shot = replace(
@@ -130,7 +130,7 @@ class _EnergyScan:
 
 
 def _chosen(sample: Mixture, wanted: str | None) -> str:
-    """The material to measure. ConfigError: the scene does not have it, or several are possible."""
+    """The material to measure. Raises ConfigError if the scene does not have it, or if several are possible."""
     present = {c.material.name: c.material for c in sample.constituents if c.material is not None}
     charged = [name for name, each in present.items() if each.state_of_charge is not None]
     if wanted is None and len(charged) == 1:
@@ -144,7 +144,8 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
 
 
 def _charged(sample: Mixture, name: str, charge: float) -> Mixture:
-    """The sample with another state of charge of a material. ValueError: the material has none."""
+    """The sample with another state of charge of a material. Raises ValueError if the material has no state of
+    charge."""
     constituents = [
         replace(each, material=replace(each.material, state_of_charge=charge))
         if each.material is not None and each.material.name == name
@@ -168,7 +169,7 @@ def _regions(sample: Mixture, material: str, scan: Scan) -> ContrastRegions:
 
 
 def _no_filters(name: str) -> Any:
-    raise AssertionError(f"an energy scan has no tube, and so no filter {name}")
+    raise AssertionError(f"an energy scan has no tube, and therefore no filter {name}")
 
 
 _MOST = 5000
@@ -176,7 +177,7 @@ _MOST = 5000
 
 @dataclass(frozen=True)
 class Jobs:
-    """Which curves to compute for each source.
+    """The curves to compute for each source.
 
     Attributes:
         low, high, step: keV; for a file, `low` and `high` select a part of its energies.

@@ -40,8 +40,8 @@ _STATES: dict[str, str] = {
 
 
 def device_state(values: RunValues) -> tango.DevState:
-    """State of the device: RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused or waits for a
-    decision, ON while no scan is running, FAULT after a scan that failed.
+    """State of the device. RUNNING: a scan is running. ALARM: the monitor has alarms. STANDBY: the scan is paused or
+    waits for a decision. ON: no scan is running. FAULT: the last scan failed.
     """
     return getattr(tango.DevState, _STATES.get(values.state, "ALARM" if values.alarms else "RUNNING"))
 
@@ -63,7 +63,7 @@ def latin(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class ServerPlace:
-    """Where a device is served.
+    """The address and the name of a served device.
 
     Attributes:
         address, port: where clients connect.

@@ -1,11 +1,11 @@
 """Pixel sensitivities (gains), measured together with the volume. A wrong sensitivity makes a ring.
 
-A gain is a constant offset of a pixel's line integrals in all projections. A few iterations of FISTA-TV alternate with
-the median of the residual over the projections, see `ring_offsets`. Total variation keeps rings out of the volume, and
-bodies in it. If there are no stripes (`recon.base.stripes`), nothing is measured, because the residual of a few
-iterations at edges would count as gains. Three kinds of gain are not removed. A gain near the axis looks like a body on
-the axis. A gain that pixels on both sides of the axis share looks like the wall of a can. A slow change along a row
-looks like density.
+A gain is a constant offset of a pixel's line integrals in all projections. The measurement alternates between two
+steps: a few iterations of FISTA-TV, and the median of the residual over the projections, see `ring_offsets`. Total
+variation removes rings from the volume and keeps bodies. If the projections have no stripes (`recon.base.stripes`),
+nothing is measured, because edges leave a residual after a few iterations, which would count as gains. Three kinds of
+gain are not removed. A gain near the axis looks like a body on the axis. A gain that pixels on both sides of the axis
+share looks like the wall of a can. A slow change along a row looks like density.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from recon.voxels.voxel_problem import Buffers, bytes_of
 LEAST_VIEWS, LEAST_COLS = 40, NARROWEST
 NEAR_AXIS = AT_AXIS
 
-_BAND, _HALO = 16, 4  # rows at a time; additional rows on each side, which show whether a stripe is in all rows
+# number of rows processed together; number of additional rows on each side, which show whether a stripe is in all rows
+_BAND, _HALO = 16, 4
 _ONE_IN = 6  # one in this many projections is held out
-_TV_WEIGHT = 1e-3  # three times this weight removes a sixth of a ball on the axis
+_TV_WEIGHT = 1e-3  # with three times this weight, a sixth of a ball on the axis would be removed
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
 # the mean square in held-out projections must fall to this share; see `exceeds_standard_error`
 _BETTER, _SURE = 0.99, 3.0
@@ -48,8 +49,8 @@ class LearntGains:
 
     Attributes:
         pixels: float32 [row, col]; 0 if held-out projections do not confirm them.
-        without, left: root mean square residual in held-out projections without and with the gains, in the rows with
-            most material. 0: no stripes were found, so nothing was measured.
+        without, left: root mean square residual in held-out projections, without the gains and with them, in the rows
+            with most material. Both are 0 if no stripes were found, because nothing was measured then.
         confirmed: True if held-out projections confirm the gains.
     """
 
@@ -65,15 +66,17 @@ def learn_gains(
     measured: Mask | None = None,
     progress: Callable[[int, int], object] = lambda n, of: None,
 ) -> LearntGains:
-    """Measure the pixel sensitivities, as far as held-out projections confirm them; memory: see `gains_memory`.
+    """Measure the pixel sensitivities, and keep those that held-out projections confirm. For the memory, see
+    `gains_memory`.
 
-    Rows of a parallel beam are processed in bands of 16. The bands with most material come first and decide. The time
-    is that of FISTA-TV with a given weight plus 24 iterations.
+    Rows of a parallel beam are processed in bands of 16. The bands with most material are processed first, and decide
+    whether the gains are confirmed. The computation takes as long as FISTA-TV with a given weight, plus 24 iterations.
 
     Args:
         projections: line integrals [view, row, col], finite.
         measured: bool [row, col]; None: all pixels.
-        progress: function called with the bands done and the number of bands; an exception in it ends the search.
+        progress: function called with the number of bands done and of all bands. An exception that it raises ends the
+            measurement.
 
     Raises:
         ValueError: there are fewer than 40 projections or 64 columns.
@@ -118,7 +121,7 @@ def gains_memory(geometry: Geometry) -> int:
 
 
 def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
-    """Whether some rows [view, row, col] show unequal pixel sensitivities, as far as the sample allows."""
+    """Whether some rows [view, row, col] show unequal pixel sensitivities. (A sample can hide them.)"""
     views = np.argsort(geometry.angles, kind="stable")
     rows = np.arange(0, projections.shape[1], max(1, projections.shape[1] // _LOOKED_AT))
     steady = steadiness(projections[np.ix_(views, rows)], geometry.axis_col)
@@ -126,7 +129,7 @@ def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
 
 
 def _height(geometry: Geometry) -> int:
-    """Number of rows at a time; all rows if a row does not show the same slice in all projections."""
+    """Number of rows that are processed together: all rows if a row does not show the same slice in all projections."""
     rows = geometry.detector_shape[0]
     return min(_BAND, rows) if geometry.rows_show_slices else rows
 
@@ -137,7 +140,7 @@ def _root(squares: F64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Band:
-    """Some rows of the projections [view, row, col]; `known`: bool [row, col], None: all."""
+    """Some rows of the projections [view, row, col]. `known` is bool [row, col]; None: all pixels."""
 
     data: F32
     geometry: Geometry
@@ -168,7 +171,7 @@ class _Band:
         return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
-        """[view] mean square residual of held-out projections for a volume and gains, in some rows."""
+        """[view] mean square residual of held-out projections for a volume and gains, in some of the rows."""
         residual = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
         known = None if self.known is None else np.broadcast_to(self.known, residual.shape)[:, rows]
         return np.asarray(np.average(np.square(residual[:, rows], dtype=np.float64), axis=(1, 2), weights=known))

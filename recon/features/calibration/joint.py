@@ -1,12 +1,13 @@
 """Joint fit of the volume and the geometry, by least squares on the projections.
 
-    min over (y, c)  ‖ p - A(g) x - A(g) y - J c ‖²_W        J: what a change c of the geometry does to the images of x
+    min over (y, c)  ‖ p - A(g) x - A(g) y - J c ‖²_W        J: the change of the images of x for a change c of the
+    geometry
 
-Alternating between volume and geometry would be slow if the volume can hide an error: for example, a slow drift looks
-like a slightly blurred sample. Here both are unknowns of one system, which conjugate gradients solve (Gauss-Newton; the
-geometry part of bundle adjustment). W is the ramp filter of FBP along the columns, so that AᵀWA is near the identity
-and ten steps suffice. CG starts from zero change, so it does not move in directions that the projections do not
-determine.
+An alternation between volume and geometry would be slow if the volume can hide an error of the geometry. For example, a
+slow drift looks like a slightly blurred sample. Here volume and geometry are unknowns of one system, which conjugate
+gradients solve (Gauss-Newton; the geometry part of bundle adjustment). W is the ramp filter of FBP along the columns,
+so that AᵀWA is near the identity and ten steps suffice. The conjugate gradients start from zero change. So the solution
+does not change in directions that the projections do not determine.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from recon.voxels.fbp import ramp
 from recon.voxels.projector import Projector, projection_lines
 
 TERMS = "axis", "roll", "tilt", "shifts"
-"""Column of the axis; in-plane tilt of the axis; its tilt along the beam; position (col, row) of each projection."""
+"""The quantities that may change: column of the axis, in-plane tilt of the axis, tilt of the axis along the beam, and
+position (col, row) of each projection."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class GeometryChange:
 
     @classmethod
     def between(cls, before: Geometry, after: Geometry) -> GeometryChange:
-        """The change from one geometry to another one of the same projections."""
+        """The change from one geometry to another geometry of the same projections."""
         return cls(
             after.axis_col - before.axis_col,
             float((after.roll - before.roll).mean()),
@@ -59,7 +61,7 @@ class GeometryChange:
         )
 
     def of(self, terms: frozenset[str]) -> GeometryChange:
-        """The change with only these terms."""
+        """The change, limited to these terms."""
         return GeometryChange(
             self.axis * ("axis" in terms), self.roll * ("roll" in terms), self.tilt * ("tilt" in terms),
             self.shifts * ("shifts" in terms),
@@ -81,7 +83,8 @@ class GeometryChange:
 
 
 def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
-    """Shifts [view, 2] without the part that data cannot determine, and their mean along the columns (the axis)."""
+    """Shifts [view, 2] without the part that the data cannot determine, and their mean along the columns, which is a
+    shift of the axis."""
     place = np.stack((np.ones_like(angles), np.cos(angles), np.sin(angles)), axis=1)
     solution = np.linalg.lstsq(place, shifts[:, 0], rcond=None)[0]
     rest = np.stack((shifts[:, 0] - place @ solution, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
@@ -89,14 +92,15 @@ def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
-    """Derivatives of images [view, col, row] by each quantity, per step of a pixel (for angles: at the image's edge).
+    """Derivatives of images [view, col, row] with respect to each quantity, per pixel (for angles: per pixel at the
+    image's edge).
 
     Args:
-        tilted: derivative by tilt, per radian; None: not needed.
+        tilted: derivative with respect to tilt, per radian; None: not needed.
     """
     across, down = -np.gradient(images, axis=1), -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
     by_term: dict[str, F32] = {}
-    if "axis" in terms:  # also if there are shifts, so that their mean is found in one step
+    if "axis" in terms:  # also used if there are shifts, so that one step finds their mean
         by_term["axis"] = across
     if "shifts" in terms:
         by_term |= {"col": across, "row": down}
@@ -112,12 +116,12 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
 
 
 def edge_motion(geometry: Geometry) -> float:
-    """Displacement of the image's edge by roll or tilt, in pixels per radian."""
+    """Displacement of the image's edge per radian of roll or tilt, in pixels."""
     return max(geometry.detector_shape) / 2
 
 
 def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: float) -> Geometry:
-    """The geometry after steps along `slopes` of at most `farthest` pixels, without parts that data cannot
+    """The geometry after steps along `slopes` of at most `farthest` pixels, without the parts that the data cannot
     determine."""
     limited = {name: np.clip(step, -farthest, farthest) for name, step in steps.items()}
     shifts, axis = geometry.shifts.copy(), geometry.axis_col
@@ -138,21 +142,22 @@ def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: f
     )
 
 
-_TRIAL = 0.25  # pixels at the image's edge, for the derivative by tilt
+_TRIAL = 0.25  # pixels at the image's edge, for the derivative with respect to tilt
 _MARGIN = 3  # additional slices at either end
-_FLOOR = 0.05  # share of the information in a typical projection; a projection without material is not moved
+# a projection with less than this share of the information in a typical one is not moved, because it shows no material
+_FLOOR = 0.05
 
 
 @dataclass(eq=False)
 class JointFit:
-    """A volume [y, x, z] and the geometry of some projections, improved together in steps.
+    """The state of a joint fit: a volume [y, x, z] and the geometry of some projections, improved together in steps.
 
     Attributes:
         data: [view, col, row], line integrals.
         known: [view, col, row] weights of rays; None: 1 for all.
         terms: those of `TERMS` that may change.
         volume: the best volume so far.
-        turned: the data as a detector without roll would have measured them.
+        turned: the data that a detector without roll would have measured.
     """
 
     data: F32
@@ -170,7 +175,7 @@ class JointFit:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None) -> JointFit:
-        """A fit to projections [view, row, col]."""
+        """A joint fit to projections [view, row, col]."""
         tall = taller(Grid.matching(geometry))
         rays = None if known is None else projection_lines(known)
         return cls(projection_lines(data), geometry, terms, tall, rays)
@@ -186,7 +191,7 @@ class JointFit:
 
         Args:
             rounds: number of conjugate-gradient iterations.
-            farthest: largest move of anything, in pixels.
+            farthest: largest move of any quantity, in pixels.
         """
         model = _Model(self.geometry, self.grid)
         images, free = model.forward(self.volume), dict[str, F32]()
@@ -210,8 +215,9 @@ def taller(grid: Grid) -> Grid:
 class _Model:
     """Projection of a volume [y, x, z] to images [view, col, row] without roll, and the transpose.
 
-    A tilt in a parallel beam is approximated to first order: it displaces the contribution of a voxel along the rows by
-    the voxel's depth times the tilt. So images of the volume times x and times y suffice.
+    A tilt in a parallel beam is approximated to first order: it displaces the image of a voxel along the rotation axis
+    by the voxel's depth times the tilt. So only the images of the volume times x, and of the volume times y, are
+    needed.
     """
 
     def __init__(self, geometry: Geometry, grid: Grid) -> None:
@@ -238,7 +244,7 @@ class _Model:
         return volume
 
     def by_tilt(self, volume: F32) -> F32:
-        """The derivative of the images by tilt, per radian."""
+        """The derivative of the images with respect to tilt, per radian."""
         if self.geometry.is_cone:
             trial = _TRIAL / max(self.geometry.detector_shape)
             there, back = (
@@ -260,7 +266,7 @@ def _along_rows(images: F32) -> F32:
 
 
 def _turned_back(data: F32, geometry: Geometry) -> F32:
-    """Projections [view, col, row] as a detector without roll would have measured them (cubic interpolation)."""
+    """The projections [view, col, row] that a detector without roll would have measured (cubic interpolation)."""
     out = np.empty_like(data)
     for view in range(len(data)):
         c, s = math.cos(geometry.roll[view]), math.sin(geometry.roll[view])
@@ -280,7 +286,8 @@ def _ramp(images: F32) -> F32:
 def _solved(
     model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], residual: F32, rounds: int
 ) -> tuple[F32, dict[str, F64]]:
-    """The change of the volume and of each free quantity: [view] for positions of projections, [1] for others."""
+    """The change of the volume and of each quantity that may change: [view] for positions of projections, [1] for the
+    others."""
     first = model.adjoint(weighed(residual))
     seen = model.forward(first)
     typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))

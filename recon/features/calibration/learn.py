@@ -1,8 +1,9 @@
 """learn_geometry: calibrates the geometry from the projections, coarse to fine, confirmed by held-out projections.
 
-For the confirmation, a volume from the other projections predicts the held-out ones. It uses another method and
-projector than the search (FISTA-TV with exact rays). Each held-out projection may first be shifted to where it fits
-best, for both geometries. So its own position, which was fitted to it, is no advantage: only the volumes are compared.
+For the confirmation, a volume from the other projections predicts the held-out projections. This volume is made with
+another method and projector than in the search: FISTA-TV with exact rays. For both geometries, each held-out projection
+may first be shifted to the position at which it agrees best. Otherwise the new geometry would have an advantage,
+because the position of the held-out projection was fitted to it. So only the volumes are compared.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from recon.voxels.methods import EarlyTv
 
 _ONE_IN = 4  # one in this many projections is held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
-_EDGE = 1  # rows at either end, in which rays of tilted projections leave the reconstructed slices
+_EDGE = 1  # number of rows at either end in which rays of tilted projections leave the reconstructed slices
 _SMOOTH = 4.0  # pixels
 _LEAST = 0.002  # a better geometry must lower the squared deviation by at least this share
 _SURE = 2.0  # see `exceeds_standard_error`
@@ -40,7 +41,7 @@ class Judge:
         views: float32 [view, row, col], line integrals.
         grid: grid of all volumes.
         known: [row, col] weights of pixels; None: 1 for all.
-        placed: True: each held-out projection is first shifted to where it fits best.
+        placed: True: each held-out projection is first shifted to the position at which it agrees best.
     """
 
     views: F32
@@ -49,7 +50,8 @@ class Judge:
     placed: bool
 
     def deviations(self, geometry: Geometry) -> F64:
-        """[held-out projection] root mean square residual for a volume from the other projections in this geometry."""
+        """[held-out projection] root mean square residual for a volume from the other projections, if this geometry is
+        used."""
         method, rows = EarlyTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
         weights = None if self.known is None else np.broadcast_to(self.known, self.views.shape)
         unseen, images = predicted_views(method, Views(self.views, geometry, weights), self.grid, _ONE_IN)
@@ -61,7 +63,7 @@ class Judge:
         )
 
     def _left(self, residual: F32, image: F32, known: F32) -> float:
-        """Root mean square residual of a projection after it was shifted to where it fits best."""
+        """Root mean square residual of a projection after it was shifted to the position at which it agrees best."""
         rays = _without_smooth(residual)[known > 0]
         if self.placed:
             ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
@@ -71,20 +73,21 @@ class Judge:
 
 
 def _without_smooth(image: F32) -> F64:
-    """Differences from the surroundings; this removes an air level or material outside the field, which are smooth."""
+    """Differences of pixels from their surroundings. An air level and material outside the field of view are smooth, so
+    the differences do not contain them."""
     return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
 
 
 def better(one: F64, other: F64) -> bool:
-    """Whether the first deviations [view] are significantly smaller than the second, given their scatter."""
+    """Whether the first deviations [view] are significantly smaller than the second deviations, given their scatter."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
     return bool(share.mean() > _LEAST) and exceeds_standard_error(share, _SURE)
 
 
-COLS, ROWS = 320, 96  # this many pixels suffice for the geometry; more would take longer
+COLS, ROWS = 320, 96  # this many pixels are enough to determine the geometry; more pixels would take longer
 LEAST_VIEWS = 12
 _FEWEST = 20  # fewest columns at the coarsest level
-# the axis is fitted alone first; if it is far off, single projections would move instead
+# the axis is fitted alone first; if it is wrong by much, single projections would move instead of it
 _AXIS_STEPS, _AXIS_ROUNDS = 4, 8
 _STEPS = 6, 4, 3  # Gauss-Newton steps per level, from coarse to fine
 _ROUNDS = 16  # conjugate-gradient iterations in each step
@@ -94,13 +97,13 @@ _NOTHING = 0.03  # pixels of the given projections, at the image's edge; smaller
 
 @dataclass(frozen=True, eq=False)
 class LearntGeometry:
-    """The change of a geometry by the calibration, as far as it is confirmed.
+    """Result of a calibration: the change of the geometry, as far as held-out projections confirm it.
 
     Attributes:
-        change: change in pixels of the projections; terms that were not confirmed are zero.
+        change: change in pixels of the projections. Terms that were not confirmed are zero.
         confirmed, dropped: names of terms.
-        before, after: median deviation of held-out projections from volumes of the others, before and after the
-            calibration.
+        before, after: median deviation of the held-out projections from volumes made from the other projections, before
+            and after the calibration.
     """
 
     change: GeometryChange
@@ -110,7 +113,7 @@ class LearntGeometry:
     after: float
 
     def in_words(self, binning: int = 1) -> str:
-        """The result as a sentence, in unbinned pixels."""
+        """The result as a sentence, with lengths in unbinned pixels."""
         changes = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: unchanged, because the projections show no error that matters."
@@ -148,9 +151,7 @@ def learn_geometry(
         projections: [view, row, col], line integrals; `COLS` columns and `ROWS` rows are enough.
         terms: those of `joint.TERMS` that may change.
         progress: function called with the steps done and the largest number of steps.
-        known: [row, col] weights of pixels; None: one for all.
-
-    Raises:
+        known: [row, col] weights of pixels; None: 1 for all. Raises:
         ValueError: there are fewer than twelve projections, or they show no material.
     """
     if geometry.n_views < LEAST_VIEWS:
@@ -189,7 +190,7 @@ def learn_geometry(
 
 def _factors(rows: int, cols: int) -> list[int]:
     """Binning factors of the levels, from coarse to fine."""
-    # the finest pixels are not needed to find a hundredth of a pixel
+    # binned pixels are fine enough to determine a shift to a hundredth of a pixel
     finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1
     factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
     return factors[-len(_STEPS) :] or [1]
@@ -246,7 +247,8 @@ def _confirmed(
 
 
 def _groups(terms: list[str]) -> list[list[str]]:
-    """Groups of terms that are confirmed together; axis and shifts are one, because the axis is the mean shift."""
+    """Groups of terms that are confirmed together. Axis and shifts are one group, because a shift of the axis is the
+    mean of the shifts."""
     places = [term for term in terms if term in ("axis", "shifts")]
     return [group for group in (places, *([term] for term in terms if term not in places)) if group]
 

@@ -43,7 +43,7 @@ class Sirt(VoxelMethod):
 
 @dataclass(frozen=True)
 class Sart(VoxelMethod):
-    """Simultaneous algebraic reconstruction, one projection per step in random order (Andersen & Kak 1984).
+    """Simultaneous algebraic reconstruction (SART), one projection per step in random order (Andersen & Kak 1984).
 
     The relaxation is multiplied by `decay` in each iteration. Memory: 3 volumes and 3 times the projections.
     """
@@ -68,11 +68,12 @@ class Sart(VoxelMethod):
 
 @dataclass(frozen=True)
 class Cgls(VoxelMethod):
-    """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952). The only regularisation is to stop early.
+    """Conjugate gradients on the normal equations (CGLS; Hestenes & Stiefel 1952). The only regularisation is to stop
+    early.
 
     Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about eight
-    iterations. From then on, the method needs one iteration more than exact arithmetic for the same residual.
-    Memory: 3 volumes and 3 times the projections.
+    iterations. From then on, the method needs one iteration more than it would need in exact arithmetic for the same
+    residual. Memory: 3 volumes and 3 times the projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -84,12 +85,12 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because more iterations do not improve the volume."""
+        """Empty, because more iterations do not improve the volume of this method."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector = problem.projector
-        # With other rays or weights, the directions would not be conjugate.
+        # With other rays or weights in an iteration, the directions would not be conjugate.
         decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
@@ -121,15 +122,15 @@ class AsdPocs(VoxelMethod):
     """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
     Each iteration makes one SART iteration, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times
-    as long as the change of the first SART iteration. The steps are multiplied by `alpha_decay` if they undo more than
-    `ratio` of the SART iteration and the residual is still above `goal`.
-    Memory: 5 volumes and 3 times the projections.
+    as long as the change of the first SART iteration. If the steps undo more than `ratio` of the SART iteration, and
+    the residual is still above `goal`, the length of the steps is multiplied by `alpha_decay`. Memory: 5 volumes and 3
+    times the projections.
 
     Attributes:
-        goal: relative residual ||A x - p|| / ||p|| to reach. None: 0.15 times the residual of filtered back-projection
-            (FBP or FDK). FDK cannot reconstruct a short cone scan; the goal is then 0.15 times the residual after one
-            iteration of ordered-subset SIRT. Both residuals are similar: 0.085 to 0.12 for SIRT, and 0.075 to 0.11
-            for FDK (a box in a box, 20 to 180 projections, 0 and 2 % noise).
+        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. None: 0.15 times the
+            residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone scan. For such a scan
+            the goal is 0.15 times the residual after one iteration of ordered-subset SIRT. Both residuals are similar:
+            0.085 to 0.12 for SIRT, and 0.075 to 0.11 for FDK (a box in a box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"
@@ -165,7 +166,7 @@ class AsdPocs(VoxelMethod):
             if k == 0:
                 step = self.alpha * swept
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:
-                break  # end after the step that fits the data, as published
+                break  # end after the step that fits the data, as in the publication
             before[...] = x
             smoothing = 1e-4 * decide("unit", partial(density_unit, x))
             for _ in range(self.tv_steps if smoothing > 0 else 0):
@@ -186,7 +187,7 @@ def _share(step: float, norm: float) -> float:
 
 
 def _baseline(problem: VoxelProblem) -> float:
-    """Relative residual of filtered back-projection, or of one iteration if FBP and FDK do not apply."""
+    """Relative residual of filtered back-projection, or of one iteration if FBP and FDK cannot be used."""
     projector, volume = problem.projector, problem.filtered("ram-lak")
     if volume is None:
         nz, ny, nx = projector.grid.shape

@@ -1,4 +1,5 @@
-"""The steps of the joint fits in `spectral` and `series`. Each projection sees its own weighted sum of volumes."""
+"""The steps of the joint fits in `spectral` and `series`. Each projection shows a weighted sum of volumes, with its own
+weights."""
 
 from __future__ import annotations
 
@@ -25,8 +26,9 @@ from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_
 
 _SUBSETS, _TV_STEPS = 9, 3
 _ROUNDS = 6  # power iterations
-_LEAST_SINGULAR = 1e-4  # share of the largest singular value; below it, the energies do not separate the materials
-_NOTHING = 1e-20  # largest singular value of materials that do not attenuate
+# the energies do not separate the materials if a singular value is below this share of the largest one
+_LEAST_SINGULAR = 1e-4
+_NOTHING = 1e-20  # largest singular value that counts as zero: the materials do not attenuate
 
 
 def refuse_alike(cross_sections: F64) -> None:
@@ -44,7 +46,8 @@ def refuse_alike(cross_sections: F64) -> None:
 
 @dataclass(frozen=True, eq=False)
 class EnergyViews:
-    """Projections of one sample at several energies; each sees the materials with their attenuation at its energy.
+    """Projections of one sample at several energies. A projection shows each material with its attenuation at the
+    energy of the projection.
 
     A series in time has the same mathematical form: the moments take the place of the energies, and the volumes that of
     the materials.
@@ -53,7 +56,7 @@ class EnergyViews:
         projections: line integrals, float32 [view, row, col], finite.
         geometry: geometry of all projections.
         energy: [view], index of the energy of each projection.
-        cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
+        cross_sections: float64 [energy, material], attenuation of each material at density 1, for example in 1/mm.
         weight: weight of each ray [view, row, col]; None: 1.
 
     Raises:
@@ -92,8 +95,8 @@ class EnergyViews:
         return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
 
     def parted(self, n: int) -> NDArray[np.intp]:
-        """Divide the projections into n parts, each with all energies and directions. Return the part, 0 to n - 1, of
-        each projection.
+        """Divide the projections into n parts, so that each part has projections of all energies and directions. Return
+        the number of the part, 0 to n - 1, for each projection.
 
         If there are more energies than projections in a part, neighbouring energies count as one.
         """
@@ -108,7 +111,8 @@ class EnergyViews:
 
 
 def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid]:
-    """The rows with most material, for test reconstructions, and their slices; all rows if rows do not show slices."""
+    """The rows with most material, for test reconstructions, and their slices. If a row does not show a single slice,
+    all rows are returned."""
     if not views.geometry.rows_show_slices:
         return slice(None), grid
     rows = busiest_rows(views.projections, height)
@@ -133,13 +137,14 @@ class EnergyFit:
     """The volumes of `fit_materials`, and the steps of the fit.
 
     Attributes:
-        motion: motion of the volume at each energy; None: it does not move.
+        motion: motion of the volume at each energy; None: the volume does not move.
         z: float32 [component, y, x, z].
-        subsets: subsets of the projections; each contains all energies.
+        subsets: subsets of the projections. Each subset contains all energies.
         _to, _back: conversion from densities to components and back.
         _u: U [energy, component].
-        step: 1 / L. L is a bound on the curvature of a subset: the largest eigenvalue of AᵀWA in which a projection of
-            energy e has the weight |U[e]|². It is a bound because A has no negative entry, so |A Σ U z| <= |U| A |z|.
+        step: 1 / L. L is an upper bound on the curvature of a subset: the largest eigenvalue of AᵀWA, if a projection
+            of energy e has the weight |U[e]|². L is a bound because A has no negative entry, so that |A Σ U z| <= |U| A
+            |z|.
     """
 
     views: EnergyViews
@@ -162,7 +167,9 @@ class EnergyFit:
         self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
-        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # empty projections have the residual 0
+        self._norm = (
+            math.sqrt(float(np.vdot(data, weight * data))) or 1.0
+        )  # if the projections are empty, the residual is 0
         subset = views.parted(subsets_of(views.geometry, _SUBSETS, to_the_end=False))
         self.subsets = []
         for number in range(subset.max() + 1):
@@ -189,7 +196,7 @@ class EnergyFit:
         self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
 
     def _curvature(self, subset: list[_Part]) -> float:
-        """`largest_eigenvalue` for a moving volume."""
+        """The same as `largest_eigenvalue`, for a volume that moves."""
         x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
         for _ in range(_ROUNDS):
             product = np.zeros_like(x)
@@ -207,7 +214,8 @@ class EnergyFit:
         return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
-        """Write minus the gradient of a subset at z to `out`. Returns the weighted sum of squares of its residual.
+        """Write the negative gradient of a subset at z to `out`. Return the weighted sum of squares of the residual of
+        the subset.
 
         Raises:
             StoppedError: `stop` returned True.
@@ -230,9 +238,10 @@ class EnergyFit:
         return squares
 
     def sweeps(self, weights: F64, n: int) -> Iterator[float]:
-        """n iterations from z, each of about nine steps that use all projections equally often; yields their residuals.
+        """Make n iterations, starting from z, and yield the residual of each. An iteration has about nine steps, which
+        use all projections equally often.
 
-        If a step is stopped, z is that before this step.
+        If a step is stopped, z stays as it was before this step.
         """
         _, ny, nx, nz = self.z.shape
         differences, count = difference_weights(self.grid), len(self.subsets)

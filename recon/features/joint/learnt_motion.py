@@ -1,7 +1,7 @@
 """The motion of a sample during the scan, estimated from coarse to fine voxels.
 
-If a sample only moves, one displaced volume explains all projections. So volume and motion are improved alternately,
-first on voxels so coarse that the motion is only a few of them.
+If a sample only moves, one displaced volume explains all projections. So volume and motion are improved alternately.
+The first voxels are so coarse that the motion is only a few voxels long.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from recon.voxels.displacement import Displacement, displaced, displacements, ju
 from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 
-_COARSEST = 12  # least number of voxels across at the first level; in each following level, voxels are half as wide
-_FINE = 96  # up to this many pixels across, the last level has one voxel per pixel; beyond, one per two pixels
-_TURNS = 6, 4, 2  # turns at the first levels; later levels have the last number
-SWEEPS_OF_TURN = 6  # iterations in a turn; they continue from the previous turn
-_KNOTS, _CONTROLS = 3, 3  # control points of the motion: in time, and along each axis
+_COARSEST = 12  # smallest number of voxels across at the first level; at each following level, voxels are half as wide
+# up to this many pixels across, the last level has one voxel per pixel; with more pixels, one voxel per two pixels
+_FINE = 96
+_TURNS = 6, 4, 2  # number of alternations at each level; further levels have the last number
+SWEEPS_OF_TURN = 6  # iterations in an alternation; they continue from the volume of the previous one
+_KNOTS, _CONTROLS = 3, 3  # number of control points of the motion: in time, and along each axis
 _HEAVIER = 2.0  # factor on the weight of total variation, because one volume for all times has less detail
 JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of the test volumes that decide about motion, and their iterations
 _BLOCKS, _ONE_BLOCK_IN = 32, 4  # blocks in time; one in this many is held out (eight blocks)
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
-    """Voxel size in pixels and number of turns for each resolution level, for `cols` pixels across."""
+    """Voxel size in pixels and number of alternations for each resolution level, if the detector has `cols` columns."""
     last = 1 if cols <= _FINE else 2
     widths = [last]
     while cols // (2 * widths[0]) >= _COARSEST:
@@ -47,7 +48,7 @@ class OfMoments(NamedTuple):
     """Projections of a changing sample, each assigned to a moment.
 
     Attributes:
-        views: each `energy` is a moment, each material a volume (knot in time).
+        views: the projections. Here, each `energy` is a moment, and each material is a volume at one time (a knot).
         times: [moment] time within the scan, 0 to 1.
         weights: weights of total variation for the components of the densities.
     """
@@ -60,14 +61,15 @@ class OfMoments(NamedTuple):
 def unseen_squares(
     coarse: OfMoments, fine: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> F64 | None:
-    """Squared residual of held-out projections for volumes without and with motion: [2, block]; None if stopped.
+    """Squared residual of held-out projections for volumes without and with motion, [2, block]; None if the computation
+    was stopped.
 
-    It is relative to the mean of the projections' own squares.
+    The residual is divided by the mean of the squared projections.
 
-    Successive projections are held out in blocks. If angles rise with time, volumes in time could predict a single
-    projection from those before and after it, even for a moving sample. The motion is estimated from the other
-    projections in `coarse` moments. Volumes of coarse voxels are fitted to them in `fine` moments, within which the
-    sample hardly moves.
+    Blocks of successive projections are held out. If angles rise with time, a single held-out projection could be
+    predicted from the projections before and after it, even if the sample moves and the volumes do not. The motion is
+    estimated from the other projections in `coarse` moments. Volumes of coarse voxels are fitted to them in `fine`
+    moments, within which the sample hardly moves.
 
     Args:
         coarse, fine: the same projections, in few and in many moments.
@@ -114,11 +116,12 @@ def _residual_squares(views: EnergyViews, densities: F32, motion: Motion | None,
 def learnt_motion(
     of_moments: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> Motion | None:
-    """Estimate the motion on the voxels of `Grid.matching`; None if stopped.
+    """Estimate the motion on the voxels of `Grid.matching`; None if the computation was stopped.
 
     Args:
-        go_on: called with (-n, residual) after each iteration; n is the number that remain. False ends it.
-        stop: called many times within an iteration; True ends it.
+        go_on: called with (-n, residual) after each iteration; n is the number of remaining iterations. False ends the
+            computation.
+        stop: called many times within an iteration; True ends the computation.
     """
     views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]

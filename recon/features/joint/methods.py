@@ -17,24 +17,25 @@ from recon.base.setting import Count, NonNegative, Setting
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
 
-_VOLUMES, _FIELDS = 8, 12  # volumes in memory: per volume of the result; for displacements and displaced volumes
+# number of volumes in memory: for each volume of the result; for displacements and displaced volumes
+_VOLUMES, _FIELDS = 8, 12
 # copies of the line integrals: lines, a held-out part, moments, binned projections, weights, and their copy
 _COPIES = 6
 
 
 @dataclass(frozen=True)
 class TimeSeries(Series):
-    """Volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
+    """Reconstructs volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
-        volumes: number of volumes, 2 or more, from the first projection to the last; each needs at least twelve
-            projections.
-        moves: True: the sample also moves; False: only densities change. None: held-out projections decide.
+        volumes: number of volumes, 2 or more, from the time of the first projection to that of the last. Each volume
+            needs at least twelve projections.
+        moves: True: the sample also moves. False: only densities change. None: held-out projections decide between the
+            two.
         sweeps: number of iterations of the fit.
         weight: weight of total variation, `tv_weight` of `fit_series`; None: held-out projections decide.
 
-    Raises:
-        ValueError: other values.
+    Raises: ValueError: `volumes` is below 2, or another value is not allowed.
     """
 
     name: ClassVar[str] = "series"
@@ -48,7 +49,7 @@ class TimeSeries(Series):
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if problem.grid != Grid.matching(problem.geometry):
-            raise ValueError("a series is reconstructed on the grid of its projections; do not give a grid")
+            raise ValueError("do not give a grid: a series is reconstructed on the grid that matches its projections")
         n, times = problem.geometry.n_views, problem.use.times
         times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
@@ -82,7 +83,8 @@ class TimeSeries(Series):
 
 @dataclass
 class _History:
-    """Progress of a fit: iterations of tests, which count down to 0, and iterations of the fit, which are recorded."""
+    """Reports and records the progress of a fit. Iterations of tests count down to 0; iterations of the fit are
+    recorded in the history."""
 
     sweeps: int
     n_views: int
@@ -114,7 +116,7 @@ class _History:
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
     ) -> Reconstruction:
         """The reconstruction with this history."""
-        if not self.of_sweeps:  # it was stopped before the first iteration
+        if not self.of_sweeps:  # the fit was stopped before its first iteration
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
 
@@ -132,17 +134,18 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
         data = np.where(weights > 0, data, np.float32(0))
     if not data.max() > 0:
         raise ValueError(
-            "these projections show no material: no line integral that is finite and has a weight is above 0"
+            "these projections show no material: expected a line integral above 0 that is finite and has a weight "
+            "above 0"
         )
     return data, weights
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
-    """Text on how held-out projections chose between rest and motion, with advice if they hardly differ."""
+    """Text on how held-out projections decided whether the sample moves, with advice if the residuals hardly differ."""
     judged = f"the residual in held-out projections is {still:.4g} without motion and {moved:.4g} with motion"
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, because {judged}"
     return (
-        "no motion, because the lower residual with motion may be chance: "
-        f"{judged}. If the sample moved, make a second volume with --moves and compare the two"
+        "if the sample moved, make a second volume with --moves and compare the two. This volume has no motion, "
+        f"because the lower residual with motion may be chance: {judged}"
     )

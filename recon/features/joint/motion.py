@@ -3,9 +3,9 @@
     x(r, t) = Σ_k h_k(t) d_k(r + u(r, t)),    u(r, t) = Σ_m s_m(t) Σ_c B_c(r) a_mc
 
 h_k are hat functions in time; s_m and B_c are natural cubic splines through a few knots. u is 0 in the middle of the
-scan, so d is the sample at that time. The control points a come from Gauss-Newton steps. In each step, the projected
-gradients of the volume along u are fitted to the residual of the projections. (Zang et al. 2018, ACM Trans. Graph. 37,
-138, use optical flow between volumes.)
+scan, so d describes the sample at that time. The control points a come from Gauss-Newton steps. In each step, the
+projected gradients of the volume along u are fitted to the residual of the projections. (Zang et al. 2018, ACM Trans.
+Graph. 37, 138, use optical flow between volumes.)
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ A = TypeVar("A", F32, F64)
 
 MIDDLE = 0.5  # the time within the scan at which u is 0
 _STEPS = 8  # conjugate-gradient iterations
-# weight of differences between neighbouring control points, divided by the typical curvature of a control point
+# weight that penalises differences between neighbouring control points, divided by the typical curvature of a control
+# point
 _SMOOTH = 0.03
-_SMALL = 1e-3  # the same for the control points themselves
+_SMALL = 1e-3  # the same for the values of the control points
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ class Motion:
         return _spline(self.times, knots) - _spline(np.array([MIDDLE]), knots)
 
     def at(self, time: int, control: F64 | None = None) -> F32:
-        """The displacement u [3, y, x, z] at a time; `control`: other control points, if given."""
+        """The displacement u [3, y, x, z] at a time. `control` replaces the control points, if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
         some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
         wide = np.einsum("yp,dpqr->dyqr", y, some)
@@ -82,7 +83,7 @@ class Motion:
 def _spline(times: F64, knots: int) -> F64:
     """Natural cubic splines through `knots` evenly spaced knots in 0 to 1, [place, knot].
 
-    For two knots they are straight lines, for one knot the constant 1.
+    With two knots the splines are straight lines; with one knot, the spline is the constant 1.
     """
     if knots == 1:
         return np.ones((times.size, 1))
@@ -96,7 +97,7 @@ def _spline(times: F64, knots: int) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Projections at one time, as [view, col, row]; `weight` None: all weights 1."""
+    """Projections at one time, as [view, col, row]. If `weight` is None, all weights are 1."""
 
     time: int
     projector: Projector
@@ -105,7 +106,8 @@ class Seen:
 
 
 def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
-    """Minus the gradient of half the weighted squares by the control points, and the derivatives of W x by u."""
+    """The negative gradient of half the weighted squares with respect to the control points, and the derivatives of W x
+    with respect to u."""
     right, slope = np.zeros_like(motion.control), list[F32]()
     for part in seen:
         u, x = motion.at(part.time), image(part.time)
@@ -138,7 +140,7 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
     def normal(control: F64) -> F64:
         return curved(control) + typical * _rough(control)
 
-    step = np.zeros_like(right)  # few iterations find large motions first
+    step = np.zeros_like(right)  # with few iterations, large motions are found first
     conjugate_gradients(normal, right - typical * _rough(motion.control), step, _STEPS)
     return Motion(motion.shape, motion.times, motion.control + step)
 
@@ -149,7 +151,8 @@ def weighed(lines: F32, weight: F32 | None) -> F32:
 
 
 def _rough(control: F64) -> F64:
-    """Gradient of half the weighted squares of the differences between neighbours in space, and of the values."""
+    """Gradient of half the weighted squares of two quantities: differences between neighbours in space, and the values
+    themselves."""
     out = _SMALL * control
     for axis in (2, 3, 4):
         wide = [(0, 0)] * 5
@@ -161,10 +164,10 @@ def _rough(control: F64) -> F64:
 def conjugate_gradients(
     normal: Callable[[A], A], residual: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
 ) -> None:
-    """Conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve `found` in place.
+    """Make conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve the solution `found` in place.
 
     Args:
-        left: the right side minus `normal` of the solution so far; overwritten.
+        left: the right side of the equations, minus `normal` of the present solution. It is overwritten.
         go_on: called before each iteration; False ends it.
     """
     of_kind = found.dtype.type
@@ -181,7 +184,7 @@ def conjugate_gradients(
 
 
 def moved(x: F32, u: F32 | None) -> F32:
-    """The displaced volume W x (see `recon.kernels.cpu.warp`); x itself if there is no motion."""
+    """The displaced volume W x (see `recon.kernels.cpu.warp`). Without motion, x itself."""
     if u is None:
         return x
     out = np.empty_like(x)
@@ -190,7 +193,7 @@ def moved(x: F32, u: F32 | None) -> F32:
 
 
 def moved_back(y: F32, u: F32 | None) -> F32:
-    """The transpose Wᵀ y; y itself if there is no motion."""
+    """The transpose Wᵀ y. Without motion, y itself."""
     if u is None:
         return y
     out = np.empty_like(y)

@@ -28,17 +28,17 @@ from recon.features.joint.motion import conjugate_gradients
 from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
-# first λ, divided by the mean curvature of the projections; ratio to the next λ; number of tests
+# first λ, divided by the mean curvature of the projections; ratio of the next λ to it; number of tests
 _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
 _IN_TIME = 0.03  # τ
-SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # conjugate-gradient iterations of the solution and of a test
+SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
-"""Largest number of iterations of all tests."""
+"""Largest number of iterations of all tests and of the solution together."""
 
 
 @dataclass
 class Countdown:
-    """Reports to a listener how many steps may remain, and records whether the listener ended them."""
+    """Reports to a listener how many steps may remain, and records whether the listener has ended the steps."""
 
     go_on: Callable[[int], bool]
     left: int
@@ -58,7 +58,8 @@ class Countdown:
 
 @dataclass(frozen=True, eq=False)
 class Proportions:
-    """The least-squares problem of this module. Volumes [y, x, z], factors [k, y, x, z], projections [view, col, row].
+    """The least-squares problem of this module. Volumes are [y, x, z], factors [k, y, x, z], projections [view, col,
+    row].
 
     Attributes:
         projector: projector of all projections.
@@ -67,7 +68,7 @@ class Proportions:
         matter: f.
         data: q.
         weight: w.
-        stop: called many times in each step; True ends it with the factors before the step.
+        stop: called many times in each step. True ends the computation, with the factors from before the step.
     """
 
     projector: Projector
@@ -105,7 +106,7 @@ class Proportions:
         return out
 
     def explained(self, lines: F32) -> F32:
-        """The transpose of `shown`, for weighted lines."""
+        """The transpose of `shown`, applied to weighted projections."""
         out = np.zeros((self.shares.shape[1], *self.matter.shape), np.float32)
         for projector, own, shares in self._each_kind():
             back = self.matter * projector.adjoint_lines(self.weight[own] * lines[own])
@@ -114,7 +115,7 @@ class Proportions:
         return out
 
     def left(self, factors: F32) -> F64:
-        """Weighted squares [view] of the residual for these factors."""
+        """Weighted sum of squares [view] of the residual for these factors."""
         residual = self.data - self.shown(factors)
         return np.einsum("vij,vij,vij->v", self.weight, residual, residual, dtype=np.float64)
 
@@ -138,7 +139,7 @@ class Proportions:
         return np.ones((self.shares.shape[1], *self.matter.shape), np.float32)
 
     def solved(self, smooth: float, factors: F32, go_on: Callable[[], bool], steps: int = SOLUTION_STEPS) -> F32:
-        """Conjugate-gradient iterations, starting from given factors.
+        """Factors after conjugate-gradient iterations that start from given factors.
 
         Args:
             smooth: λ divided by the mean curvature of the projections.
@@ -157,11 +158,12 @@ class Proportions:
 
 
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
-    """The `smooth` for which the projections of `fit` predict those of `judge` best, and the residual in these.
+    """The value of `smooth` with which the projections of `fit` predict the projections of `judge` best, and the
+    residual in the projections of `judge`.
 
-    It starts with a large value and is reduced until the prediction is worse twice. The largest value that predicts as
-    well as the best one (within one standard error of the difference over the projections of `judge`) is chosen
-    (Breiman et al. 1984, section 3.4.3).
+    The search starts with a large value and reduces it until the prediction has been worse twice. It then chooses the
+    largest value that predicts as well as the best one: within one standard error of the difference over the
+    projections of `judge` (Breiman et al. 1984, section 3.4.3).
 
     Args:
         first: factors to start with.
@@ -183,7 +185,8 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
     return _HEAVIEST, math.inf
 
 
-_ROWS, _DEEPEST = 16, 7.0  # rows of test reconstructions; line integral from which on all rays have equal weight
+# number of rows of a test reconstruction; line integral above which all rays have equal weight
+_ROWS, _DEEPEST = 16, 7.0
 STEPS = TRIAL_STEPS + SOLUTION_STEPS
 
 
@@ -197,15 +200,15 @@ def fit_share(
     """Fit the densities of two states of one material again. The sum of both densities does not change; the fraction of
     each state becomes smooth in space.
 
-    Held-out projections (one in eight, some rows) choose how smooth it is. Memory: ten volumes, six times the
-    projections.
+    Held-out projections (one in eight, on some rows) decide how smooth the fraction is. Memory: ten volumes, six times
+    the projections.
 
     Args:
         found: result of `fit_materials` from the same projections.
         states: indices of the two materials.
-        go_on: called before each of at most `STEPS` steps, with the number of steps that may still follow. If it
-            returns False, the fit ends with the densities so far.
-        stop: called many times within a step. If it returns True, the fit ends at once, with the densities so far.
+        go_on: function called before each of at most `STEPS` steps, with the number of steps that may still follow. If
+            it returns False, the fit ends with the densities reached so far. stop: function called many times within a
+            step. If it returns True, the fit ends at once, with the densities reached so far.
 
     Raises:
         ValueError: `states` are not two different materials.
@@ -245,7 +248,7 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
 
 
 def _even(problem: Proportions) -> F32:
-    """The single share for the whole sample that explains the mean of the projections best."""
+    """The share of each state, the same in the whole sample, that explains the mean of the projections best."""
     one = problem.ones()
     all_explained = float(problem.explained(problem.shown(one)).sum(dtype=np.float64))
     mean = float(problem.explained(problem.data).sum(dtype=np.float64)) / (all_explained or 1)

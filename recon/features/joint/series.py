@@ -1,8 +1,8 @@
 """Time series: joint fit of volumes at several times of a changing sample, with linear change in between.
 
-The projections of a short time are too few for a volume, and one volume from all projections shows a sample that never
-existed. So one fit determines the volumes of all times from all projections, with total variation of their common part
-and of their differences.
+A short part of the scan has too few projections for a volume, and one volume from all projections shows a sample that
+never existed. So one fit determines the volumes of all times from all projections. Total variation acts on the common
+part of the volumes and on their differences.
 """
 
 from __future__ import annotations
@@ -33,17 +33,20 @@ from recon.features.joint.spectral import weight_of, weights_by_views
 from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
-MOMENTS = 64  # largest number of moments between two knots; projections of one moment count as simultaneous
-_MOTION_MOMENTS = 16  # moments of the scan for estimating the motion, which is smooth in time
+MOMENTS = 64  # largest number of moments between two knots; the projections of one moment are treated as simultaneous
+_MOTION_MOMENTS = 16  # number of moments into which the scan is divided to estimate the motion, which is smooth in time
 _SURE = 2.0  # standard errors over eight held-out blocks, see `exceeds_standard_error`; 4 % false alarms
-_LESS = 0.95  # motion or factors are accepted if they lower the squared residual in held-out projections to this share
-_ROWS = 16  # rows in the test of factors
-_TRIALS = 24 * 13  # iterations for the weights on these rows; 24 * 11 for usual data, 24 * 16 at most
-_TURN = 4  # time of the steps of a motion in units of iterations, in addition to its own iterations
-_FACTORS = 120, 60  # time of factors in units of iterations: tests (in addition to the fit), and solution
+# motion or factors are accepted if they lower the squared residual in held-out projections at least to this share
+_LESS = 0.95
+_ROWS = 16  # number of rows in the test of factors
+_TRIALS = 24 * 13  # number of iterations that choose the weights on these rows; 24 * 11 for usual data, 24 * 16 at most
+_TURN = 4  # time of the steps of a motion, in units of iterations, in addition to the iterations for the motion
+# time of the factors in units of iterations: of their tests (in addition to the fit), and of their solution
+_FACTORS = 120, 60
 SWEEPS = 60
-LEAST_VIEWS = 12  # projections per volume; held-out projections must also see it
-# fewest projections that are nearer to a volume than to any other (end volumes have projections on one side only)
+LEAST_VIEWS = 12  # smallest number of projections per volume; some of them are held out
+# smallest number of projections that are nearer in time to one volume than to any other (the first and the last volume
+# have projections on one side only)
 _LEAST_NEAR = 6
 
 
@@ -54,7 +57,7 @@ class TimedViews:
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
         geometry: geometry of all projections.
-        times: float64 [view], time of each exposure; any unit and origin.
+        times: float64 [view], time of each exposure, in any unit and from any origin.
         weight: weight of each ray [view, row, col]; None: 1.
 
     Raises:
@@ -80,7 +83,7 @@ class TimedViews:
 
 @dataclass(frozen=True, eq=False)
 class TimedVolumes:
-    """A changing volume: linear between knots in time, optionally with motion.
+    """A changing volume: it changes linearly between knots in time, and may also move.
 
     Attributes:
         times: float64 [knot], in the unit of the projections' times, evenly spaced from the first projection to the
@@ -89,9 +92,9 @@ class TimedVolumes:
             applied. `at` gives the displaced volume.
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
-        motion: for each voxel, the displacement to the place from which it takes its value; None: nothing moves.
-        unseen_residuals: residuals in held-out projections, first without motion, then with motion, both from coarse
-            volumes; None if held-out projections did not decide about motion.
+        motion: for each voxel, the displacement to the place from which the voxel takes its value; None: nothing moves.
+        unseen_residuals: residuals of coarse volumes in held-out projections: without motion, and with motion. None:
+            held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
             factors. None: each volume is fitted separately.
     """
@@ -105,7 +108,7 @@ class TimedVolumes:
     smooth: float | None = None
 
     def at(self, time: float) -> F32:
-        """The volume [z, y, x] at a time; before the first and after the last knot it is constant."""
+        """The volume [z, y, x] at a time. Before the first knot and after the last knot, the volume does not change."""
         before = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
         if self.motion is None:
             return before
@@ -115,7 +118,8 @@ class TimedVolumes:
 
 
 def hats(times: ArrayLike, knots: F64) -> F64:
-    """Weights [time, knot] for linear interpolation between evenly spaced knots; constant beyond the ends."""
+    """Weights [time, knot] for linear interpolation between evenly spaced knots. Beyond the first and the last knot,
+    the weights are constant."""
     place = np.interp(np.atleast_1d(times), knots, np.arange(knots.size))
     return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
 
@@ -138,19 +142,22 @@ def fit_series(
     h_k are hat functions, so the volume is linear in time between knots. W displaces the volume, smoothly in space and
     time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the problem of
     `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the orthonormal
-    components of all volumes x_k; the first one is their common part. If nothing moves, and if it predicts held-out
-    projections better, the volumes become the mean volume times smooth factors. Smooth factors suit a sample of
-    particles, if each particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` are as in
-    `fit_materials`. There are four tests: of the weights, of whether the sample moves, of the motion, and of the
-    factors. In each of them, `go_on` gets a countdown that ends at 0. After the iterations, `go_on` gets a countdown of
-    the steps that fit the factors. If you end these steps early, the result is the volumes without factors.
+    components of all volumes x_k; the first one is their common part. If nothing moves, the function also tries the
+    mean volume times smooth factors. It returns these volumes if they predict held-out projections better. Smooth
+    factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps, memory,
+    `go_on` and `stop` are as in `fit_materials`. There are four tests: of the weights, of whether the sample moves, of
+    the motion, and of the factors. During each test, `go_on` gets a countdown that ends at 0. After the iterations,
+    `go_on` gets a countdown of the steps that fit the factors. If you end these steps early, the result is the volumes
+    without factors.
 
     Args:
         knots: number of volumes, 2 or more.
-        motion: True: also estimate the motion. None: only if it predicts held-out projections better. It helps for a
-            sample that settles. If only the densities of the sample change, motion that does not exist is found.
-        tv_weight: μ of all components. It is scaled so that, if the sample does not change, it equals the weight for
-            one volume from all projections. None: the weight that predicts held-out projections best.
+        motion: True: also estimate the motion. None: use the motion only if it predicts held-out projections better.
+            Motion helps for a sample that settles. If only the densities of the sample change, the estimate shows
+            motion that does not exist.
+        tv_weight: μ of all components. The scale is that of one volume: for a sample that does not change, the value
+            has the same effect as the same weight for one volume from all projections. None: the weight that predicts
+            held-out projections best.
 
     Raises:
         ValueError: a volume has fewer than twelve projections, or fewer than six projections are nearer in time to this
@@ -197,7 +204,8 @@ def _motion(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> tuple[Motion | None, tuple[float, float] | None]:
-    """The motion of the sample, and the residuals in held-out projections without and with motion, if these decided."""
+    """The motion of the sample; and, if held-out projections decided about motion, their residuals without and with
+    it."""
     unseen = None
     if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
         wanted = _moves(*squares)
@@ -207,12 +215,14 @@ def _motion(
 
 
 def _moves(still: F64, moved: F64) -> bool:
-    """Whether the sample moves, from squared residuals [block] of held-out projections without and with motion."""
+    """Whether the sample moves, decided with the squared residuals [block] of held-out projections without and with
+    motion."""
     return exceeds_standard_error(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
-    """The volumes as their mean times smooth factors; unchanged if the steps are stopped."""
+    """The volumes, replaced by their mean times smooth factors. If the steps are stopped, the volumes stay
+    unchanged."""
     stop, problem = fit.stop, _of_factors(fit.views, made.volumes, made.grid, fit.stop)
     steps = Countdown(lambda after: go_on(-after, made.residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
@@ -224,7 +234,8 @@ def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callab
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
-    """The problem of factors of the mean volume; rays with low intensity behind the mean have less weight."""
+    """The problem of finding the factors of the mean volume. Rays that are strongly attenuated by the mean volume have
+    less weight."""
     projector, matter = Projector(views.geometry, grid), volume_lines(volumes.mean(0))
     weight = weight_of(np.exp(-projector.forward_lines(matter)))
     if views.weight is not None:
@@ -242,9 +253,9 @@ def smooth_factors(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> float | None:
-    """The best smoothness of the factors; None if separate volumes predict held-out projections as well.
+    """The best smoothness of the factors; None if separate volumes predict held-out projections equally well.
 
-    It is found on some rows, from seven of eight projections.
+    The search uses some rows, and fits to seven of eight projections.
     """
     rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
@@ -274,7 +285,8 @@ def refuse_few(knots: int, n: int) -> None:
 
 
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
-    """The projections in at most `most` moments of equal size, and the times of these moments in the scan, 0 to 1."""
+    """The projections, divided into at most `most` moments of equal size, and the times of these moments within the
+    scan, 0 to 1."""
     n = views.geometry.n_views
     moments = min(most, n)
     moment = np.empty(n, np.intp)

@@ -1,7 +1,7 @@
 """Spectral reconstruction: joint fit of the density of each material to projections at several energies.
 
-The attenuation at an energy is a sum over materials with known cross sections. So no energy needs a complete set of
-projections: the projections of all energies together determine the few volumes of the materials.
+The attenuation at an energy is a sum over materials with known cross sections. The projections of all energies together
+determine the few volumes of the materials. So no energy needs a complete set of projections.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 
-# rows and iterations of a test of weights, which starts with the volumes of the previous test
+# number of rows and of iterations of a test of weights, which starts with the volumes of the previous test
 TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8
-_LITTLE, _LEAST = 0.1, 0.1  # share of the open-beam intensity; smallest weight of a ray
-_AVERAGED = 1.5  # pixels over which line integrals are averaged
+# share of the open-beam intensity below which rays have lower weights; smallest weight of a ray
+_LITTLE, _LEAST = 0.1, 0.1
+_AVERAGED = 1.5  # number of pixels over which line integrals are averaged
 _FIRST = 0.1  # the first weight, divided by the largest gradient at zero
 ALIKE_LONGER = 3  # factor on the iterations, because volumes at different times differ more than materials
 _TRIALS = 12  # tests of one weight for all components, each half of the previous one
 _HEAVIER = 4  # tests of a larger weight for all except the first component, each twice the previous one
 _AS_WELL = 1.01  # weights whose residual is within this factor of the smallest count as equally good
 MATERIAL_SWEEPS = 20
-TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # largest number for all tests
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # largest number of iterations of all tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,8 @@ class Materials:
     """Densities of materials.
 
     Attributes:
-        densities: float32 [material, z, y, x], 0 or more, in the density unit of the cross sections.
+        densities: float32 [material, z, y, x], 0 or more, in the unit in which the cross sections are stated for
+            density 1.
         grid: grid of each volume.
         weights: weights of total variation, one for each component (see `fit_materials`).
         residual: norm of the residual of the projections, divided by the norm of the projections.
@@ -50,11 +52,11 @@ class Materials:
     residual: float
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
-        """The density of a material divided by the sum of its density and those of the others, [z, y, x], 0 to 1; for
-        example the state of charge.
+        """The density of a material, divided by the sum of the densities of this material and the others, [z, y, x], 0
+        to 1. An example is the state of charge.
 
         Args:
-            least: voxels with a lower summed density get NaN.
+            least: smallest sum of densities. Voxels with a smaller sum get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)
@@ -78,21 +80,20 @@ def fit_materials(
 
     U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
     projections). The densities are V S⁻¹ z. U has orthonormal columns. Therefore all components z_k have the same
-    noise, and the fit is as well conditioned as a fit to projections at a single energy. An iteration takes as long as
-    one with the same number of projections at a single energy. Steps are those of `ordered_fista`; after each step,
+    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as an iteration
+    with the same number of projections at a single energy. The steps are those of `ordered_fista`. After each step,
     densities below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to
-    spectra in one step.)
-    Memory: seven volumes per material, three times the projections.
+    spectra in one step.) Memory: seven volumes per material, three times the projections.
 
     Args:
         grid: grid of the volumes; None: that of the geometry.
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
-        sweeps: number of iterations, each of about nine steps that use all projections equally often.
-        go_on: called with (iteration, residual) after each iteration. During the test reconstructions for the weights
-            the first argument is -n, where n is the number of iterations that may still follow (`TRIAL_SWEEPS` at
-            most). False ends the fit with the volumes so far.
-        stop: called many times within an iteration, from the second step on. True ends the fit with the volumes before
-            the current step.
+        sweeps: number of iterations. An iteration has about nine steps, which use all projections equally often.
+        go_on: function called with (iteration, residual) after each iteration. During the test reconstructions for the
+            weights, the first argument is -n; n is the number of iterations that may still follow (`TRIAL_SWEEPS` at
+            most). If it returns False, the fit ends with the volumes reached so far.
+        stop: function called many times within an iteration, from the second step on. If it returns True, the fit ends
+            with the volumes from before the current step.
     """
     check_arguments(fit_materials, locals())
     warn_of_other_quantity(views.projections)
@@ -110,11 +111,11 @@ def weight_of(transmission: F32) -> F32:
 
 
 def _weighed(views: EnergyViews) -> EnergyViews:
-    """The projections with lower weights (down to a tenth) for rays below a tenth of the open-beam intensity.
+    """The projections, with lower weights (down to a tenth) for rays below a tenth of the open-beam intensity.
 
-    The reason: their noise is larger, and the logarithm of few counts is biased. The mean line integral around a ray
-    decides. Given weights above a tenth of the largest count as equal, because a wider range of weights would need more
-    iterations.
+    Such rays have more noise, and the logarithm of few counts is biased. The intensity of a ray is computed from the
+    mean line integral around the ray. Given weights above a tenth of the largest weight count as equal, because a wider
+    range of weights would need more iterations.
     """
     there = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
     transmission = np.empty_like(there)
@@ -128,7 +129,8 @@ def _weighed(views: EnergyViews) -> EnergyViews:
 
 
 class _Trials:
-    """Test reconstructions for the weights of total variation [component]; each starts with the previous volumes.
+    """Test reconstructions for the weights of total variation [component]. Each test starts with the volumes of the
+    previous test.
 
     Attribute `going`: True as long as `go_on` and `stop` have not ended a test.
     """
@@ -147,7 +149,8 @@ class _Trials:
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """Residual in held-out projections, infinite if the test was stopped; `after`: tests that may still follow."""
+        """Residual in held-out projections; infinite if the test was stopped. `after` is the number of tests that may
+        still follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
@@ -160,7 +163,8 @@ class _Trials:
         return self._judge.residual_of(self._fit.densities())
 
     def common(self, after: int) -> F64:
-        """One weight for all components, halved until the prediction is worse twice; if stopped, the best so far."""
+        """The best single weight for all components: the weight is halved until the prediction has been worse twice. If
+        the tests are stopped, the best weight so far."""
         weights = np.full(len(self._fit.z), _FIRST * self._fit.steepest())
         best, least, worse = weights, math.inf, 0
         for trial in range(1, 1 + _TRIALS):
@@ -174,7 +178,8 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """The largest weights, in powers of `factor`, that predict as well as the best; `weights` if stopped."""
+        """The largest weights, in powers of `factor`, that predict as well as the best weights. If the tests are
+        stopped, `weights`."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:
@@ -195,8 +200,8 @@ def weights_by_views(
     """Weights of total variation [component], chosen with one in eight projections held out.
 
     First, one weight for all components is halved until the prediction gets worse. Then the components that contain
-    differences get the largest weight that predicts within 1 % of the best, because they have less structure and the
-    same noise.
+    differences get the largest weight whose residual is within 1 % of the smallest, because these components have less
+    structure and the same noise.
 
     Args:
         alike: True: all components keep the same weight.

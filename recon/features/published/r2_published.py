@@ -17,9 +17,9 @@ _STEPS = 30_000
 def published_fit() -> FitSettings:
     """The published weights, learning rates and limits.
 
-    Three differences remain. Widths have a lower bound in pixels instead of a sigmoid. Total variation does not move
-    centres (in the published code it has no effect on them either). A Gaussian ends at 3σ of its ellipse instead of a
-    square of tiles.
+    Three differences from the published code remain. Widths have a lower bound in pixels instead of a sigmoid. Total
+    variation does not move centres (in the published code it has no effect on them either). A Gaussian ends at 3σ of
+    its ellipse. In the published code it ends at a square of tiles.
     """
     policy = DensityPolicy(
         start=500 / _STEPS, stop=0.5, every=100, threshold=5e-5, large=0.1, prune_below=1e-5, growth=10.0,

@@ -96,7 +96,8 @@ def activate(
 def activation_backward(
     quaternions: F32, raw: F32, unit: float, d_rotations: F32, d_densities: F32, d_quaternions: F32, d_raw: F32
 ) -> None:
-    """Gradients of quaternions [n, 4] and raw densities [n] from those of rotations [n, 9] and densities [n]."""
+    """Gradients of quaternions [n, 4] and raw densities [n], computed from the gradients of rotations [n, 9] and
+    densities [n]."""
     n, two, four = raw.shape[0], _f(2), _f(4)
     raws, d_dense, out = raw.reshape(1, n), d_densities.reshape(1, n), d_raw.reshape(1, n)
     for task in prange((n + _TASK - 1) // _TASK):

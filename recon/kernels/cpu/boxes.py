@@ -48,7 +48,7 @@ def is_upright(table, i, row0):
 
 @njit(inline="always", fastmath=True)
 def span_of(table, i, dy, col0, col1):
-    """Columns of one row that lie within the footprint: (first, last + 1), inside its box."""
+    """Columns of one row that lie within the footprint: (first, last + 1), inside the box of the footprint."""
     reach = table[i, HV] * np.sqrt(table[i, KV])
     half = np.sqrt(max(reach * reach - table[i, KV] * dy * dy, _f(0)) / table[i, K]) + _f(0.5)
     middle = table[i, U] + table[i, SHEAR] * dy

@@ -1,13 +1,13 @@
 """Cone-beam projector and its adjoint: Joseph's interpolation, sixteen rows or slices at once (numba, threaded).
 
 All rays to one column of the detector lie in one plane parallel to the rotation axis, so they share their path in x and
-y. In every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is sampled
-once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row].
+y. In every plane of voxels that these rays cross, the rays of successive rows meet a line of slices at equal steps. A
+ray is sampled once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row].
 
-Sixteen rows cross at most 32 neighbouring slices, and sixteen slices at most 32 rows; their values are picked from
-these (see `picks`). If the steps are longer, fewer rows or slices are processed at once. Tiles of the volume remain in
-the cache, as in `cpu.joseph`. The transpose uses the same weights and runs tile by tile, so that no two threads write
-to the same voxel.
+Sixteen rows cross at most 32 neighbouring slices, and sixteen slices at most 32 rows. The kernels pick values from
+these 32 (see `picks`). If the steps are longer, fewer rows or slices are processed at once. Tiles of the volume remain
+in the cache, as in `cpu.joseph`. The transpose uses the same weights and runs tile by tile, so that no two threads
+write to the same voxel.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _f = np.float32
 _WIDTH = lanes.WIDTH
 _BLOCK = 64  # largest number of rows or slices of one job
 _ZEROS = 2 * _WIDTH + 2  # zeros around a line, so that values picked there are 0
-_LEAST = 1e-3  # slices per row; no sample is nearer to the source
+_LEAST = 1e-3  # slices per row; no sample with a smaller step exists, because it would be nearer to the source
 
 # Columns of the table of views. At line y and x of voxels one row is CLIMB + CLIMB_Y y + CLIMB_X x slices high. This,
 # divided into SIDE + SIDE_Y y + SIDE_X x, gives columns from MIDDLE_COL. z = 0 is at row MIDDLE and slice HEIGHT.
@@ -75,7 +75,8 @@ def _columns(view, y0, y1, x0, x1, cols):
 
 @njit(cache=True)
 def _slices(views, row0, row1, y0, y1, x0, x1, nz):
-    """Slices first..end (excluded) of a tile that rows row0..row1 (excluded) see, and the zeros before them."""
+    """Slices first..end (excluded) of a tile that the rays of rows row0..row1 (excluded) cross, and the zeros before
+    them."""
     bottom, top = math.inf, -math.inf
     for v in range(len(views)):
         low, high, _, _ = _box(views[v], y0, y1, x0, x1)
@@ -87,7 +88,8 @@ def _slices(views, row0, row1, y0, y1, x0, x1, nz):
 
 @njit(cache=True)
 def _room(views, row0, row1, shape):
-    """Largest number of slices of a tile that rows row0..row1 (excluded) see, with zeros: an odd number of Lanes."""
+    """Largest number of slices of a tile that the rays of rows row0..row1 (excluded) cross, with zeros: an odd number
+    of Lanes."""
     most = 0
     for y0 in range(0, shape[0], TILE):
         for x0 in range(0, shape[1], TILE):

@@ -128,7 +128,8 @@ class RenderedView:
     rays: CpuRays | None
 
     def backward(self, gradient: F32) -> F32:
-        """Back-propagate an image gradient [row, col] to `into`; returns the gradient of centres [n, 2] in pixels."""
+        """Back-propagate an image gradient [row, col] and add the result to `into`; returns the gradient of centres [n,
+        2] in pixels."""
         a, into, table = self.active, self.into, self.scratch.table
         centres = np.empty((len(into.densities), 2), np.float32)
         under = moments(table, gradient, self.scratch.moments, a.kernel)

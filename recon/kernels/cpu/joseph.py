@@ -31,7 +31,7 @@ _GROUP = 16  # projections that share one pass over the volume
 _ENOUGH = 4  # blocks per thread above which one remaining block costs little
 TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
 EDGE = TILE + 2
-_FLAT = 1e-9  # lines per plane; a ray with a smaller step stays on its line
+_FLAT = 1e-9  # lines per plane; a ray with a smaller step is treated as staying on its line
 
 CALL = 2**28
 """Approximate number of samples in one call of a kernel.
@@ -131,7 +131,7 @@ def tile_of(axis, y0, y1, x0, x1):
     """How rays cross a tile: planes j0..j1 (excluded), and lower lines low0..low1 (excluded) of the samples that touch
     it.
 
-    Also the rows of the tile from plane to plane and from line to line, and the row of the first sample."""
+    It also returns the rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:
         return y0, y1, x0 - 1, x1, EDGE, 1, EDGE
     return x0, x1, y0 - 1, y1, 1, EDGE, 1
@@ -231,7 +231,7 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, 
 def shares(views: int, nz: int) -> tuple[int, int]:
     """Projections and slices of one job, so that all threads have work and a pass serves many projections."""
     threads, blocks = get_num_threads(), -(-nz // _BLOCK)
-    if blocks % threads == 0 or blocks >= _ENOUGH * threads:  # the blocks of slices are enough work for all threads
+    if blocks % threads == 0 or blocks >= _ENOUGH * threads:  # the blocks of slices alone give all threads work
         return -(-views // -(-views // _GROUP)), _BLOCK
     rounds = -(-views // (_GROUP * threads))
     group = -(-views // (rounds * threads))

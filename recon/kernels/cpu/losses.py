@@ -24,8 +24,7 @@ class DataTerm(NamedTuple):
 
     L1: |x - y|.   L2: (x - y)² / 2δ.   POISSON: e^(-depth y) (x - y)² / 2δ, the second-order expansion of the
     likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). A y
-    below 0 (transmission above 1) gets the weight of y = 0, because otherwise a few such pixels would outweigh all
-    others.
+    below 0 (transmission above 1) gets the weight of y = 0; otherwise a few such pixels would outweigh all others.
     """
 
     kind: int
@@ -44,7 +43,8 @@ def gaussian_window(sigma: float = 1.5) -> F32:
 
 @njit(inline="always", fastmath=True)
 def _columns(start, cols, width):
-    """Sixteen columns for the block at `start`: the first, and the lanes (low, high) not in the block before."""
+    """Sixteen columns for the block at `start`: the first column, and the lanes (low, high) that are not in the block
+    before."""
     first = min(start, width - lanes.WIDTH)
     return first, start - first, cols - first
 

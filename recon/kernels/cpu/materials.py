@@ -3,9 +3,10 @@
     z = (Σ_k P_k c_k E_k + Σ_i Q_i d_i y) / (Σ_k P_k c_k + Σ_i Q_i d_i)
 
 y is the voxel's value, c_k its likelihood under material k, E_k = m_k + kept_k (y - m_k) its mean given y, and d_i the
-likelihood of a partial voxel between the materials i and i + 1, which is one over their gap whatever its value.
-Probabilities follow from the neighbours: f_k is the share of material k, by the value alone, blurred by a Gaussian of
-one voxel; Q_i = least + (most - least) min(1, 4 f_i f_{i+1}) and P_k = max(1 - Σ Q, 0.05) f_k + 0.01.
+likelihood of a partial voxel between the materials i and i + 1. d_i is one divided by the gap between both materials,
+for any value of the voxel. Probabilities follow from the neighbours: f_k is the share of material k, by the value
+alone, blurred by a Gaussian of one voxel; Q_i = least + (most - least) min(1, 4 f_i f_{i+1}) and P_k = max(1 - Σ Q,
+0.05) f_k + 0.01.
 
 Volumes are [a, b, c]. A thread takes a block of lines along c, with two lines around it.
 """
@@ -20,7 +21,8 @@ from numba import njit, prange
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 BLUR = (0.40262, 0.244201, 0.0544886)
-"""Weights of a voxel, its first and its second neighbour along an axis: a Gaussian of one voxel, truncated there."""
+"""Weights of a voxel, its first and its second neighbour along an axis: a Gaussian of one voxel, truncated after the
+second neighbour."""
 LEAST_OF_MATERIALS, LEAST_OF_EACH = 0.05, 0.01
 _BLOCK, _SHORTEST = 2**15, 8  # approximate number of voxels of a block; least number of lines of its sides
 _f = np.float32
@@ -139,7 +141,7 @@ def posterior_mean(x: F32, table: MaterialTable, out: F32, probabilities: F32 | 
 
     Args:
         probabilities: [K, a, b, c], replaced by the posterior probability of each material; the rest up to one is the
-            probability of a partial voxel. None: they are not needed.
+            probability of a partial voxel. None: the caller does not need them.
     """
     wide = max(_SHORTEST, min(x.shape[1], round((_BLOCK / x.shape[2]) ** 0.5)))
     tall = max(_SHORTEST, min(x.shape[0], _BLOCK // (x.shape[2] * wide)))

@@ -39,8 +39,8 @@ def nonnegative_mix(z: F32, back: F64, to: F64) -> None:
     """Replace components z [component, ...] by nearby components whose densities are 0 or more.
 
     One round of coordinate descent from max(D, 0) on |to (d - D)|², d >= 0, where D = back z. If a density is raised to
-    0, the others become lower, so that the sum that projections see changes little. Voxels with D >= 0 do not change,
-    bit for bit.
+    0, the others become lower, so that the sum, which determines the projections, changes little. Voxels with D >= 0 do
+    not change, bit for bit.
 
     Args:
         back: [material, component], from components to densities.

@@ -4,10 +4,10 @@ The kernels for many slices process sixteen slices at once; for one slice, fifte
 rays lie in the plane of the slice: a parallel beam, or a fan. Slices are [y, x], projections [view, col]. A ray is
 sampled once in every line of voxels across its axis, as the table of `cpu.joseph` says.
 
-Sixteen neighbouring lines form a band. In a band, lines are shifted by whole voxels so that rays of one direction are
-upright, and then transposed. The sixteen samples of a ray are then between four rows of the band. Rays of a fan form
-groups with about the same direction. The transpose reads the same weights band by band, so that no two threads write to
-the same voxel.
+Sixteen neighbouring lines form a band. The kernel shifts the lines of a band by whole voxels so that rays of one
+direction are upright, and then transposes the band. The sixteen samples of a ray are then between four rows of the
+band. Rays of a fan form groups with about the same direction. The transpose reads the same weights band by band, so
+that no two threads write to the same voxel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from recon.kernels.cpu.joseph import F64, Flags, calls
 
 _f = np.float32
 _BAND = lanes.WIDTH
-_ALIKE = 1 / 16  # voxels per line; rays of a group differ by less, so that they stay within one voxel in a band
+# voxels per line; the slopes of rays of a group differ by less, so these rays stay within one voxel of each other in a
+# band
+_ALIKE = 1 / 16
 _BEFORE, _BEHIND = 2 * _BAND, 4 * _BAND  # zeros around a line
 
 

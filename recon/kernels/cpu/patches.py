@@ -68,7 +68,7 @@ def _values(p, base, step):
 
 @njit(inline="always", fastmath=True)
 def _shrink(found, sums, size, plane, threshold):
-    """The blocks whose first plane is `plane`: `found` [4 size, 16] to `sums`, both by plane modulo 4."""
+    """Adds the blocks whose first plane is `plane`, `found` [4 size, 16], to `sums`. Both use the plane modulo 4."""
     p0, p1, p2, p3 = (plane & 3) * size, (plane + 1 & 3) * size, (plane + 2 & 3) * size, (plane + 3 & 3) * size
     for m in range(size):
         a, b, c, d = (
@@ -92,7 +92,8 @@ def _shrink(found, sums, size, plane, threshold):
 
 @njit(fastmath=True, error_model="numpy", cache=True)
 def _column(given, out, share, first, end, at, line, depth, threshold, found, sums):
-    """Sixteen columns of blocks, from planes `first` to `end` of their first voxels; `at`: of the first, in a plane."""
+    """Sixteen columns of blocks, with first voxels in planes `first` to `end`; `at`: position of the first column in a
+    plane."""
     size = EDGE * depth
     counts = lanes.load(share, 0, at)
     for m in range(EDGE * size):
@@ -119,7 +120,8 @@ def _column(given, out, share, first, end, at, line, depth, threshold, found, su
         if depth > 1:
             for j in range(EDGE):
                 _values(sums, slot + j * depth, 1)
-        # The last voxel of a block first, so that a voxel sums its blocks in the same order wherever a vector begins.
+        # The last voxel of a block comes first, so that a voxel sums its blocks in the same order, whatever the first
+        # voxel of a vector.
         for j in range(EDGE - 1, -1, -1):
             for k in range(depth - 1, -1, -1):
                 to, row = at + j * line + k, slot + j * depth + k

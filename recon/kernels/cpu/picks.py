@@ -1,8 +1,8 @@
 """picks: reads sixteen numbers from a line of an array, each lane at its own position.
 
 Lanes pick from a window with twice as many neighbours as lanes. With AVX-512, sixteen lanes share a window, and a pick
-is one instruction. With AVX2, eight lanes share a window, which begins where the first lane picks. On other processors,
-numbers are read one by one.
+is one instruction. With AVX2, eight lanes share a window, which begins at the pick of the first lane. On other
+processors, numbers are read one by one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _lanes_per_window(context: Any) -> int:
 
 
 def _pick_sixteen(context: Any, builder: Any, numbers: Loader, at: Any, further: Any, near: bool) -> Any:
-    """The numbers at + further, from their window. Lanes that are `near` step by at most NEAR_STEP."""
+    """The numbers at + further, picked from their window. If `near`, lanes step by at most NEAR_STEP."""
     offset = ir.IntType(64)
     if _lanes_per_window(context) == _HALF:
         halves = [_pick_eight(builder, numbers, at, further, first, near) for first in (0, _HALF)]

@@ -23,7 +23,7 @@ from recon.kernels.cpu.joseph import F64, calls
 _f = np.float32
 _COLS = 16  # columns of one job
 _FLAT = 1e-15  # voxels per row; with a smaller step, a line of samples stays at its position
-_LEAST = 0.05  # least share of the run across the planes, relative to that in the middle of a column
+_LEAST = 0.05  # least share of the run across the planes, relative to the run in the middle of a column
 
 Axes = NDArray[np.int8]
 
@@ -32,8 +32,9 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     """The path of the rays of every column: float64 [view, col, 12], and the axis across its planes, int8 [view, col].
 
     The axis is 0 for planes of constant y, 1 for x, 2 for z. The other two are (x, z), (y, z) or (y, x), in this order.
-    In plane j the ray to a row is at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row) of the first one. Of the second
-    one t4 to t7 say the same. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
+    In plane j the ray to a row is at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row) of the first one. For the
+    second one, t4 to t7 replace t0 to t3. The path of the ray from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1
+    + t8 row) mm.
 
     Raises:
         ValueError: rays of one column differ so much that they do not cross the same planes.

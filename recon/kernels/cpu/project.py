@@ -4,8 +4,8 @@
     M₀ = Σ g G,   M₁ = Σ g D ε,   M₂ = Σ g D εεᵀ,   ε = (τ, δv),   D = ∂G / ∂E, which is G itself for a Gaussian
 
 with δ the offset in pixels and g the gradient of the image. Every Gaussian gathers its own gradient, without atomics. τ
-is the offset along a row from the axis of a slanted footprint. With moments of δ itself, the thin side of a needle
-would be a small difference of large sums.
+is the offset along a row from the axis of a slanted footprint. With moments of δ itself, the moment of the thin side of
+a needle would be a small difference of large sums.
 
 E is a parabola along a column, so G follows from the row above by two products, with factors that are the exponentials
 of E's first and second difference:
@@ -13,9 +13,9 @@ of E's first and second difference:
     G(δv + 1) = G(δv) Q(δv),   ln Q = k r (r - 2 (δu - r δv)) + l (2 δv + 1)
     Q(δv + 1) = Q(δv) q,       ln q = 2 (k r² + l)
 
-Errors grow with the rows, so G is computed directly after every `ANCHOR` rows. A long slanted footprint may start so
-far down its flank that float32 underflows. If the first row would begin below exp(-DEEPEST), the exponential is
-computed for every pixel of the footprint.
+Errors grow with the rows, so G is computed directly after every `ANCHOR` rows. In the first row of a long slanted
+footprint, G may be so small that float32 underflows. If the first row would begin below exp(-DEEPEST), the exponential
+is computed for every pixel of the footprint.
 
 A compact kernel (`recon.base.kernel`) has G = t^p with t = (1 + 2 E / R²)₊ and D = 2 p / R² t^(p - 1): p = 2 in an
 image, p = 3/2 in a slice of voxels. It needs no exponential: t follows from the row above by two sums.
@@ -41,8 +41,9 @@ from recon.kernels.cpu.footprints import KV, SHEAR, K, U, V, W
 _f = np.float32
 ANCHOR = 16  # rows of one recurrence; the error stays below 1e-5 of the footprint's weight
 MANY = 512  # footprints in one sum
-# What a footprint is made of, a constant of each compiled kernel: exp(-q/2); of a compact kernel its image, t², or the
-# kernel itself, t^(3/2). None, as numba leaves out what `is None` excludes before it compiles the rest.
+# The profile of a footprint, a constant of each compiled kernel: exp(-q/2); for a compact kernel its image, t², or the
+# kernel itself, t^(3/2). One value is None, because numba removes branches that `is None` excludes before it compiles
+# the others.
 GAUSSIAN, SHADOW, COMPACT = None, 1, 2
 _PER = np.float32(1 / Kernel.COMPACT.radius**2)
 _SHADOW_SLOPE = np.float32(2 * (Kernel.COMPACT.exponent + 0.5) / Kernel.COMPACT.radius**2)  # 2 p / R²
@@ -104,7 +105,7 @@ def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):
 
 @njit(inline="always", fastmath=True)
 def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):
-    """Fill moments [i] from the lanes' sums; with Σ g D as a seventh for a compact kernel in a slice."""
+    """Fill moments [i] from the sums of the lanes; a compact kernel in a slice has Σ g D as a seventh moment."""
     if profile is None:
         lanes.store_first(moments, i, 0, lanes.totals((m0, mt, mv, mtt, mtv, mvv)), 6)
     elif profile == SHADOW:
@@ -202,7 +203,7 @@ def _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient):
 
 @njit(inline="always", fastmath=True)
 def _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profile):
-    """As `_column_gaussian`, of a compact kernel, D without its factor."""
+    """The same as `_column_gaussian` for a compact kernel, with D without its factor."""
     m0, s0, s1, s2 = lanes.zero(), lanes.zero(), lanes.zero(), lanes.zero()
     for anchor in range(row0, row1, ANCHOR):
         t, change, bend = _start_compact(table, i, dx, _f(anchor) - table[i, V])

@@ -5,15 +5,15 @@ With H = S⁻¹Rᵀ, t from the source to the centre and D along the ray of a pi
     V = ρ sqrt(2π) |D| / |H D| exp(-1/2 |H t x H D|² / |H D|²)
 
 As a function of the offset δ of the pixel from that of the centre, it is the affine footprint with three more numbers.
-At the depth of the centre, H D = e + y with e = H t and y linear in δ. The part of y across e is what the footprint's
-quadratic form N = δᵀKδ measures, its part along e is α·δ. So
+At the depth of the centre, H D = e + y with e = H t and y linear in δ. The quadratic form of the footprint, N = δᵀKδ,
+is the square of the part of y across e. The part of y along e is α·δ. So
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   η = 1 / |e|²,   α = η (e·Hu, e·Hv) tz / f
 
-with W, K from `cpu.footprints`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All of these are
-sums of squares, which are also accurate for thin Gaussians. Rays with N / Q <= c² pass within c standard deviations.
-They fill an ellipse, which limits the columns of each row. If the Gaussian reaches the plane of the source, whole rows
-are computed.
+with W, K from `cpu.footprints`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All these values
+are sums of squares, which are accurate for thin Gaussians, too. Rays with N / Q <= c² pass within c standard
+deviations. They fill an ellipse, which limits the columns of each row. If the Gaussian reaches the plane of the source,
+whole rows are computed.
 
 A compact kernel has (1 - N / (R² Q))₊² in place of the exponential and ends at c² = R².
 
@@ -57,7 +57,8 @@ A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
 
 @njit(inline="always", fastmath=True)
 def _decay(x):
-    """e^x for x <= 0, to 4e-6: e^(x / 32) by its series, squared five times. np.exp would prevent vectorisation."""
+    """e^x for x <= 0, accurate to 4e-6: e^(x / 32) by its series, squared five times. np.exp would prevent
+    vectorisation."""
     t = max(x, _f(-40)) * _f(1 / 32)
     p = _f(1 / 120) + t * _f(1 / 720)
     p = _f(1) + t * (_f(1) + t * (_f(0.5) + t * (_f(1 / 6) + t * (_f(1 / 24) + t * p))))

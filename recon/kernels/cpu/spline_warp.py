@@ -22,7 +22,8 @@ _SIXTH = _f(1 / 6)
 
 @njit(inline="always")
 def _taps(at, size, index, share, slope):
-    """Numbers, shares and derivatives of the shares of the four coefficients around a place; of one if size is 1."""
+    """Numbers, shares and derivatives of the shares of the four coefficients around a place (of one coefficient if size
+    is 1)."""
     for e in range(4):
         index[e], share[e], slope[e] = 0, _f(0), _f(0)
     if size == 1:

@@ -27,7 +27,8 @@ def _weighted_sum(x: F32, places: NDArray[np.int64], shares: F32, out: F32) -> N
 
 
 def weighted_sum(x: F32, stencil: F32, out: F32) -> None:
-    """out[j, i, k] = Σ stencil[a, b] x[j + a - middle, i + b - middle, k]; beyond the edge, x is that at the edge.
+    """out[j, i, k] = Σ stencil[a, b] x[j + a - middle, i + b - middle, k]; beyond the edge, x has the value at the
+    edge.
 
     Args:
         stencil: [odd, odd]; its zeros cost nothing.

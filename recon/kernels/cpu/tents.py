@@ -2,8 +2,8 @@
 
     (Tᵀ x)[a, b] = Σ w(y, a) w(x, b) x[y, x],    T c = the linear interpolation of c between the centres of cells
 
-w is a tent (a triangular weight) about the centre of a cell, as wide as two cells. The outer half of the outer cells
-belongs only to these cells, so that the weights of a voxel add up to one. Lines along z are not changed.
+w is a tent (a triangular weight) about the centre of a cell, with the width of two cells. Voxels in the outer half of
+an outer cell belong only to this cell, so that the weights of a voxel add up to one. Lines along z are not changed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def tent_sums(x: F32, width: int) -> F32:
     ny, nx, nz = x.shape
     (first_y, share_y), (first_x, share_x) = tents(ny, width), tents(nx, width)
     rows = cells_of(ny, width)
-    # The voxels whose tents are those of cells a - 1 and a begin at begin[a]; those of a end at begin[a + 2].
+    # Voxels that lie in the tents of cells a - 1 and a begin at begin[a]; voxels in the tent of a end at begin[a + 2].
     begin = np.searchsorted(first_y, np.arange(-1, rows + 1)).astype(np.int64)
     out = np.empty((rows, cells_of(nx, width), nz), np.float32)
     _sums(x, first_y, share_y, first_x, share_x, begin, out)

@@ -80,7 +80,7 @@ def _dual_piece(p0, p1, p2, near0, far0, near1, far1, here, after, s0, s1, s2):
 def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, s2):
     """The differences that belong to the voxels of plane v: from u `near` to `far` at `pair`, and within `here`."""
     p0, p1, p2, last, back = pa[pair], pb[v], pc[v], pa.shape[1] - nc, back1 * nc
-    # The difference from the last row is 0, and stays so. It belongs to the last row or, with back1, to the first.
+    # The difference from the last row is 0 and remains 0. It belongs to the last row or, with back1, to the first row.
     first = 0 if back1 else last
     row, after, low = slice(first, first + nc), slice(first + 1, first + nc + 1), slice(last, last + nc)
     u = here[low]
@@ -104,7 +104,7 @@ def _dual_step(
     s0, s1 = _f(pace) * w0, _f(pace) * w1
     s2 = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
     s2[nc - 1 :: nc] = _f(0)
-    # The first plane of each run, before another thread changes the dual fields that it depends on.
+    # Compute the first plane of each run, before another thread changes the dual fields on which this plane depends.
     for run in prange(runs):
         _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):

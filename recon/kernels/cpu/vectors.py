@@ -12,7 +12,7 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
 _RUN = 4096  # values that are summed in float32 before they are added to the float64 sum
-_PARTS = 64  # parts of a sum; independent of the number of threads, so that results are, too
+_PARTS = 64  # number of parts of a sum; it does not depend on the number of threads, so results do not either
 
 
 @njit(**OPTIONS)
@@ -127,5 +127,5 @@ def _extrapolate(x: F32, factor: float, last: F32, start: F32) -> None:
 
 
 def extrapolate(x: F32, factor: float, last: F32, start: F32) -> None:
-    """x += factor (x - last), and `last` becomes x before that, `start` x after it."""
+    """x += factor (x - last); `last` becomes x before the update, and `start` becomes x after it."""
     _extrapolate(x.reshape(-1), factor, last.reshape(-1), start.reshape(-1))

@@ -7,8 +7,8 @@ With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squar
 
 At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as in `cpu.project`.
 
-A compact kernel is t^(3/2), t = 1 + 2 E / R²: with t_z that of δz alone, the slice at δz is the footprint of k / t_z
-and l / t_z with weight t_z^(3/2).
+A compact kernel is t^(3/2), t = 1 + 2 E / R². If t_z is t for δz alone, the slice at δz is the footprint of k / t_z and
+l / t_z with weight t_z^(3/2).
 
 The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g D ε and N₂ = Σ g D εεᵀ with D as in `cpu.project` and
 ε = (τ, δy', δz). δz is measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In
@@ -38,13 +38,15 @@ from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, add_shap
 from recon.kernels.cpu.project import COMPACT, GAUSSIAN, add_footprint, gather_footprint
 
 _f = np.float32
-_SLAB = 4  # slices per task: few enough that all threads have work on a 32-voxel cube, enough to keep rows in the cache
+# slices per task: the number is small, so that all threads have work on a 32-voxel cube, but large enough to keep rows
+# in the cache
+_SLAB = 4
 _TASK = 1024  # Gaussians per task of the search
 _SHARE = 16  # Gaussians per task of the backward pass
 # Columns of the table, besides K, SHEAR and KV of the footprints. They are centre, shift of the centre per slice, 1 /
 # Σzz, half widths of the middle slice over the reach, reach in standard deviations.
 _X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
-_FARTHEST = 1e30  # keeps float32 from infinity
+_FARTHEST = 1e30  # prevents infinity in float32
 _PER = np.float32(1 / Kernel.COMPACT.radius**2)
 _SLOPE = 8  # in a piece: the weight of D in a slice of a compact kernel
 

@@ -42,7 +42,7 @@ def _seen(x, y, z, axes, focal, sod):
 
 @njit(inline="always", fastmath=True)
 def _path(x, y, axes, ax, ay, g, travel):
-    """e of a centre in px, and its change along the beam."""
+    """e of a centre in px, and the change of e along the beam."""
     along = axes[2, 1] * x - axes[2, 0] * y
     eu = travel * g * (axes[0, 1] * x - axes[0, 0] * y - ax * along)
     ev = travel * g * (axes[1, 1] * x - axes[1, 0] * y - ay * along)
@@ -136,7 +136,7 @@ def _backward(
 
 
 def widen(table: F32, means: F32, camera: RayCamera, faint: float, cut: float, kernel: Kernel) -> None:
-    """Convert footprints of rays without a width to those with the width of the camera.
+    """Convert footprints of rays without a width to footprints of rays with the width of the camera.
 
     Arguments as for `footprints`.
     """

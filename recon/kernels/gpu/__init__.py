@@ -1,9 +1,9 @@
 """Kernels for CUDA devices (Triton and torch) with the operations of the CPU kernels; imported only if a GPU is used.
 
-They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
-sums the Gaussians in its list, and a Gaussian sums the gradient in its footprint. So there are no atomics, and the same
-input gives bit-identical results. If TRITON_INTERPRET=1 is set in the environment before the first import, the same
-kernels run slowly on the CPU, for tests.
+They work on contiguous float32 torch tensors. A result gathers its sum, and no two programs write to one value: an
+image tile or a brick of voxels sums the Gaussians in its list, and a Gaussian sums the gradient in its footprint. So
+there are no atomics, and the same input gives bit-identical results. If TRITON_INTERPRET=1 is set in the environment
+before the first import, the same kernels run slowly on the CPU, for tests.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class GpuStep:
         return graph
 
     def _load(self, inputs: StepInputs) -> None:
-        """Copy the values that differ between steps to where the graph reads them."""
+        """Copy the values that differ between steps to the arrays from which the graph reads them."""
         plan = self.plan
         variation = inputs.tv_weight / max(1, neighbours(plan.box.shape)) if plan.box is not None else 0.0
         numbers = np.concatenate(

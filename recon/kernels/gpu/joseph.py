@@ -43,7 +43,7 @@ _HIGH = 32  # largest number of neighbouring rows: a cache line
 _DEEP = 64  # largest number of slices in a tile of voxels
 _FLAT = tl.constexpr(1e-6)  # lines per plane; such a ray stays on its line to 1e-3 of 2048
 _LEAST = tl.constexpr(1e-6)  # slices per row; a ray with less, or with the opposite direction, is outside the box
-_EDGE = tl.constexpr(0.01)  # lines beyond the box that are also checked; more than rounding can move a ray
+_EDGE = tl.constexpr(0.01)  # lines beyond the box that are also checked; rounding moves a ray by less
 _MARGIN, _SCALE = 0.01, 1.001  # margin and factor for columns and rows, against rounding
 _WHOLE = 1e-6  # slices; rows this close to a slice count as lying on it
 
@@ -88,7 +88,7 @@ class JosephRays:
         level = views[:, cone.HEIGHT] - rise * views[:, cone.MIDDLE]
         off = max(abs(rise - 1) * geometry.detector_shape[0], np.abs(level - np.rint(level)).max())
         on_slices = not geometry.is_cone and bool(off < _WHOLE)
-        if on_slices:  # exactly, so that rounding gives no row a weight on another slice
+        if on_slices:  # exactly 1, so that rounding gives no row a weight on another slice
             views[:, cone.HEIGHT], views[:, cone.MIDDLE], table[..., joseph.RISE] = np.rint(level), 0.0, 1.0
         near = _near(views, grid.shape)
         cols, rows = min(near[0], steep.shape[1]), min(1 if on_slices else near[1], geometry.detector_shape[0])

@@ -111,7 +111,8 @@ def _activation_backward(
 def activation_backward(
     quaternions: Tensor, raw: Tensor, unit: float, d_rotations: Tensor, d_densities: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of quaternions [n, 4] and raw densities [n] from those of rotations [n, 9] and densities [n]."""
+    """Gradients of quaternions [n, 4] and raw densities [n], computed from the gradients of rotations [n, 9] and
+    densities [n]."""
     n = raw.shape[0]
     d_quaternions, d_raw = torch.empty_like(quaternions), torch.empty_like(raw)
     if n > 0:

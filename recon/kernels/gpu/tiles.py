@@ -1,7 +1,7 @@
 """tile_lists: lists of the Gaussians that touch each image tile or brick of voxels, made by counting and one sort.
 
 A pixel is a sum, so any order within a tile is correct; a stable sort makes it the same in every run. The host needs
-only one number, the length of the lists. It reads the length from the device, or uses that of a `Room`.
+only one number, the length of the lists. It reads the length from the device, or uses the length of a `Room`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ def _tile_of_pairs(
 
 @triton.jit(do_not_specialize=["pairs", "halvings"])
 def _starts(tiles, starts, pairs, halvings, n_tiles, BLOCK: tl.constexpr):
-    """For each tile, the first of the sorted pairs that does not belong to an earlier tile, int32 [n_tiles + 1]."""
+    """For each tile, the index of the first sorted pair that does not belong to an earlier tile, int32 [n_tiles +
+    1]."""
     tile = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     low, high = tl.zeros((BLOCK,), tl.int32), tl.zeros((BLOCK,), tl.int32) + pairs
     for _ in range(halvings):

@@ -97,7 +97,7 @@ def tent_sums(x: Tensor, width: int) -> Tensor:
 
 
 def _summed(x: Tensor, axis: int, width: int) -> Tensor:
-    """Sums with tents along one axis, of one voxel of each cell at a time."""
+    """Sums with tents along one axis; each step adds one voxel of each cell."""
     n = x.shape[axis]
     count, (first, share) = cells_of(n, width), tents(n, width)
     size = list(x.shape)
@@ -225,7 +225,8 @@ def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: 
         given = x.index_select(0, places[0][first : end + _BEYOND])
         for axis in axes[1:]:
             given = given.index_select(axis, places[axis])
-        # A voxel sums its blocks in the order of their first plane, wherever a part of the planes begins.
+        # A voxel sums its blocks in the order of their first planes, so the result does not depend on the first plane
+        # of a part.
         for at, value in reversed(list(enumerate(_shrunk(given, axes, limit, True)))):
             sums[first + at : end + at] += value
     torch.mul(sums[_BEYOND : na + _BEYOND], 16.0 ** -len(axes), out=out)

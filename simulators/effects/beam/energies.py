@@ -10,20 +10,20 @@ from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Positive, Share
 from simulators.frame.shot import Image, Shot
 
-PHOTOELECTRIC = 3.0**-3  # Attenuation at three times the energy over that at the energy itself
+PHOTOELECTRIC = 3.0**-3  # Attenuation at three times the energy, divided by the attenuation at the energy itself
 
 
 @dataclass(frozen=True)
 class Harmonics(ImageEffect):
-    """exp(-d') = (1 - share) exp(-d) + share exp(-ratio d), for a sample given by its attenuation.
+    """exp(-d') = (1 - share) exp(-d) + share exp(-ratio d), for a sample that is defined by its attenuation.
 
     A crystal that reflects E from its planes (111) reflects 3E from (333). Photoelectric absorption falls as E^-3
-    between edges (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3), hence the ratio of 1/27.
-    For a sample of materials give the beam its harmonics instead: then each material has its true attenuation at both.
+    between edges (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3), so the ratio is 1/27. For a
+    sample of materials, give the beam its harmonics instead: then each material has its true attenuation at both
+    energies.
 
     Attributes:
-        share: of the detected photons of the open beam, 0 ... 1.
-        ratio: of the two attenuations, 0 ... 1.
+        share: share of the detected photons of the open beam, 0 ... 1. ratio: ratio of the two attenuations, 0 ... 1.
     """
 
     share: Share
@@ -43,7 +43,8 @@ class Harmonics(ImageEffect):
 
 @dataclass(frozen=True)
 class BeamHardening(ImageEffect):
-    """exp(-d') = sum of w_k exp(-r_k d), with sum w_k = 1 and sum w_k r_k = 1, for a sample given by its attenuation.
+    """exp(-d') = sum of w_k exp(-r_k d), with sum w_k = 1 and sum w_k r_k = 1, for a sample that is defined by its
+    attenuation.
 
     The sample's attenuation is the mean over the spectrum, so that d' = d for a thin sample and d' < d for a thick one.
     The cost is one exponential of the image for each energy. For a sample of materials give the beam a spectrum
@@ -51,9 +52,9 @@ class BeamHardening(ImageEffect):
 
     Attributes:
         weights: shares of the detected photons of the open beam; only their proportions count.
-        energies: keV; attenuation goes as E^-3, as photoelectric absorption does between edges (Als-Nielsen &
-            McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3).
-        ratios: the attenuations at the energies, in any unit, in place of the energies.
+        energies: keV; the attenuation is proportional to E^-3, like photoelectric absorption between edges (Als-Nielsen
+            & McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3).
+        ratios: the attenuations at the energies, in any unit; they replace the energies.
     """
 
     weights: tuple[NotNegative, ...]

@@ -17,11 +17,12 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class BeamBend(ImageEffect):
-    """A change of the beam in the projections: -log of each ray's light changes by level + drift t + Σ curvature x².
+    """A change of the beam in the projections: -log of the intensity of each ray changes by level + drift t + Σ
+    curvature x².
 
     x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t is in s since the
-    camera was connected. Flats and darks do not change. If the value is negative, the projections have more light than
-    the flats predict.
+    camera was connected. Flats and darks do not change. If the value is negative, the projections have a higher
+    intensity than the flats predict.
 
     Attributes:
         curvature: (horizontal, vertical), value at the edges of the frame.
@@ -47,14 +48,14 @@ class RingCurrent(ImageEffect):
     """The current decays as exp(-t/lifetime) and returns to full at each top-up. The ring is full when the camera is
     connected.
 
-    A frame gets the mean current over its exposure, in closed form: consecutive exposures collect the same light as one
-    long exposure.
+    A frame gets the mean current over its exposure, in closed form. So consecutive exposures collect the same number of
+    photons as one long exposure.
 
     Attributes:
         lifetime: s to fall to 1/e.
         top_up_every: s from the start of one top-up to the start of the next; None: not periodic.
-        top_up_below: share of the full current at which a top-up starts; None: not by the current. Without both
-            settings the current only decays.
+        top_up_below: share of the full current at which a top-up starts; None: the current does not start a top-up.
+            Without both settings the current only decays.
         refill: duration of a top-up in s, with a linearly rising current; 0: instantaneous.
     """
 
@@ -80,11 +81,12 @@ class RingCurrent(ImageEffect):
         return image
 
     def mean(self, start: float, duration: float) -> float:
-        """Mean share of the full current over `duration` s from `start`, s since the camera was connected."""
+        """Mean share of the full current over `duration` s from `start` (s since the camera was connected)."""
         if not self.tops_up:
             x = duration / self.lifetime
             return math.exp(-start / self.lifetime) * (-math.expm1(-x) / x if x > 0 else 1.0)
-        start %= self._falls() + self.refill  # within its cycle, because differences of small numbers lose fewer digits
+        # time within its cycle, because differences of small numbers lose fewer digits
+        start %= self._falls() + self.refill
         return (self._charge(start + duration) - self._charge(start)) / duration
 
     def _charge(self, time: float) -> float:
@@ -98,7 +100,7 @@ class RingCurrent(ImageEffect):
         return cycles * whole + self._fallen(min(rest, falls)) + least * risen + slope * risen**2 / 2
 
     def _falls(self) -> float:
-        """s of each cycle in which the current falls."""
+        """Duration in s, in each cycle, in which the current falls."""
         if self.top_up_below is not None:
             return -self.lifetime * math.log(self.top_up_below)
         assert self.top_up_every is not None  # called only for a ring that is topped up
@@ -110,12 +112,12 @@ class RingCurrent(ImageEffect):
 
 @dataclass(frozen=True)
 class LostBeam(ImageEffect, Anomaly):
-    """The beam is off for a range of projections or of time; a frame loses the light of the overlap.
+    """The beam is off for a range of projections or of time; a frame loses the photons of the overlap.
 
     Attributes:
-        views: [first, one after the last]; flats taken just before one of them also lose their light.
+        views: [first, one after the last]; flats taken just before one of these projections also lose their photons.
         seconds: [from, to] since the camera was connected.
-        share: share of the light that remains.
+        share: share of the intensity that remains.
     """
 
     views: ViewRange | None = None
@@ -139,10 +141,10 @@ class LostBeam(ImageEffect, Anomaly):
         return [AnomalyLabel(self.name, (0, rows, 0, cols))] if shot.beam and self._lost(shot) > 0 else []
 
     def _lost(self, shot: Shot) -> float:
-        """Share of the frame's light that is lost."""
+        """Share of the photons of the frame that is lost."""
         if self.seconds is None:
             return 1 - self.share if within(self.views, shot) else 0.0
-        # In seconds of this exposure, so that rounding cannot remove more than all light.
+        # In seconds of this exposure, so that rounding cannot remove more than all photons.
         begin, end = (at - shot.elapsed for at in self.seconds)
         off = min(end, shot.exposure) - max(begin, 0.0)
         return (1 - self.share) * max(off, 0.0) / shot.exposure
@@ -150,16 +152,15 @@ class LostBeam(ImageEffect, Anomaly):
 
 @dataclass(frozen=True)
 class Ghost(ImageEffect, Anomaly):
-    """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
+    """A smooth change of the intensity by a cos², as high as the frame. Flats do not have this change.
 
-    It was seen in an early data set of a battery: "fog" crosses the frame in a few projections, with intensities that
-    no other projection has. The cause is unknown. The ghost may be bright (light scattered into the detector) or dark.
+    An early data set of a battery shows it: "fog" crosses the frame in a few projections, with intensities that no
+    other projection has. The cause is unknown. The ghost may be bright (photons scattered into the detector) or dark.
 
     Attributes:
-        view: the first view that shows it, at the right edge.
-        width: mm, full width at half height; it ends `width` from its middle.
-        speed: mm to the left from one view to the next.
-        gain: relative change of the light in its middle; negative for a dark ghost.
+        view: the first projection that shows the ghost, at the right edge. width: full width at half height in mm; the
+            ghost ends `width` from its middle. speed: mm to the left from one projection to the next. gain: relative
+            change of the intensity in the middle of the ghost; negative for a dark ghost.
     """
 
     view: Whole
@@ -186,11 +187,11 @@ class Ghost(ImageEffect, Anomaly):
         ]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
-        """The first column that the ghost covers, and the relative change of the light from there to the right."""
+        """The first column that the ghost covers, and the relative change of the intensity from there to the right."""
         cols, pitch = shot.detector.shape[1], shot.detector.pitch
         if not shot.sample or shot.view < self.view:
             return 0, np.zeros(0)
-        # middle in columns, half a step after the left end of the hump has touched the right edge of the frame
+        # middle in columns, half a step after the left end of the ghost has reached the right edge of the frame
         middle = cols - 0.5 + (self.width - self.speed * (shot.view - self.view + 0.5)) / pitch
         reach = self.width / pitch
         first = max(0, math.ceil(middle - reach))
@@ -203,10 +204,9 @@ class BlackBand(ImageEffect, Anomaly):
     """A slit darkens a band at the left, with an edge that is soft because of the penumbra; flats also have the band.
 
     Attributes:
-        width: mm from the left edge of the frame, for any ROI, to half of the light.
-        penumbra: mm over which the light rises from none to all.
-        share: share of the light that remains in the band.
-        views: [first, one after the last] projection with the slit in the beam; None: all.
+        width: mm from the left edge of the frame, for any ROI, to the place with half of the intensity. penumbra: mm
+            over which the intensity rises from none to all. share: share of the intensity that remains in the band.
+            views: [first, one after the last] projection with the slit in the beam; None: all.
     """
 
     width: Positive
@@ -225,7 +225,7 @@ class BlackBand(ImageEffect, Anomaly):
         return [AnomalyLabel(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
 
     def _intensity(self, shot: Shot) -> NDArray[np.float64]:
-        """Share of the light in each column of the band."""
+        """Share of the intensity in each column of the band."""
         from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
         intensity = self.share + (1 - self.share) * exposed_share(from_left - self.width, self.penumbra)
         return intensity[intensity < 1]
@@ -233,15 +233,15 @@ class BlackBand(ImageEffect, Anomaly):
 
 @dataclass(frozen=True)
 class NarrowField(ImageEffect, Anomaly):
-    """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
+    """An aperture before the sample transmits a rectangle of the beam, whose edges are soft because of the penumbra of
+    the source.
 
-    Flats are equally narrow. Pixels without full light get a label for each side: left, right, above and below.
+    Flats are equally narrow. Pixels without the full intensity get a label for each side: left, right, above and below.
 
     Attributes:
-        width: mm of the rectangle across the beam, between the places with half of the light.
-        height: mm, vertically; None: the whole frame.
-        centre: mm of its middle, (across, down the rows) from the projected rotation axis and z = 0.
-        penumbra: mm over which the light rises from none to all.
+        width: width of the rectangle in mm across the beam, between the places with half of the intensity. height:
+            height in mm; None: the whole frame. centre: position of its middle in mm, (across, down the rows) from the
+            projected rotation axis and z = 0. penumbra: mm over which the intensity rises from none to all.
     """
 
     width: Positive
@@ -270,7 +270,7 @@ class NarrowField(ImageEffect, Anomaly):
         ]
 
     def _intensity(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Shares of the light in each row and in each column; a pixel has their product."""
+        """Shares of the intensity in each row and in each column; the share of a pixel is their product."""
         detector = shot.detector
         across = self._between(detector.u() - self.centre[0], self.width)
         if self.height is None:
@@ -278,7 +278,7 @@ class NarrowField(ImageEffect, Anomaly):
         return self._between(detector.v() - self.centre[1], self.height), across
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        # The part of the source that is not covered. The two edges cover it from opposite ends.
+        # The part of the source that is not covered. The two edges cover the source from opposite ends.
         one, other = (exposed_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
         return np.maximum(one + other - 1, 0.0)
 

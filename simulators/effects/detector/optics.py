@@ -22,22 +22,23 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, 
 
 TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
 NEGLIGIBLE = 1e-9
-"""Share of the light of a kernel beyond its last tap; the taps are normalised to a sum of 1."""
+"""Share of the intensity of a kernel beyond its last tap; the taps are normalised to a sum of 1."""
 MAX_CORE = 64.0
-"""Largest sigma of the core in pixels; the work grows with it."""
+"""Largest sigma of the core in pixels, because the work grows with sigma."""
 
 
 @dataclass(frozen=True)
 class ScintillatorBlur(ImageEffect):
-    """Point spread (1 - tail_share) Gaussian + tail_share tail, of integral 1; the frame's edges are mirrors.
+    """The point spread is (1 - tail_share) Gaussian + tail_share tail, with integral 1; the edges of the frame are
+    mirrors.
 
     The core's taps go as exp(-b n²) with the b that gives the Gaussian's variance, however narrow (the discrete normal
-    law, Kemp 1997, J. Stat. Plan. Inference 63:223); from 1 pixel of sigma on that is the Gaussian, with the transfer
-    exp(-2 (pi f sigma)²). No tap is negative. Name this effect before the effects behind the optics.
+    law, Kemp 1997, J. Stat. Plan. Inference 63:223); from a sigma of 1 pixel on this law is the Gaussian, with the
+    transfer exp(-2 (pi f sigma)²). No tap is negative. Name this effect before the effects behind the optics.
 
     Attributes:
-        fwhm_um: full width at half maximum of the core, um at the sample.
-        tail_share: share of the light that goes into the tail, 0 ... 1 (excluded).
+        fwhm_um: full width at half maximum of the core, um at the sample. tail_share: share of the intensity in the
+            tail, 0 ... 1 (excluded).
         tail_um: width w of the tail, um at the sample.
         tail: "exponential", exp(-r/w) / 2πw² with the transfer (1 + (2πfw)²)^-1.5; or "lorentzian",
             w / 2π(r² + w²)^1.5 with the transfer exp(-2πfw), which reaches much farther.
@@ -79,7 +80,7 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
     if variance < 1:  # narrower than the sampling; a steeper law, because the continuous one would lose variance
         steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
     kept = taps(steepness)
-    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap and beyond
+    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # intensity at this tap and beyond
     kept = kept[beyond >= NEGLIGIBLE]
     return kept / (2 * kept.sum() - kept[0])
 
@@ -122,21 +123,21 @@ REACH = 4.0  # a Gaussian is drawn up to this number of sigmas; less than 4e-4 o
 
 @dataclass(frozen=True)
 class FlatStructure(ImageEffect):
-    """Each speck and scratch multiplies the light by 1 - depth x Gaussian.
+    """Each speck and scratch multiplies the intensity by 1 - depth x Gaussian.
 
-    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them. Name dust on the
+    A flat corrects them, unless the beam has moved (beam_profile) or the image is blurred after them. Name dust on the
     scintillator before scintillator_blur, dust on the camera's window after it. Specks and scratches are computed for
     sensor pixels and averaged over binned pixels, so that they are the same for any ROI and binning.
 
     Attributes:
         specks: number of specks on the whole sensor.
         radius_um: mean of their radii (sigmas; half to one and a half times this), um at the sample.
-        depth: mean share of the light that is lost in the middle of a speck; between 0 and twice this.
+        depth: mean share of the intensity that is lost in the middle of a speck; a speck has between 0 and twice this.
         scratches: number of straight scratches on the whole sensor.
         scratch_length_um: mean of their lengths (exponentially distributed), um at the sample.
         scratch_width_um: sigma across them, um at the sample.
-        scratch_depth: mean share of the light that is lost along a scratch; between 0 and twice this.
-        seed: of places, sizes and depths.
+        scratch_depth: mean share of the intensity that is lost along a scratch; a scratch has between 0 and twice this.
+            seed: seed of places, sizes and depths.
     """
 
     specks: int = setting(200, ge=0, le=100_000)
@@ -153,7 +154,7 @@ class FlatStructure(ImageEffect):
         return image
 
     def transmission(self, shot: Shot) -> Image:
-        """Share of the light that remains, float64 [row, col]."""
+        """Share of the intensity that remains, float64 [row, col]."""
         pixel_um = shot.detector.pitch / shot.binning * 1e3
         row0, col0, rows, cols = shot.roi
         left = np.ones((rows, cols))
@@ -199,7 +200,7 @@ def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: flo
     # Along the axis, an inclined line of width w has the width w / cos, at most √2 w.
     reach = int(np.ceil(REACH * width * np.sqrt(2)))
     middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
-    whole = 2 * reach >= left.shape[1]  # wider than the frame; each column of the frame once
+    whole = 2 * reach >= left.shape[1]  # a line wider than the frame covers each column of the frame once
     at = np.arange(left.shape[1]) + 0 * middle[:, None] if whole else middle[:, None] + np.arange(-reach, reach + 1)
     dy, dx = (steps - row)[:, None], at - col
     t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across
@@ -216,7 +217,8 @@ def _window(middle: float, reach: float, extent: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Afterglow(SamplingEffect):
-    """The prompt share of the light is 1 - sum of shares; a share p is delayed by an exponential time with its decay.
+    """The prompt share of the light is 1 - sum of shares; a share p comes later, after an exponentially distributed
+    time.
 
     The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
     times. A Gauss rule of `samples` moments replaces it, exact for its powers up to 2 x samples - 1 (Golub & Welsch
@@ -232,8 +234,8 @@ class Afterglow(SamplingEffect):
 
     Attributes:
         shares: of the light, one for each component; their sum below 1.
-        decay_times: s to fall to 1/e, one for each component.
-        samples: moments in the past, for all components together.
+        decay_times: times in s to fall to 1/e, one for each component. samples: number of moments in the past, for all
+            components together.
     """
 
     shares: tuple[NotNegative, ...]
@@ -253,7 +255,7 @@ class Afterglow(SamplingEffect):
         share = sum(self.shares)
         middle = moments.weights @ moments.times  # [row]
         spread = moments.times[:, 0] - middle[0]
-        age, chance = np.polynomial.laguerre.laggauss(self.samples)  # of the exponential law with decay time 1
+        age, chance = np.polynomial.laguerre.laggauss(self.samples)  # moments of the exponential law with decay time 1
         ages = np.concatenate([decay * age for decay in self.decay_times])
         chances = np.concatenate([part / share * chance for part in self.shares])
         past, weights = gauss_rule(

@@ -22,9 +22,9 @@ class Prnu(ImageEffect):
     It acts on the light, so that the photon noise remains Poisson. Name this effect after all effects that blur light.
 
     Attributes:
-        spread: standard deviation as a share of the light; 1 % is typical of sensors (Janesick 2007, "Photon
-            transfer"), and assumed here: ORCA-Quest's is not published.
-        seed: of the pixels' responses.
+        spread: standard deviation as a share of the intensity; 1 % is typical of sensors (Janesick 2007, "Photon
+            transfer"). It is assumed here, because the value of the ORCA-Quest is not published. seed: seed of the
+            responses of pixels.
     """
 
     spread: float = setting(0.01, ge=0, le=0.2)
@@ -62,12 +62,12 @@ class HotPixels(ImageEffect):
 
 @dataclass(frozen=True)
 class DeadPixels(ImageEffect):
-    """The same pixels of the sensor in every frame. Name it after all effects that add charge and before the read
-    noise, which dead pixels have like others. A binned pixel loses the share of its dead ones.
+    """The same pixels of the sensor in every frame. Name this effect after all effects that add charge and before the
+    read noise, because dead pixels have read noise like others. A binned pixel loses the share of its dead pixels.
 
     Attributes:
         fraction: fraction of the sensor's pixels.
-        charge: their electrons: 0, or 7000 for pixels that are stuck at the full well.
+        charge: number of electrons in them: 0, or 7000 for pixels that are stuck at the full well.
         seed: seed of their positions.
     """
 
@@ -84,7 +84,7 @@ class DeadPixels(ImageEffect):
 
 
 DROPS = 200  # number of parts into which a spread charge is divided
-MOST = 100_000  # Largest number of zingers in a frame; the work grows with it
+MOST = 100_000  # Largest number of zingers in a frame, because the work grows with this number
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class Zingers(ImageEffect):
     """Bright pixels at random places; some may be tracks, and their charge may be spread.
 
     Attributes:
-        rate: mean number a second in the frame.
-        charge: mean electrons of a zinger (exponentially distributed).
+        rate: mean number of zingers per second in the frame. charge: mean number of electrons of a zinger
+            (exponentially distributed).
         tracks: share of zingers that run along the sensor, in any direction.
         length: mean length of a track (exponentially distributed), pixels of the frame.
         radius: standard deviation of the charge around its point or track, pixels of the frame; 0: a single pixel.
@@ -137,7 +137,7 @@ class Zingers(ImageEffect):
 
 @dataclass(frozen=True)
 class RollingShutter(SamplingEffect):
-    """Sensor rows are read in pairs, one pair a line time, downwards from the frame's first row.
+    """The sensor reads its rows in pairs, one pair in each line time, downwards from the first row of the frame.
 
     A line time is two row periods of the sensor: 7.2 us in the standard readout and 172.8 us in ultra quiet (property
     table of the C15550-20UP). A binned row begins with its first line. Every row is exposed for the same time from its

@@ -17,7 +17,8 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
 Length = Annotated[float, Setting(ge=1e-9, le=1e9)]
 Height = Annotated[float, Setting(ge=-1e9, le=1e9)]
-"""mm. With larger values, more crumbs or deeper ones a frame takes seconds or overflows."""
+"""Limits of lengths (mm), of the number of particles and of their depth; above them, a frame takes seconds or
+overflows."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,7 @@ class Crumb:
     """A round Gaussian cloud in a frame, cut off where it is thinner than VISIBLE.
 
     Attributes:
-        row, col: of its middle.
-        sigma: pixels.
-        depth: optical depth through its middle.
+        row, col: position of its middle. sigma: standard deviation in pixels. depth: optical depth through its middle.
         which: number of the loose particle in the scene.
     """
 
@@ -40,7 +39,7 @@ class Crumb:
     def box(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
         """(first row, row after the last, first column, column after the last); empty outside the frame."""
         middle, size = np.array([self.row, self.col]), np.array(shape)
-        aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # the frame may contain only a cap of the circle
+        aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # the frame may contain only a part of the circle
         reach = np.sqrt(np.maximum(2 * math.log(self.depth / VISIBLE) * self.sigma**2 - aside**2, 0.0))
         # clipped first, because close to the source of a cone, positions exceed the range of integers
         top, left = np.clip(np.ceil(middle - reach), 0, size).astype(int).tolist()
@@ -50,12 +49,12 @@ class Crumb:
 
 @dataclass(frozen=True)
 class Floaters(ImageEffect, Anomaly):
-    """Crumbs on the outside of the can or elsewhere in the beam.
+    """Loose particles on the outside of the can or elsewhere in the beam.
 
-    Turning particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a
-    turn, in front of the axis and behind it. Within 180 degrees it crosses once, in a range of views, on one side.
-    Loose particles drift across at their own speed. All rows show a loose particle at its position at the time when the
-    first row is exposed.
+    Turning particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a turn, in
+    front of the axis and behind it. Within 180 degrees it crosses once, in a range of projections, on one side.
+    Particles with the motion "loose" drift across at their own speed. All rows show a loose particle at its position at
+    the time when the first row is exposed.
 
     Attributes:
         distance: [least, most] mm from the rotation axis; a loose particle is visible within the larger distance.
@@ -64,9 +63,9 @@ class Floaters(ImageEffect, Anomaly):
         depth: largest optical depth through the middle of a loose particle; the smallest is half of it.
         heights: [least, most] mm, down the rows from z = 0.
         motion: "turning" with the stage, or "loose".
-        speed: mm a view, the drift of a loose particle in either direction.
-        views: [first, one after the last] in which loose particles exist; a loose one passes the axis within it.
-        seed: of sizes, places and depths.
+        speed: drift of a loose particle in either direction, mm per projection. views: [first, one after the last]
+            projection in which loose particles exist; a particle with the motion "loose" passes the axis within this
+            range. seed: seed of sizes, places and depths.
     """
 
     distance: tuple[Length, Length]
@@ -135,7 +134,7 @@ class Floaters(ImageEffect, Anomaly):
 
 @dataclass(frozen=True)
 class Scatter(ImageEffect):
-    """Adds ratio x the mean or a broad blur of the transmitted image, and a constant background.
+    """Adds `ratio` times the mean, or times a broad blur, of the transmitted image, and a constant background.
 
     The ratio compares scattered with primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). A flat has the
     background, but no scatter. Name it before the effects of the scintillator.

@@ -23,8 +23,8 @@ HC = 1.239841984e-6
 DARKEST = 1e-30
 """Smallest transmission, so that the depth is finite."""
 STEEPEST = math.pi / 2
-"""Largest phase step in radians between neighbouring pixels of the wave: its square has twice the bandwidth and must
-not alias either."""
+"""Largest phase step in radians between neighbouring pixels of the wave. The square of the wave has twice the
+bandwidth, and must not alias either."""
 
 
 @dataclass(frozen=True)
@@ -33,25 +33,24 @@ class PhaseFringes(ImageEffect):
 
     With the refractive index 1 - delta + i beta and mu = 4 pi beta / wavelength, the depth d = mu t gives amplitude and
     phase. The wave's cosine transform is multiplied by exp(-i pi wavelength z f²) (Paganin 2006, Coherent X-Ray Optics,
-    ch. 1.4; f cycles/mm). Its square is the intensity: never negative, with the same sum. The frame's edges are
-    mirrors. To first order in z it is T - (z delta / mu) laplace T (Paganin et al. 2002, J. Microsc.
-    206:33). The transforms are single precision: intensities are right to 1e-5 of the open beam.
+    ch. 1.4; f cycles/mm). The square of the result is the intensity. It is never negative and has the same sum. The
+    edges of the frame are mirrors. To first order in z it is T - (z delta / mu) laplace T (Paganin et al. 2002, J.
+    Microsc. 206:33). The transforms are single precision: intensities are right to 1e-5 of the open beam.
 
     In a cone the frame is that of a plane wave at the distance z / M, M = 1 + z / sod, at the sample's scale (Fresnel
-    scaling theorem, Paganin 2006, appendix B). The detector's pitch refers to that scale here. For the blur of fringes
-    by source and detector name scintillator_blur, too.
+    scaling theorem, Paganin 2006, appendix B). Here the pitch of the detector is in this scale. Source and detector
+    blur the fringes; for this blur, name scintillator_blur, too.
 
     Edges of solids turn the phase by many radians a pixel, which a wave sampled on the pixels cannot represent. If the
-    Fresnel number of a pixel is 1 or more, fringes are finer than pixels: use "transport". It moves light between
-    neighbouring pixels, to first order in z, and no pixel gives more light than it has.
+    Fresnel number of a pixel is 1 or more, fringes are finer than pixels: use "transport". This method moves photons
+    between neighbouring pixels, to first order in z, and no pixel gives more photons than it has.
 
     Attributes:
         delta_beta: ratio of delta to beta of the material at the energy.
-        distance: mm from the sample to the detector; in a cone sdd - sod.
-        energy: keV.
-        oversampling: pixels of the wave per pixel and axis, 1 ... 8; the depth is interpolated linearly between pixels
-            and the intensity averaged over each, which adds a blur with a variance of 1/4 pixel². Work and memory grow
-            as its square. For the wave only.
+        distance: mm from the sample to the detector; in a cone sdd - sod. energy: photon energy in keV. oversampling:
+            pixels of the wave per pixel and axis, 1 ... 8. The depth is interpolated linearly between pixels, and the
+            intensity is averaged over each pixel. This adds a blur with a variance of 1/4 pixel². Work and memory grow
+            as the square of the oversampling. Only the method "wave" uses it.
         method: "wave" or, near the sample, "transport".
     """
 
@@ -164,7 +163,8 @@ def _transported(intensity: Image, share: float) -> Image:
 
 @njit(cache=True, nogil=True)
 def _keep(begin: int, end: int, intensity: Image, share: float, kept: Image) -> None:
-    """Limits what pixels of rows begin ... end give to the light that they have: writes a factor for each to `kept`."""
+    """Limits the photons that pixels of rows begin ... end give to the photons that they have: writes a factor for each
+    pixel to `kept`."""
     rows, cols = intensity.shape
     for j in range(begin, end):
         above, below = intensity[max(j - 1, 0)], intensity[min(j + 1, rows - 1)]
@@ -179,7 +179,7 @@ def _keep(begin: int, end: int, intensity: Image, share: float, kept: Image) -> 
 
 @njit(cache=True, nogil=True)
 def _give(begin: int, end: int, intensity: Image, share: float, kept: Image, out: Image) -> None:
-    """The light of the pixels of rows begin ... end after the exchange."""
+    """The photons in the pixels of rows begin ... end after the exchange."""
     rows, cols = intensity.shape
     for j in range(begin, end):
         above, below = max(j - 1, 0), min(j + 1, rows - 1)
@@ -196,6 +196,6 @@ def _give(begin: int, end: int, intensity: Image, share: float, kept: Image, out
 
 @njit(cache=True, nogil=True)
 def _gain(intensity: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
-    """Light that pixel (j, i) gets from its neighbour (k, m) for a share of 1; negative if it gives light."""
+    """Photons that pixel (j, i) gets from its neighbour (k, m) for a share of 1; negative if it gives photons."""
     more = intensity[j, i] - intensity[k, m]
     return more * (kept[k, m] if more > 0 else kept[j, i])

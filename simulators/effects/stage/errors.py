@@ -16,7 +16,7 @@ from simulators.frame.mapping import NotNegative, Positive, Whole
 from simulators.frame.shot import AngleAt, Pose, Shot, frame_rng
 
 Wave = tuple[int, NotNegative, float]
-"""Waves a turn, amplitude (its unit is the effect's) and phase in degrees; 0 waves are a constant."""
+"""Number of waves per turn, amplitude in the unit of the effect, and phase in degrees; 0 waves are a constant."""
 
 
 def _once(waves: tuple[Wave, ...]) -> tuple[Wave, ...]:
@@ -36,7 +36,7 @@ def series(angle: NDArray[np.float64], waves: Sequence[Wave]) -> NDArray[np.comp
     """Sum of amplitude x exp(i (waves x angle + phase)) at `angle` in radians, any shape.
 
     A scalar effect takes the real part. A direction in the laboratory has the real part along u and minus the imaginary
-    part along b: with one wave a turn it turns with the sample, with -1 against it.
+    part along b. With one wave per turn this direction turns with the sample, with -1 against the sample.
     """
     total = np.zeros(np.shape(angle), dtype=np.complex128)
     for order, amplitude, phase in waves:
@@ -49,8 +49,8 @@ class EncoderError(PoseEffect):
     """Angular positioning error: the sample is at the angle of the trigger plus the error.
 
     Attributes:
-        harmonics: waves a turn, millidegrees, phase in degrees. An eccentric grating gives 1 wave, a gear one per
-        tooth, and interpolation between an encoder's lines one per line.
+        harmonics: waves per turn, millidegrees, phase in degrees. An eccentric grating gives 1 wave, a gear gives one
+            wave per tooth, and interpolation between the lines of an encoder gives one wave per line.
         random_mdeg: standard deviation of the random part, drawn for each frame.
     """
 
@@ -69,7 +69,8 @@ HISTORY = 3600.0  # s before the frame; earlier moves are not searched for
 
 @dataclass(frozen=True)
 class Backlash(PoseEffect):
-    """Lost motion of a gear (ISO 230-2:2014, reversal value) between the encoder, on the motor's side, and the sample.
+    """Lost motion of a gear (ISO 230-2:2014, reversal value). The gear is between the encoder, on the side of the
+    motor, and the sample.
 
     While the stage turns forwards (angles grow), its angles are right. When it turns backwards, the other flanks of the
     teeth push, and the sample is `lost_motion_deg` ahead of the stage's angle. If the stage is at rest, its last move
@@ -132,13 +133,11 @@ class StageWobble(PoseEffect):
 class Runout(PoseEffect):
     """Radial and axial error motion (ISO 230-7:2015), synchronous (harmonics) and asynchronous (drawn for each frame).
 
-    Attributes:
-        radial: waves a turn, micrometres, phase in degrees, of the axis' motion across the beam and along it. 1 wave is
-        equivalent to a sample next to the axis, 0 waves to an axis at another place. Other numbers come from the
-        bearing. A negative number turns against the sample.
-        axial: the same, vertically.
-        radial_random_um: standard deviation of the random part across the beam, and along it.
-        axial_random_um: of the random part, vertically.
+    Attributes: radial: motion of the axis across the beam and along the beam: waves per turn, micrometres, phase in
+    degrees. 1 wave is equivalent to a sample next to the axis, 0 waves to an axis at another place. Other numbers come
+    from the bearing. A negative number turns against the sample. axial: the same for the vertical motion.
+    radial_random_um: standard deviation of the random part across the beam, and along the beam. axial_random_um:
+    standard deviation of the random vertical part.
     """
 
     radial: Waves = ()
@@ -168,9 +167,8 @@ class Jump(PoseEffect, Anomaly):
     before the jump, because they depend on the angle of the stage and not on that of the sample.
 
     Attributes:
-        view: the first after the jump.
-        shift_um: micrometres along x, y (which turn with the stage) and z (along the axis).
-        turn_deg: degrees about the axis, in the sense in which angles grow.
+        view: the first projection after the jump. shift_um: shift in micrometres along x, y (which turn with the stage)
+            and z (along the axis). turn_deg: rotation in degrees about the axis, in the direction in which angles grow.
     """
 
     view: Whole

@@ -1,4 +1,4 @@
-"""Chords: a frame's line integrals through packed solids, row by row: the sum over the bodies that shadow a row.
+"""Chords: line integrals of a frame through packed solids, row by row. A row is the sum over the bodies that shadow it.
 
 In the laboratory's axes (u, b, v) a parallel ray is (u, 0, v) + t (0, 1, 0) and a cone's (0, -sod, 0) + t (u, sod, v),
 t = 1 being the plane of the rotation axis. Seen from a body's middle, the ray of the column at `middle` + d is
@@ -25,7 +25,7 @@ from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, View
 Reals = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
-EDGE_ON = 1e-12  # a ray with a smaller normal · ray counts as parallel to a face or an axis
+EDGE_ON = 1e-12  # a ray with a smaller scalar product with the normal counts as parallel to a face or an axis
 _KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
 """Without reference counts (_nrt): counting references to slices takes longer than a short chord. Arrays are allocated
 outside."""
@@ -35,10 +35,9 @@ class ChordRays(NamedTuple):
     """The rays of one row through the neighbourhood of one body; see the module's docstring.
 
     Attributes:
-        offset: float64 [col], mm, the d of each column that the body may shadow.
-        R0, D0, U: R and D at d = 0, and U, in the sample's axes.
-        near, turn: factors of d U in R and in D.
-        scale: length of D, to its order of magnitude.
+        offset: float64 [col], mm, the distance d of each column that the body may shadow. R0, D0, U: R and D at d = 0,
+            and U, in the axes of the sample. near, turn: factors of d U in R and in D. scale: order of magnitude of the
+            length of D.
     """
 
     offset: Reals
@@ -60,11 +59,12 @@ def depths(p: Packed, view: View) -> Reals:
 
 
 def _add_upright(p: Packed, view: View, out: Reals) -> None:
-    """Add upright cylinders in a parallel beam, whose shadow is the same in all rows between their ends."""
+    """Add upright cylinders in a parallel beam: their shadow is the same in all rows between their ends."""
     profiles: dict[tuple[int, int], Reals] = {}
     for b in np.flatnonzero(p.kind == CYLINDER):
         middle = p.centre[b] - view.origin[0]
-        across, _, up = (middle[:, None] * view.axes[0]).sum(axis=0)  # to the bit `_dot`; `@` may fuse and round once
+        # bit for bit the same as `_dot`; `@` may fuse and round once
+        across, _, up = (middle[:, None] * view.axes[0]).sum(axis=0)
         rows = np.flatnonzero(np.abs(view.v - up) <= p.size[b, 1] + 1e-9 * view.pitch)
         if rows.size:
             profile = profiles.setdefault((int(rows[0]), int(rows[-1])), np.zeros(view.u.size))
@@ -86,7 +86,7 @@ def _add_rows(p: Packed, view: View, begin: int, end: int, spare: Reals, out: Re
         for k in range(view.first[j], view.first[j + 1]):
             if not (added and p.kind[view.bodies[k]] == CYLINDER):
                 _add_body(row, view, j, p, view.bodies[k], view.axes[pose], view.origin[pose], spare)
-        if cone:  # from t to length
+        if cone:  # converts t to a length
             square = view.sod * view.sod + view.v[j] * view.v[j]
             for i in range(row.size):
                 row[i] *= math.sqrt(square + view.u[i] * view.u[i])
@@ -100,7 +100,7 @@ def _add_body(row: Reals, view: View, j: int, p: Packed, b: int, axes: Reals, or
     extent = (p.extent[b, 0], p.extent[b, 1], p.extent[b, 2])
     across, deep, up = _dot(middle, U), _dot(middle, B), _dot(middle, V)
     reach, v, near, turn, scale, D0 = _along(extent, U), view.v[j], 1.0, 0.0, 1.0, B
-    if view.sod == np.inf and p.kind[b] != CYLINDER:  # within the ball around the body, too
+    if view.sod == np.inf and p.kind[b] != CYLINDER:  # the columns must be within the ball around the body, too
         reach = min(reach, math.sqrt(max(p.size[b, 1] ** 2 - (v - up) ** 2, 0.0)) + 1e-9 * p.size[b, 1])
     low, high = across - reach, across + reach
     if view.sod < np.inf:
@@ -211,7 +211,8 @@ def _add_polyhedron(part: Reals, rays: ChordRays, faces: Reals, attenuation: flo
 
 @njit(**_KERNEL)
 def columns(u: Reals, per_mm: float, low: float, high: float) -> tuple[int, int]:
-    """First column whose centre lies in low..high, and the one after the last. The range is empty if these are NaN."""
+    """First column whose centre lies in low..high, and the column after the last one. The range is empty if low or high
+    is NaN."""
     cols = float(u.size)
     left, right = (low - u[0]) * per_mm, (high - u[0]) * per_mm
     if not left <= right:

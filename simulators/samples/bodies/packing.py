@@ -105,9 +105,9 @@ class View(NamedTuple):
         sod: mm, infinite in a parallel beam.
         axes: float64 [pose, 3, 3] and
         origin: float64 [pose, 3], see Pose.frames; one pose for the frame, or one a row.
-        upright: parallel beam and the sample's z is the laboratory's v.
-        first: int64 [row + 1]; the bodies first[j] to first[j + 1] of the next may shadow row j.
-        bodies: int64, in their order.
+        upright: True if the beam is parallel and z of the sample is v of the laboratory. first: int64 [row + 1]; the
+            entries first[j] to first[j + 1] of `bodies` may shadow row j. bodies: int64, indices of bodies in ascending
+            order.
     """
 
     u: Reals
@@ -160,7 +160,7 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
 def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:
     """Bounds of each body along the laboratory's k-th axis in all poses, mm.
 
-    They are its box in the first pose, widened by the difference of the poses."""
+    The bounds are the box of the body in the first pose, widened by the difference of the poses."""
     axis, at = axes[:, :, k], np.einsum("ri,ri->r", axes[:, :, k], origin)
     drift = np.linalg.norm(axis - axis[0], axis=1).max(initial=0.0)
     far = np.linalg.norm(p.centre, axis=1) + np.linalg.norm(p.extent, axis=1)
@@ -170,7 +170,7 @@ def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]
 
 
 def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
-    """Raises CannotExposeError if the exact shape of a doubtful body does not lie wholly in front of the source."""
+    """Raises CannotExposeError if a doubtful body, by its exact shape, is not wholly in front of the source."""
     for i in doubtful:
         axis = axes[:, :, 1]
         if p.kind[i] == CYLINDER:
@@ -190,7 +190,8 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
 
 
 def _by_row(above: Wholes, below: Wholes, rows: int) -> tuple[Wholes, Wholes]:
-    """The bodies that touch each row, and the start of each row's; the work is linear in the entries."""
+    """The bodies that touch each row, and the start of the entries of each row. The work is linear in the number of
+    entries."""
     height = np.maximum(below - above, 0)
     bodies = np.repeat(np.arange(above.size), height)
     row = np.arange(bodies.size) - np.repeat(np.cumsum(height) - height, height) + above[bodies]

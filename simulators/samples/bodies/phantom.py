@@ -27,7 +27,7 @@ _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False} 
 def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, out: Reals) -> None:
     """Add attenuation x filled share to `out`, float64 [z, y, x].
 
-    The share is counted on supersample³ points, only in voxels that a surface can cross.
+    The share is counted with supersample³ points, only in voxels that a surface can cross.
 
     Args:
         corner: (z, y, x) of voxel (0, 0, 0)'s centre, mm.
@@ -67,7 +67,8 @@ def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Tripl
 
 @njit(**_KERNEL)
 def _level(p: Packed, b: int, x: float, y: float, z: float) -> float:
-    """Negative inside, positive outside; its slope is 1 at most, so that it bounds the distance to the surface."""
+    """A function that is negative inside and positive outside. Its slope is at most 1, so its value bounds the distance
+    to the surface."""
     if p.kind[b] == CYLINDER:
         return max(math.sqrt(x * x + y * y) - p.size[b, 0], abs(z) - p.size[b, 1])
     if p.kind[b] == ELLIPSOID:
@@ -153,7 +154,7 @@ class Phantom:
 
     @cached_property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter.
+        """mm from the rotation axis to the farthest material.
 
         An ellipsoid is bounded by the upright elliptic cylinder around it, turned with its longer axis outwards."""
         p = self.packed
@@ -185,7 +186,7 @@ class Phantom:
         return out.astype(np.float32)
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
-        """See Sample.labels; where solids overlap, the later one counts."""
+        """See Sample.labels; if solids overlap, the label is that of the later solid."""
         out = np.zeros(grid.shape, np.uint8)
         index = {name: i + 1 for i, name in enumerate(self.names)}
         label = np.array([index[name] for name in self.solid_names], dtype=np.uint8)

@@ -1,8 +1,9 @@
 """Solids: analytic bodies with a constant attenuation, as values.
 
-Where solids overlap their attenuations add up: a particle in a matrix is given by its contrast to the matrix, a hole
-by a negative attenuation. Lengths are in mm, attenuation in 1/mm, positions (x, y, z) in the sample's frame (z is the
-rotation axis). Orientations are quaternions (w, x, y, z) of any length that turn the body's axes into the sample's.
+The attenuations of overlapping solids add up: a particle in a matrix has its contrast to the matrix as attenuation, and
+a hole has a negative attenuation. Lengths are in mm, attenuation in 1/mm, positions (x, y, z) in the sample's frame (z
+is the rotation axis). Orientations are quaternions (w, x, y, z) of any length that turn the body's axes into the
+sample's.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
-LEAST, MOST = 1e-9, 1e9  # mm: with far larger lengths, squares and quotients in the kernels overflow
+LEAST, MOST = 1e-9, 1e9  # mm: with much larger lengths, squares and quotients in the kernels overflow
 Millimetres = Annotated[float, Setting(ge=LEAST, le=MOST)]
 Micrometres = Annotated[float, Setting(ge=1e3 * LEAST, le=1e3 * MOST)]
 Gap = Annotated[float, Setting(ge=0, le=1e3 * MOST)]  # um
-DENSEST = 1e12  # 1/mm: with far larger ones, sums over chords overflow
-FLAT = 1e-9  # Share of a body's size: corners closer than this to a plane count as in it
+DENSEST = 1e12  # 1/mm: with much larger attenuations, sums over chords overflow
+FLAT = 1e-9  # Share of the size of a body: a corner closer than this to a plane counts as in the plane
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ class Hull:
 
 @lru_cache(4096)
 def _hull(vertices: tuple[tuple[float, ...], ...]) -> Hull:
-    """The hull of a convex polyhedron. A body that is moved or turned, as while a sample is packed, keeps its hull."""
+    """The hull of a convex polyhedron. A body keeps its hull if it is moved or turned, for example when a sample is
+    packed."""
     points = np.array(vertices, dtype=np.float64)
     size = float(np.ptp(points, axis=0).max())
     try:

@@ -62,11 +62,12 @@ class KEdge:
 K_EDGES: Mapping[int, KEdge] = MappingProxyType(
     {25: KEdge(6.5610, shift=0.0), 27: KEdge(7.7290, shift=1.0), 28: KEdge(8.3485, shift=2.0)}
 )
-"""By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument
-follows (figure 2.1: 8348.5 eV). It is given for LiCoO2 there, but lies next to the K edge of nickel, 640 eV above that
-of cobalt. Co and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt
-hardly moves (Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths have the right
-order of magnitude, but belong to no particular sample. Every monochromator has an offset of about an eV."""
+"""By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument follows
+(figure 2.1: 8348.5 eV). The thesis gives this peak for LiCoO2, but the peak is next to the K edge of nickel, 640 eV
+above the edge of cobalt. The lines of Co and Mn are at the energies in spectra of LiCoO2 and of Mn(IV) oxides. Nickel
+carries most of the charge and cobalt hardly moves (Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights
+and widths have the right order of magnitude, but belong to no particular sample. Every monochromator has an offset of
+about an eV."""
 
 
 def near_edge(
@@ -76,11 +77,8 @@ def near_edge(
 
     Args:
         energies: keV.
-        table: of the element.
-        edge: keV, where the table has its step.
-        level_width: eV, Γ: full width of the K level.
-        shape: of the edge.
-        charge: state of charge, 0 (fully lithiated) to 1.
+        table: table of the element. edge: energy in keV at which the table has its step. level_width: Γ in eV, full
+            width of the K level. shape: shape of the edge. charge: state of charge, 0 (fully lithiated) to 1.
     """
     tabulated = table(energies)
     away = (energies - edge) * 1e3
@@ -155,7 +153,7 @@ class Material:
             )
 
     def attenuation(self, energies: ArrayLike) -> Reals:
-        """Linear attenuation in 1/mm at `energies` in keV, float64, of their shape.
+        """Linear attenuation in 1/mm at `energies` in keV, float64, with the shape of `energies`.
 
         Raises:
             ValueError: an energy is outside the tables.
@@ -192,7 +190,7 @@ def of_formula(name: str, formula: str, density: float) -> Material:
 
 
 def by_mass(name: str, density: float, parts: Mapping[str, float]) -> Material:
-    """A mixture of formulas by their shares of the mass, of any sum."""
+    """A mixture of formulas by their shares of the mass; the shares may have any sum."""
     total: dict[int, float] = {}
     for formula, mass in parts.items():
         for z, share in _fractions(formula):
@@ -201,7 +199,7 @@ def by_mass(name: str, density: float, parts: Mapping[str, float]) -> Material:
 
 
 def by_volume(name: str, one: Material, other: Material, share: float) -> Material:
-    """A mixture of two materials: the fraction `share` of the volume is `one`, the rest `other`."""
+    """A mixture of two materials: the fraction `share` of the volume is `one`, the remaining volume is `other`."""
     masses = (share * one.density, (1 - share) * other.density)
     total: dict[int, float] = {}
     for mass, material in zip(masses, (one, other), strict=True):
@@ -243,12 +241,12 @@ _KNOWN: Mapping[str, Callable[[], Material]] = MappingProxyType(
     {
         # Cell of Orman & Wiseman, Acta Cryst. C 40, 12, 1984.
         "LiCoO2": lambda: layered_oxide("LiCoO2", "LiCoO2", 2.8166, 14.052),
-        "graphite": lambda: of_formula("graphite", "C", 2.26),  # the crystal's (CRC Handbook)
+        "graphite": lambda: of_formula("graphite", "C", 2.26),  # density of the crystal (CRC Handbook)
         "Al": lambda: of_formula("Al", "Al", 2.699),  # elements: NIST, X-ray mass attenuation coefficients, table 1
         "Cu": lambda: of_formula("Cu", "Cu", 8.96),
         "Si": lambda: of_formula("Si", "Si", 2.33),
         "Ni": lambda: of_formula("Ni", "Ni", 8.902),
-        "steel": lambda: by_mass("steel", 7.85, {"Fe": 0.995, "Mn": 0.004, "C": 0.001}),  # of cans: low carbon
+        "steel": lambda: by_mass("steel", 7.85, {"Fe": 0.995, "Mn": 0.004, "C": 0.001}),  # steel of cans: low carbon
         "stainless_steel": lambda: by_mass("stainless_steel", 8.0, {"Fe": 0.71, "Cr": 0.19, "Ni": 0.1}),  # AISI 304
         "electrolyte": _electrolyte,
         "polypropylene": lambda: of_formula("polypropylene", "C3H6", 0.90),  # NIST, table 2, as are the next three
@@ -299,7 +297,7 @@ class Palette:
 
 
 def palette_of(where: str, entry: Any) -> Palette:
-    """The materials of a scene: the known ones, changed and added to by its key `materials`.
+    """The materials of a scene: the known ones, and those that its key `materials` changes or adds.
 
         materials:
           NMC811: {state_of_charge: 0.5}

@@ -1,7 +1,7 @@
 """Parts: solids with materials, and the sample that they form in a given beam.
 
-Overlapping solids add up, so that a part that displaces another material counts with the difference of the two. Grey
-parts have the same attenuation at every energy.
+The attenuations of overlapping solids add up. So a part that displaces another material counts with the difference of
+both attenuations. Grey parts have the same attenuation at every energy.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ class Part:
     """A solid and its material.
 
     Attributes:
-        solid: without a material its attenuation is in 1/mm. With one it is the share of the solid's volume that the
-            material fills, 1 for all of it.
-        material: None: grey.
-        instead_of: the material that it displaces; None: nothing.
-        name: of its label; None: the material's name, or the solid's kind.
+        solid: without a material its attenuation is in 1/mm. With a material its attenuation is the share of its volume
+            that the material fills, 1 for the whole volume. material: the material; None: the part is grey. instead_of:
+            the material that the part displaces; None: it displaces no material. name: name of its label; None: the
+            name of the material, or the kind of the solid.
     """
 
     solid: Solid
@@ -69,7 +68,8 @@ class Constituent:
     instead_of: Material | None = None
 
     def attenuation(self, energies: ArrayLike) -> Reals:
-        """Attenuation in 1/mm, minus that of the displaced material, at energies in keV; same shape as the energies."""
+        """Attenuation in 1/mm, minus the attenuation of the displaced material, at energies in keV; same shape as the
+        energies."""
         if self.material is None:
             return np.ones(np.shape(energies))
         own = self.material.attenuation(energies)
@@ -117,7 +117,7 @@ class Mixture:
         return self.whole.labels(grid)
 
     def under(self, spectrum: Spectrum) -> Mixture:
-        """The same sample in another spectrum; its truth remains that of the original one."""
+        """The same sample in another spectrum; its true attenuation remains that of the original spectrum."""
         return replace(self, spectrum=spectrum)
 
 
@@ -149,7 +149,7 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
     return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)
 
 
-ROUNDING = 1e-14  # A smaller depth counts as no matter
+ROUNDING = 1e-14  # A smaller depth counts as air
 
 
 def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:
@@ -169,7 +169,7 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
         hit = (chords != 0.0).any(axis=0)  # air is exactly 0
         lengths = chords[:, hit]
         least = functools.reduce(np.minimum, (_through(lengths, mu) for mu in attenuation))
-        intensity = np.zeros_like(least)  # with the hardest energy factored out, against underflow
+        intensity = np.zeros_like(least)  # the highest energy is factored out, so that the sum does not underflow
         for weight, mu in zip(weights, attenuation, strict=True):
             intensity += weight * np.exp(least - _through(lengths, mu))
         depth = least - np.log(intensity)
@@ -180,7 +180,7 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
 
 
 def _through(lengths: Reals, attenuation: Reals) -> Reals:
-    """Optical depth at one energy; not by BLAS, whose sums depend on where a ray lies in the array."""
+    """Optical depth at one energy. BLAS is not used, because its sums depend on the position of a ray in the array."""
     return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, lengths, strict=True)))
 
 

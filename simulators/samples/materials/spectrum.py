@@ -1,4 +1,4 @@
-"""Spectrum: energies and weights of a beam, reduced to as few as its sample needs."""
+"""Spectrum: energies and weights of a beam, reduced to the few energies that its sample needs."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Reals = NDArray[np.float64]
 Attenuation = Callable[[ArrayLike], Reals]  # Linear attenuation in 1/mm at energies in keV
 
 NODES = (3, 5, 9, 17, 33, 65, 129, 257, 513)
-TOLERANCE = 1e-5  # of the open beam, in the light: far below the noise of a pixel with 7000 electrons
+TOLERANCE = 1e-5  # share of the open beam in the intensity, much smaller than the noise of a pixel with 7000 electrons
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
-_NOTHING = 1e-7  # share of the light: smaller weights, of energies that a filter stops, are dropped
+_NOTHING = 1e-7  # share of the intensity: smaller weights, of energies that a filter absorbs, are dropped
 _FEW = 9
 _A_FEW = 4
 _REACH = 4.5  # standard deviations; 7e-6 of a line lie beyond
@@ -40,7 +40,7 @@ class Spectrum:
 
     @classmethod
     def of(cls, energies: ArrayLike, weights: ArrayLike) -> Spectrum:
-        """A spectrum from weights of any sum; energies without weight are dropped."""
+        """A spectrum from weights with any sum; energies without weight are dropped."""
         e, w = np.asarray(energies, dtype=np.float64), np.asarray(weights, dtype=np.float64)
         return cls(e[w > 0], w[w > 0] / w.sum())
 
@@ -49,7 +49,7 @@ class Spectrum:
         return float(self.weights @ attenuation(self.energies))
 
     def transmission(self, attenuation: Attenuation, thickness: ArrayLike) -> Reals:
-        """Transmitted share of the light through `thickness` mm; same shape as `thickness`."""
+        """Transmitted share of the intensity through `thickness` mm; same shape as `thickness`."""
         through = np.exp(-np.multiply.outer(np.asarray(thickness, dtype=np.float64), attenuation(self.energies)))
         return np.asarray(through @ self.weights)
 
@@ -100,7 +100,7 @@ def _converged(
 
 
 def _nodes(beam: Beam, n: int, filters: Callable[[str], Attenuation]) -> Spectrum:
-    """The spectrum with n nodes a line."""
+    """The spectrum with n nodes per line."""
     if beam.tube is not None:
         return _tube(beam.tube, n, filters)
     assert beam.energy_kev is not None  # the beam states its energies
@@ -117,8 +117,8 @@ def _nodes(beam: Beam, n: int, filters: Callable[[str], Attenuation]) -> Spectru
 
 
 def _gaussian(n: int) -> tuple[Reals, Reals]:
-    """Nodes and weights for a normal distribution: a Gauss rule for few nodes, evenly spaced ones where an edge needs
-    many: these converge as fast for smooth integrands and have no nodes in the far tails."""
+    """Nodes and weights for a normal distribution: a Gauss rule for few nodes, evenly spaced nodes if an edge needs
+    many. Evenly spaced nodes converge as fast for smooth integrands, and have no nodes in the far tails."""
     if n <= _FEW:
         x, w = np.polynomial.hermite_e.hermegauss(n)
     else:
@@ -127,7 +127,7 @@ def _gaussian(n: int) -> tuple[Reals, Reals]:
     return x, w / w.sum()
 
 
-@cache  # half a second for many
+@cache  # takes half a second for many nodes
 def _gauss_rule(n: int) -> tuple[Reals, Reals]:
     """Nodes in -1 ... 1 and their weights."""
     return np.polynomial.legendre.leggauss(n)
@@ -145,14 +145,14 @@ def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum
     return Spectrum.of(energies, np.where(weights > _NOTHING * weights.sum(), weights, 0.0))
 
 
-STEPS = 40  # Number of thicknesses, from the full one down to a 8000th of it
+STEPS = 40  # Number of thicknesses, from the full thickness down to one 8000th
 SHARES = (0.125, 0.5, 0.875)
-"""Shares of the first of each pair of materials. Halves alone do not suffice: for one sample in 1000, with an edge
-in each of two materials, the error is ten times the tolerance."""
+"""Shares of the first material of each pair. Half of each alone is not enough: for one sample in 1000, with an edge in
+each of two materials, the error is ten times the tolerance."""
 
 
 def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float) -> tuple[NDArray[np.intp], Reals]:
-    """Few energies with the same transmission for any sample: their indices, and their weights, of sum 1.
+    """Few energies with the same transmission for any sample: their indices and their weights, with sum 1.
 
     exp(-mu(E) t) of different energies are nearly linearly dependent. The energies are found by non-negative least
     squares (Lawson & Hanson, Solving Least Squares Problems, 1974, ch. 23). It runs on rays through each material, each
@@ -181,7 +181,7 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     light = through @ weights
     try:
         exact, _ = nnls(through, light)
-    except RuntimeError:  # so nearly dependent, as around an edge, that it does not converge
+    except RuntimeError:  # too nearly dependent (as around an edge), so the search does not converge
         return np.arange(weights.size), weights
     enough = np.flatnonzero(exact)
     through = through[:, enough]

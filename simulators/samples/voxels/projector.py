@@ -1,9 +1,9 @@
 """Voxel projector: kernels for line integrals through a volume by Joseph's method.
 
-The volume is the function that its voxels' centres interpolate linearly, falling to 0 one voxel beyond the outermost.
-A ray is sampled where it meets the planes of centres across its main axis, and interpolated in each plane. (Joseph,
-"An improved algorithm for reprojecting rays through pixel images", IEEE Trans. Med. Imaging 1, 1982). In a parallel
-beam through an upright sample each row lies in one slice, with one interpolation a plane.
+The volume is the function that its voxels' centres interpolate linearly, falling to 0 one voxel beyond the outermost. A
+ray is sampled at the points where it crosses the planes of centres across its main axis, and interpolated in each
+plane. (Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE Trans. Med. Imaging 1, 1982).
+In a parallel beam through an upright sample each row is in one slice, with one interpolation per plane.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         def rows(low: int, high: int) -> None:
             _any(lattice, rays, axes, origin, low, high, out)
 
-    share_rows(rows, detector.shape, bands=8)  # rows near the middle cost more than those next to the sample
+    share_rows(rows, detector.shape, bands=8)  # rows near the middle take longer than rows next to the sample
     return out
 
 
@@ -164,7 +164,7 @@ def _any(lattice: Lattice, rays: VoxelRays, axes: Reals, origin: Reals, low: int
                     continue
                 one, other = (_EDGE - at) / step[n], (size[n] + 1 - _EDGE - at) / step[n]
                 start, stop = max(start, min(one, other)), min(stop, max(one, other))
-            if not start <= stop:  # checked here: far off they exceed the range of integers
+            if not start <= stop:  # checked here, because far outside they exceed the range of integers
                 continue
             total = 0.0
             for k in range(math.ceil(start), math.floor(stop) + 1):
@@ -180,7 +180,7 @@ def _any(lattice: Lattice, rays: VoxelRays, axes: Reals, origin: Reals, low: int
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(plane: Voxels32, down: float, across: float) -> float:
-    # On the plane, even where a distant ray's rounding differs.
+    # On the plane, also if the rounding of a distant ray differs.
     j, i = min(max(int(down), 0), plane.shape[0] - 2), min(max(int(across), 0), plane.shape[1] - 2)
     q, p = down - j, across - i
     upper = plane[j, i] + p * (plane[j, i + 1] - plane[j, i])

@@ -35,15 +35,14 @@ ON = 1e-9  # Voxels: a point closer than this to a centre counts as on it
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """A volume around the rotation axis. Created by `Voxels.of`.
+    """A volume around the rotation axis. `Voxels.of` creates it.
 
     Attributes:
         padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of zeros on all sides.
         spacing: mm from voxel to voxel along (z, y, x).
         thresholds: 1/mm, ascending: label k from the k-th on; None if there is a `label_volume`.
-        label_volume: uint8 [z, y, x].
-        names: of the labels 1, 2, ...
-        radius: mm from the rotation axis to the farthest matter.
+        label_volume: uint8 [z, y, x]. names: names of the labels 1, 2, ... radius: mm from the rotation axis to the
+            farthest material.
     """
 
     padded: NDArray[np.float32]
@@ -142,8 +141,8 @@ class Voxels:
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
-        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume. In larger voxels than its own it is
-        averaged, with as many points a side as it has voxels there. `supersample` is for surfaces."""
+        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume. A voxel larger than those of the volume
+        gets a mean, with as many points per side as the volume has voxels there. `supersample` is for surfaces."""
         points = [
             max(1, math.ceil(wanted / own - 1e-6)) for wanted, own in zip(grid.spacing, self.spacing, strict=True)
         ]
@@ -166,8 +165,8 @@ class Voxels:
         return out
 
     def _mean(self, grid: Grid, points: Sequence[int]) -> NDArray[np.float32]:
-        """Mean over `points` a side (z, y, x) in each voxel, float32 [z, y, x]. It is separable: one sparse matrix for
-        each axis."""
+        """Mean over `points` per side (z, y, x) in each voxel, float32 [z, y, x]. The mean is separable: there is one
+        sparse matrix for each axis."""
         values = self.padded
         for axis, centres in enumerate(grid.coordinates()):
             weights = _weights(
@@ -183,7 +182,7 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
     """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
     within = (np.arange(points) + 0.5) / points - 0.5
     place = (centres[:, None] + within * edge - first) / step + 1.0
-    # Exactly the voxel's value at its centre: a rounded share of its neighbour would count as matter.
+    # Exactly the value of the voxel at its centre: a rounded share of its neighbour would count as material.
     place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
     below = np.floor(place)
     rows = np.repeat(np.arange(centres.size), points)
@@ -196,7 +195,7 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
 
 
 def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) -> float:
-    """mm to the farthest voxel with matter; the interpolation ends one voxel beyond it."""
+    """mm to the farthest voxel with material; the interpolation ends one voxel beyond it."""
     y, x = np.nonzero((volume != 0).any(axis=0))
     if not x.size:
         return 0.0
@@ -211,17 +210,16 @@ VIEWS = 8  # Views over 180 degrees in which the largest line integral is search
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """Values of the file become attenuation linearly: (value - low) times a factor, clipped to the window.
+    """The attenuation is linear in the values of the file: (value - low) times a factor, clipped to the window.
 
     Attributes:
-        file: path; see ReadVolume.
-        dataset: path in an HDF5 file, name in an .npz; needed if there is more than one volume.
-        axes: the file's order of axes.
-        voxel_mm: from voxel to voxel; None: as in the file.
-        window: file's values (low, high) for 0 and the largest attenuation; None: low is 0, nothing is clipped.
+        file: path; see ReadVolume. dataset: path in an HDF5 file, name in an .npz; needed if there is more than one
+            volume. axes: order of axes in the file. voxel_mm: mm from voxel to voxel; None: the value in the file.
+            window: values of the file (low, high) for 0 and the largest attenuation; None: low is 0, and no value is
+            clipped.
         scale: the factor itself, 1/mm per unit of the file.
-        attenuation_max: 1/mm of the window's upper end, or of the largest value.
-        largest_line_integral: dimensionless, over all rays of 8 views, a voxel apart.
+        attenuation_max: attenuation in 1/mm at the upper end of the window, or of the largest value.
+            largest_line_integral: dimensionless, the largest over rays of 8 projections, one voxel apart.
         thresholds: file's values, ascending, at which labels 1, 2, ... begin.
         labels: a file of labels 0 ... 255 of the same shape, instead of thresholds; `labels_dataset` in it.
         names: of the labels.
@@ -256,8 +254,7 @@ class VolumeSettings:
 def volume_sample(settings: VolumeSettings, read: ReadVolume) -> Voxels:
     """The sample of the settings.
 
-    Raises:
-        ValueError: the file holds no volume, or a volume that does not fit the settings.
+    Raises: ValueError: the file contains no volume, or the volume does not fit the settings.
     """
     stored = read(settings.file, settings.dataset)
     values = _turned(stored.values, settings)
@@ -288,7 +285,7 @@ def _spacing(stored: Stored, settings: VolumeSettings) -> tuple[float, float, fl
         raise ValueError("voxel_mm is missing, and the file does not state the size of its voxels")
     own = stored.spacing or (1.0, 1.0, 1.0)
     z, y, x = (own[settings.axes.index(axis)] for axis in "zyx")
-    # voxel_mm is the voxel's width; the ratio of width to height is that in the file.
+    # voxel_mm is the width of a voxel; the ratio of width to height is taken from the file.
     factor = 1.0 if settings.voxel_mm is None else settings.voxel_mm / x
     return z * factor, y * factor, x * factor
 

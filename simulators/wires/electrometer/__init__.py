@@ -62,5 +62,5 @@ class ElectrometerWire(BytesWire):
 
 
 def matching(settings: Any, clock: Clock) -> ElectrometerWire:
-    """The electrometer whose lines end as those of a section of the configuration."""
+    """The electrometer with the line ends of a section of the configuration."""
     return ElectrometerWire(clock, end=settings.end)

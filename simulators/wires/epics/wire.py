@@ -131,7 +131,7 @@ class MotorRecord(BytesWire):
 
     def _search(self, wanted: float) -> None:
         if wanted:
-            self._homed = True  # by the end of the move; a stop takes it back
+            self._homed = True  # set by the end of the move; a stop removes it
             self._start(self._build.home_at)
 
     def _shows_motion(self) -> bool:

@@ -1,8 +1,9 @@
 """Simulated PI GCS 2.0 (C-863 class), the axis: servo, reference, moves, stops, limits, trigger line.
 
-Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis' own
-zero, which before a reference move is wherever it was switched on. Nothing runs in the background: the effects of a
-move's end happen at the next call. If a manual says nothing, the axis is strict: it rejects a move during a move.
+Inside, positions are encoder counts from the reference switch ("true"). On the wire, positions are degrees from the
+zero of the axis. Before a reference move, this zero is the position at which the axis was switched on. Nothing runs in
+the background: the effects of a move's end happen at the next call. If a manual says nothing, the axis is strict: it
+rejects a move during a move.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class PiAxisBuild:
 
 
 class GcsAxis(MovedAxis):
-    """An axis, not safe from several threads. `line` is the cable in the output with the settings `wired`."""
+    """An axis; only one thread may use it. `line` is the cable in the output with the settings `wired`."""
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PiAxisBuild, wired: PiOutput) -> None:
         self.build = build
@@ -116,7 +117,7 @@ class GcsAxis(MovedAxis):
         return self._target
 
     def switches(self) -> tuple[bool, bool, bool]:
-        """Negative limit, reference, positive limit: which are on."""
+        """True or False for each switch that is on or off: negative limit, reference, positive limit."""
         self.catch_up()
         here = self._counts(self._clock.now()) / self.per_degree
         return here <= self.build.low or self._hit < 0, here >= 0, here >= self.build.high or self._hit > 0
@@ -185,7 +186,7 @@ class GcsAxis(MovedAxis):
             act()
 
     def _counts(self, time: float) -> int:
-        """True encoder counts: the last edge passed on the way."""
+        """True encoder counts: the last edge that the axis has passed."""
         return self._at(time)[0].counts(time)
 
     def _begin(self, counts: int, velocity: float) -> None:

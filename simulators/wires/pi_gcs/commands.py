@@ -18,12 +18,12 @@ MODES = (0, 2, 5, 6, 7, 8)
 
 
 class PiGcsBox:
-    """One axis with its identifier, and the output lines by number. Not safe from several threads."""
+    """One axis with its identifier, and the output lines by number. Only one thread may use it."""
 
     def __init__(self, name: str, axis: GcsAxis, outputs: dict[int, PiOutput]) -> None:
         self.name, self.axis, self.outputs = name, axis, outputs
         self.levels = dict.fromkeys(outputs, False)
-        """As DIO has put the output lines."""
+        """The states of the output lines that DIO has set."""
 
     def axis_of(self, arguments: list[str], more: int = 0) -> list[str]:
         """The arguments after the axis' name. A command without other arguments may leave the name out."""
@@ -112,7 +112,7 @@ def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 
 
 
 def _act(act: Callable[[GcsAxis], None]) -> Action:
-    """What the axis does at once, without a value."""
+    """A command without a value that the axis obeys at once."""
 
     def do(box: PiGcsBox, arguments: list[str]) -> None:
         box.axis_of(arguments)

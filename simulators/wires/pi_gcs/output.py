@@ -19,7 +19,7 @@ from drivers.stages.pi_gcs.settings import PiFirstPulse
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 
-SLACK = 1e-6  # counts: largest error of a position by the decimals on the wire
+SLACK = 1e-6  # counts: largest error of a position because of the number of decimals on the wire
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Window:
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """How far a line is: inside its window or not, and the last pulse (or where it would have been): anchor + index
-    steps."""
+    """State of a line: True if it is inside its window, and the last pulse (or the place where it would have been):
+    anchor + index steps."""
 
     inside: bool = False
     anchor: float = 0.0
@@ -58,7 +58,7 @@ class Crossing:
 
 
 def crossings(window: Window, progress: TrainProgress, begin: float, end: float) -> Iterator[Crossing]:
-    """What happens on the straight way from `begin` (not included) to `end` (included), in order."""
+    """The changes on the straight way from `begin` (not included) to `end` (included), in order."""
     if begin == end:
         return
     sign, reach = (1 if end > begin else -1), abs(end - begin)
@@ -75,7 +75,7 @@ def crossings(window: Window, progress: TrainProgress, begin: float, end: float)
                 yield Crossing(window.start, True, progress)
             else:
                 yield Crossing(window.start, False, progress)
-        else:  # it stood inside when it was switched on
+        else:  # the axis was inside when the line was switched on
             progress = _entered(window, begin, sign)
     edge = window.stop if sign == window.sign else window.start
     room = ahead(edge) if window.sign else math.inf
@@ -115,11 +115,10 @@ class Firmware:
     """Properties that no command changes.
 
     Attributes:
-        first_pulse: where it comes. The manuals do not say, so each possibility is offered.
-        width: s that a pulse is held.
-        period: s of a servo cycle; positions are compared once in it. 0 compares at every instant.
-        lost: pulses, counted from 0 since power-on, that never reach the cable.
-        rising: the camera at the cable's end takes rising edges, else falling ones.
+        first_pulse: place of the first pulse. The manuals do not say it, so each possibility is offered. width:
+            duration of a pulse in s. period: duration of a servo cycle in s; positions are compared once per cycle. 0:
+            positions are compared at every instant. lost: pulses that never reach the cable, counted from 0 since
+            power-on. rising: True: the camera at the end of the cable reacts to rising edges; False: to falling edges.
     """
 
     first_pulse: PiFirstPulse
@@ -131,7 +130,8 @@ class Firmware:
 
 @dataclass(frozen=True)
 class _Coming:
-    """A change of the line at `time` if nobody stops the move, and the edge that the camera gets, if any."""
+    """A change of the line at `time` if the move is not stopped, and the edge that the camera gets; None if it gets no
+    edge."""
 
     time: float
     crossing: Crossing
@@ -207,6 +207,6 @@ class WiredOutput:
             self._coming.append(_Coming(time, crossing, edge))
 
     def _noticed(self, time: float, now: float) -> float:
-        """When the servo sees a crossing; never before the present time."""
+        """Time at which the servo sees a crossing; never before the present time."""
         period = self._firmware.period
         return max(math.ceil(time / period) * period if period else time, math.nextafter(now, math.inf))

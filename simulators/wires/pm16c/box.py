@@ -20,7 +20,8 @@ VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
 MAX_PULSES = 200_000
-"""Most pulses of a train: a limit of this simulation, which computes all of them when a move begins."""
+"""Largest number of pulses of a train: a limit of this simulation, because it computes all pulses when a move
+begins."""
 WIDTHS = {"0": None, "2": 200e-9, "3": 10e-6, "4": 100e-6, "5": 1e-3}
 """TMGM digit -> the output's pulse width in s; None: off. The gate of digit 1 is not simulated."""
 
@@ -105,7 +106,7 @@ class Channel:
 
     @property
     def letter(self) -> str:
-        """P, N or S: turns CW, turns CCW, is at rest."""
+        """P, N or S: the motor turns CW, turns CCW, or is at rest."""
         return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
 
     def status(self) -> int:
@@ -139,7 +140,7 @@ class BoxBuild:
 
 
 class PM16CBox:
-    """State and actions; methods take the channel as the hex digit of the protocol. Not safe from several threads.
+    """State and actions; methods take the channel as the hex digit of the protocol. Only one thread may use it.
 
     Args:
         line: the cable in the TP0 connector, the output of position controller A.
@@ -171,7 +172,7 @@ class PM16CBox:
         return sum(channel.motor.moving() for channel in self.channels.values())
 
     def standing(self, c: str) -> Channel:
-        """The channel if it is at rest; raises Refused if it moves."""
+        """The channel if its motor is at rest; raises Refused if the motor moves."""
         if self.channels[c].motor.moving():
             raise Refused(Pm16cError.COMMAND)
         return self.channels[c]
@@ -262,7 +263,7 @@ class PM16CBox:
         channel.rate = code
 
     def set_trigger(self, c: str, **changes: float | None) -> None:
-        """Change the trigger settings of a motor that stands and is not armed."""
+        """Change the trigger settings of a motor that is at rest and not armed."""
         trigger = self.standing(c).motor.trigger
         settings = replace(trigger.settings, **changes)  # type: ignore[arg-type]
         if trigger.ready(self.clock.now()) or settings.interval < 1:

@@ -119,7 +119,7 @@ class PM16CBuild:
 
 
 class PM16CController(BytesWire):
-    """No output of it can be set.
+    """None of its outputs can be set.
 
     Args:
         line: the cable in the TP0 connector (position controller A); it also learns the sample's true angle.
@@ -159,7 +159,7 @@ class PM16CController(BytesWire):
 
 
 def _find(table: tuple[tuple[str, Callable[..., T]], ...], text: str) -> Callable[[PM16CBox], T] | None:
-    """The action for a line, with the line's fields bound to it."""
+    """The action for a line, with the fields of the line as its arguments."""
     for pattern, action in table:
         if match := re.fullmatch(pattern, text):
             return lambda box: action(box, *match.groups())

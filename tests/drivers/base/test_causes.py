@@ -75,8 +75,8 @@ PORTS = {
         serial.SerialException("could not open port 'COM3': PermissionError(13, 'Zugriff verweigert', None, 5)"),
         "Another program uses it",
     ),
-    "not there": (serial.SerialException(errno.ENOENT, "no such file"), "Check the cable, the name of the port"),
-    "a URL of another kind": (ValueError("invalid URL"), "Check the cable, the name of the port"),
+    "not there": (serial.SerialException(errno.ENOENT, "no such file"), "Check the cable and the name of the port"),
+    "a URL of another kind": (ValueError("invalid URL"), "Check the cable and the name of the port"),
 }
 
 

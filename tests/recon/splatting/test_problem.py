@@ -153,7 +153,7 @@ def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(r
 def test_a_view_with_only_wild_values_is_refused_with_the_range(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[1] = 1e8
-    with pytest.raises(ValueError, match=r"1 of 3 projections.*within ±4\.5e\+06.*\[1\]"):
+    with pytest.raises(ValueError, match=r"1 of 3 projections.*\[1\].*within ±4\.5e\+06"):
         make_problem(Views(data, VIEWS), GRID, 1.0, Cpu())
 
 

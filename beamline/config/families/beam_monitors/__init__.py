@@ -1,4 +1,4 @@
-"""The section of each kind of beam monitor, and how its driver is connected."""
+"""The section of each kind of beam monitor, which also connects the driver."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class ElectrometerConfig(BeamMonitorSection):
 
 
 class RingCurrentConfig(BeamMonitorSection):
-    """The ring current from a page or a text file."""
+    """The ring current, read from a web page or a text file."""
 
     kind: Literal["ring_current"]
     url: Annotated[str, Setting(problem=url_problem)] = setting(doc="http://..., https://... or file:///...")
@@ -76,7 +76,7 @@ class RingCurrentConfig(BeamMonitorSection):
 
 
 class EpicsBeamConfig(BeamMonitorSection):
-    """The ring current, or an intensity, from an EPICS process variable."""
+    """The ring current, or an intensity, read from an EPICS process variable."""
 
     kind: Literal["epics"]
     pv: PvUrl = setting(doc="pva://NAME or ca://NAME.")

@@ -1,9 +1,9 @@
 """Arrangement: places convex bodies at random in a cylinder and moves them apart until no two overlap.
 
 A force-biased packing (Mościński, Bargieł, Rycerz and Jacobs, Mol. Simul. 3, 1989): all bodies have their full size
-from the beginning. Each overlapping pair is pushed apart along the direction in which it overlaps least. It
-reaches beyond 0.5 of the volume, where random sequential addition stalls at 0.38. Bodies keep their orientation. Two
-bodies count as apart only where a separating plane is known, so that no overlap is missed.
+from the beginning. Each overlapping pair is pushed apart along the direction in which it overlaps least. The bodies can
+fill more than 0.5 of the volume; random sequential addition stops at 0.38. Bodies keep their orientation. Two bodies
+count as apart only if a separating plane is known, so that no overlap is missed.
 
 Each sweep enlarges a small difference between two starts, and numerical libraries round differently on other
 processors. So bodies and starts are rounded first, and a seed gives the same places everywhere.
@@ -27,21 +27,24 @@ Wholes = NDArray[np.int64]
 
 SWEEPS = 600
 SPARE = 0.03
-"""Extra distance by which bodies are moved apart, over the median reach."""
+"""Extra distance by which bodies are moved apart, divided by the median reach."""
 SKIN = 0.3
-"""Margin within which a body's neighbours are listed, over the median reach, so that the list serves several sweeps."""
+"""Margin within which the neighbours of a body are listed, divided by the median reach. One list is used for several
+sweeps."""
 TRIALS, DECAY = 12, 0.8
-"""Directions tried for a separating plane until two bodies count as overlapping, and the ratio of successive turns."""
+"""Number of directions that are tried for a separating plane until two bodies count as overlapping, and the ratio of
+successive turns."""
 FINEST = 2.0**-26
-"""Bodies and starts are rounded to this part of the median reach, far above a double's rounding."""
+"""Bodies and starts are rounded to this part of the median reach, which is much larger than the rounding of a
+double."""
 
 
 class Bodies(NamedTuple):
     """Convex bodies, each symmetric about its centre, as flat arrays.
 
     Attributes:
-        reach: float64 [n], mm, of the sphere around each.
-        across, up: float64 [n], mm, largest distance from its own vertical axis, and half its height.
+        reach: float64 [n], mm, radius of the sphere around each body. across, up: float64 [n], mm, largest distance of
+            a body from its own vertical axis, and half its height.
         spread: float64 [n, 3, 3], mm: an ellipsoid is this matrix times the unit ball; not used for others.
         first: int64 [n + 1]; body i has corners first[i] to first[i + 1] of `corners`; an ellipsoid has no corners.
         corners: float64 [corner, 3], mm from the centre.
@@ -56,7 +59,8 @@ class Bodies(NamedTuple):
 
 
 def bodies_of(solids: Sequence[Solid]) -> Bodies:
-    """Ellipsoids and polyhedra without centres. Raises ValueError for others, and for bodies without point symmetry."""
+    """Ellipsoids and polyhedra without centres. Raises ValueError for other solids, and for bodies without point
+    symmetry."""
     p = pack(solids)
     n = len(solids)
     if not np.isin(p.kind, (ELLIPSOID, POLYHEDRON)).all():
@@ -126,7 +130,7 @@ def arrange(
 def _part(
     centres: Reals, bodies: Bodies, room: Reals, tall: Reals, gap: float, wanted: float, skin: float, sweeps: int
 ) -> int:
-    """Moves the bodies apart, in place; returns how many are still closer than `gap`.
+    """Moves the bodies apart, in place; returns the number of bodies that are still closer than `gap`.
 
     Pairs are moved to a distance of `wanted`, so that rounding leaves the gap."""
     n = centres.shape[0]
@@ -177,7 +181,7 @@ def _all_apart(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: 
 
 @njit(cache=True, nogil=True)
 def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
-    """Pairs of bodies [pair, 2] whose bounding spheres are closer than `room`: by cells, in order."""
+    """Pairs of bodies [pair, 2] whose bounding spheres are closer than `room`, in order; the search uses cells."""
     n = centres.shape[0]
     edge = 2 * reach.max() + room
     low, cells, size = np.empty(3), np.empty(3, np.int64), np.empty(3)

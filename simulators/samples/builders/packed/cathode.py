@@ -1,6 +1,4 @@
-"""Cathode: grains packed in electrolyte in a can, with a current collector below and, if asked for, a separator
-above.
-"""
+"""Cathode: grains packed in electrolyte in a can, with a current collector below and optionally a separator above."""
 
 from __future__ import annotations
 
@@ -33,10 +31,11 @@ from simulators.samples.builders.packed.pieces import Piece, PieceBuilder, check
 Grain = Ellipsoid | Polyhedron
 
 Habit = Literal["sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate"]
-TAIL = 2.5  # Standard deviations beyond which no size is drawn
+TAIL = 2.5  # Number of standard deviations beyond which no size is drawn
 HOLLOW, CRACK = 0.5, (0.95, 0.06)
-"""Size of a pore over the grain's; radius and half width of a crack over the inscribed sphere's radius."""
-MOST = 100_000  # Largest number of grains in a cell: this many take minutes to arrange
+"""Size of a pore divided by the size of its grain; radius and half width of a crack divided by the radius of the
+inscribed sphere."""
+MOST = 100_000  # Largest number of grains in a cell; the arrangement of this number takes minutes
 ROUNDEST, FLATTEST = 0.6, 0.85  # Least and largest cut of truncated octahedra; see `truncated_octahedron`
 MADE_OF: Mapping[str, str] = MappingProxyType(
     {
@@ -76,7 +75,7 @@ class Sizes:
 
 
 def grain(rng: np.random.Generator, habit: Habit, diameter: float, irregularity: float, aspect: float) -> Grain:
-    """A grain at the origin, of the volume of a sphere of `diameter` (mm), in any orientation.
+    """A grain at the origin in any orientation, with the volume of a sphere of `diameter` (mm).
 
     Args:
         irregularity: largest relative change of each axis, before all are scaled to the volume.
@@ -144,7 +143,7 @@ def grains(
 
 
 def core(grain: Grain) -> Grain:
-    """The pore of a hollow grain: its own shape, scaled down."""
+    """The pore of a hollow grain: the shape of the grain, scaled down."""
     if isinstance(grain, Ellipsoid):
         a, b, c = grain.semi_axes
         return replace(grain, semi_axes=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
@@ -152,7 +151,7 @@ def core(grain: Grain) -> Grain:
 
 
 def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
-    """A crack through a grain's middle: a flat ellipsoid within the grain's inscribed sphere."""
+    """A crack through the middle of a grain: a flat ellipsoid within the inscribed sphere of the grain."""
     radius = inner_radius(grain)
     w, x, y, z = rng.normal(size=4).tolist()
     wide, thin = CRACK[0] * radius, CRACK[1] * radius

@@ -26,7 +26,7 @@ Reals = NDArray[np.float64]
 MADE_OF: Mapping[str, str] = MappingProxyType({"matter": "polypropylene", "hole": "air"})
 POINTS_A_CELL = 8
 GREY = 2.0
-"""Attenuation of the matter times half its width, in a beam without energies."""
+"""Attenuation of the material times half its width, in a beam without energies."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Foam(PieceBuilder):
         return {"matter": GREY * 2 / width, "hole": 0.0}
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The matter and its holes, the largest first."""
+        """The material and its holes, the largest hole first."""
         rng = np.random.default_rng(self.seed)
         x, y, z = self.edges or (self.diameter, self.diameter, self.height)
         points = rng.uniform(-0.5, 0.5, (self.candidates, 3)) * (x, y, z)

@@ -1,4 +1,4 @@
-"""Pieces: solids with their roles in a phantom; a change in time may move them or change their charge."""
+"""Pieces: solids with their roles in a phantom. A change in time may move them or change their charge."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from simulators.samples.sample import Changing, Sample
 
 @dataclass(frozen=True)
 class Piece:
-    """Attributes:
-    solid: its attenuation is the share of its volume that the role fills: 1, or -1 for a hole in the same role.
-    role: "wall", "particle", ...; also its label.
-    instead_of: the role of the displaced piece.
+    """Attributes: solid: the solid. Its attenuation is the share of its volume that the role fills: 1, or -1 for a hole
+    in the same role. role: "wall", "particle", ...; the role is also the label. instead_of: the role of the displaced
+    piece.
     """
 
     solid: Solid
@@ -38,10 +37,9 @@ class PieceBuilder(Protocol):
     """Settings of a phantom made of pieces.
 
     Attributes:
-        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies.
-        attenuation: 1/mm of parts, for a beam without energies, or in place of all materials. If the scene gives any,
-            no part has a material.
-        default_materials: of each role, in a beam with energies.
+        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies. attenuation:
+            attenuation of parts in 1/mm, for a beam without energies, or to replace all materials. If the scene gives
+            an attenuation, no part has a material. default_materials: material of each role in a beam with energies.
     """
 
     made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
@@ -51,10 +49,10 @@ class PieceBuilder(Protocol):
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
+        """Attenuation of each role in 1/mm, in a beam without energies."""
 
     def pieces(self) -> tuple[Piece, ...]:
-        """All pieces. Raises ValueError if they cannot be placed."""
+        """All pieces. Raises ValueError if there is no room for them."""
 
 
 def check_roles(settings: PieceBuilder) -> None:
@@ -119,18 +117,15 @@ def _sunk(piece: Piece, factor: float, bottom: float) -> Ellipsoid | Cylinder | 
 
 @dataclass(frozen=True)
 class Charge:
-    """Pieces of one role change their attenuations, each at its own time: particles of a battery that charge.
+    """Pieces of one role change their attenuations, each at its own time, like particles of a battery that charge.
 
     The attenuation of a piece is multiplied by 1 + (factor - 1) s, and s rises from 0 to 1 as a logistic curve. Its
     middle is drawn between `from_s` and `from_s + over_s`; its width is `each_s`.
 
     Attributes:
-        role: of the pieces.
-        factor: by which the attenuation is multiplied in the end.
-        from_s: s since the camera was connected, when the first may charge.
-        over_s: s until the last one does.
-        each_s: s that a piece takes from 27 to 73 %.
-        seed: of the moments.
+        role: role of the pieces. factor: factor by which the attenuation is multiplied at the end. from_s: time at
+            which the first piece may charge, s since the camera was connected. over_s: s from then until the last piece
+            charges. each_s: s that a piece takes from 27 to 73 %. seed: seed of the times.
     """
 
     role: str = "particle"
@@ -163,8 +158,7 @@ def phantom(name: str, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sa
         name: of the kind.
         where: path of the phantom, for messages.
 
-    Raises:
-        SceneError: a wrong value. ValueError: pieces that cannot be placed.
+    Raises: SceneError: a value is wrong. ValueError: there is no room for the pieces.
     """
     kind = getattr(import_module(f"{__package__}.{name}"), name.capitalize())
     rest = {key: mapping[key] for key in mapping if key not in ("materials", "change")}
