@@ -134,7 +134,7 @@ class StateFit:
             return self.going(self._done, left)
 
         self.x = ordered_fista(
-            replace(self.problem, go_on=go_on), self.x, self.weight, self._subsets, sweeps=most, tv_steps=self._prox,
+            replace(self.problem, go_on=go_on), self.x, self.weight, self._subsets, sweeps=most, prox=self._prox,
             still=still,
         )  # fmt: skip
 
