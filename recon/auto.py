@@ -18,7 +18,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
-from recon.voxels.half_voxels import halves_by_quality
+from recon.voxels.half_voxels import with_halves
 from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import TrialWatch, VoxelMethod, Watch, scaled_problem, threads_for
 from recon.voxels.projector import Projector
@@ -125,10 +125,11 @@ class Auto(Method):
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """With "preview", only the first two candidates are tried. With "best", a costlier method is taken even if
         it is only slightly better, each test of a fit runs to its end, and the last iterations use half voxels."""
-        tried = self.candidates[:2] if quality == "preview" else self.candidates
-        least_gain = 0.0 if quality == "best" else self.least_gain
-        candidates = tuple(halves_by_quality(each, quality) for each in tried)
-        return replace(self, candidates=candidates, least_gain=least_gain)
+        if quality == "standard":
+            return self
+        best = quality == "best"
+        candidates = tuple(with_halves(each, best) for each in (self.candidates if best else self.candidates[:2]))
+        return replace(self, candidates=candidates, least_gain=0.0 if best else self.least_gain)
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))

@@ -34,6 +34,7 @@ MakePull = Callable[[VoxelProblem, F32], Pull]
 COST, USUAL_FURTHER = 3, 30
 """Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 1.1, 0.75, 0.1
+_MORE_VOLUMES = 0.6  # of half voxels: a quarter for the volume of whole ones, the rest for the coarse cells of damping
 _BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 
 
@@ -65,14 +66,16 @@ class HalfVoxels(VoxelMethod):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The method that ends nearer to the minimum, on half voxels; or, for a preview, farther from it."""
-        return halves_by_quality(with_quality(self, quality), quality)
+        made, wanted = with_quality(self, quality), _BY_QUALITY[quality]
+        return made if wanted is None else with_halves(made, wanted)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory in bytes: on half voxels, volumes are four times as large, and no FBP is made."""
         whole = bytes_of(self.buffers, geometry, grid, weighted)
         if not self.halves(geometry, grid):
             return whole
-        return max(whole, bytes_of(replace(self.buffers, filtered=False), geometry, halved(grid), weighted))
+        on_halves = replace(self.buffers, volumes=self.buffers.volumes + _MORE_VOLUMES, filtered=False)
+        return max(whole, bytes_of(on_halves, geometry, halved(grid), weighted))
 
     def in_half_voxels(
         self, problem: VoxelProblem, x: F32, mu: float, tv_steps: int, pull: MakePull | None = None, first: int = 0
@@ -110,12 +113,6 @@ def with_halves(method: MethodT, wanted: bool) -> MethodT:
     settings: Any = method
     changed: MethodT = replace(settings, half_voxels=wanted) if isinstance(method, HalfVoxels) else method
     return changed
-
-
-def halves_by_quality(method: MethodT, quality: Quality) -> MethodT:
-    """The method that uses half voxels always with "best", and never with "preview"."""
-    wanted = _BY_QUALITY[quality]
-    return method if wanted is None else with_halves(method, wanted)
 
 
 def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> bool:
