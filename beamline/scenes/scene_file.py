@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from recon.base.registry import unknown
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.samples.sample import Sample
+from simulators.samples.sample import Changing, Sample, TruthTable
 from simulators.scenes.scene import Scene, load_scene
 
 
@@ -89,6 +89,7 @@ class Truth:
     Attributes:
         values: float32 [z, y, x]; lengths are in mm.
         labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
+        table: of each particle, lengths from the rotation axis and the middle of the sample.
     """
 
     grid: Grid
@@ -96,6 +97,7 @@ class Truth:
     labels: NDArray[np.uint8]
     names: tuple[str, ...]
     kind: VoxelKind = VoxelKind.ATTENUATION
+    table: TruthTable = field(default_factory=dict)
 
 
 def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
@@ -125,7 +127,8 @@ def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
     grid = grid_of(detector, binning)
     z, y, x = grid.centre
     shifted = replace(grid, centre=(z + _above(detector, binning), y, x))
-    return Truth(grid, sample.attenuation(shifted), sample.labels(shifted), sample.names)
+    table = sample.table if isinstance(sample, Changing) else {}
+    return Truth(grid, sample.attenuation(shifted), sample.labels(shifted), sample.names, table=table)
 
 
 def grid_of(detector: Detector, binning: int) -> Grid:
@@ -143,8 +146,8 @@ def _above(detector: Detector, binning: int) -> float:
 
 
 def write_truth(path: Path, truth: Truth) -> None:
-    """Write an HDF5 file with entry/data/data (read by `beamline recon --truth`) and entry/data/labels, complete or not
-    at all.
+    """Write an HDF5 file with entry/data/data (read by `beamline recon --truth`), entry/data/labels and, if there is a
+    table, a column for each name in entry/particles; complete or not at all.
 
     Raises:
         DataError: `path` exists or cannot be written.
@@ -156,3 +159,5 @@ def write_truth(path: Path, truth: Truth) -> None:
         data["data"].attrs["units"] = truth.kind.unit("mm")
         data.create_dataset("labels", data=truth.labels, chunks=chunks, compression="gzip", compression_opts=1)
         data["labels"].attrs["names"] = ["air", *truth.names]
+        for name, column in truth.table.items():
+            file.create_dataset(f"entry/particles/{name}", data=column)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,6 +37,10 @@ class Sample(Protocol):
         """Label at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
 
 
+TruthTable = Mapping[str, NDArray[Any]]
+"""Columns by name, with a row for each particle; empty: there is no such truth."""
+
+
 @dataclass(frozen=True, eq=False)
 class Changing:
     """A sample that changes while it is scanned; as a `Sample` it is what it is at first.
@@ -44,10 +48,12 @@ class Changing:
     Attributes:
         at: the sample so many seconds after the camera was connected.
         start: at 0 s.
+        table: truth of each of its particles at 0 s, see TruthTable.
     """
 
     at: Callable[[float], Sample]
     start: Sample
+    table: TruthTable = field(default_factory=dict)
 
     @property
     def radius(self) -> float:

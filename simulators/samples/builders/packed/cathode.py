@@ -46,11 +46,21 @@ MADE_OF: Mapping[str, str] = MappingProxyType(
         "particle": "LiCoO2",
         "pore": "electrolyte",
         "crack": "electrolyte",
+        "gas": "air",
     }
 )
 """Material of each part by default."""
 GREY: Mapping[str, float] = MappingProxyType(
-    {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
+    {
+        "wall": 0.9,
+        "electrolyte": 0.15,
+        "collector": 0.9,
+        "separator": 0.1,
+        "particle": 2.2,
+        "pore": 0.15,
+        "crack": 0.15,
+        "gas": 0.0,
+    }
 )
 """Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
 transmits about 5 % at its thickest part."""

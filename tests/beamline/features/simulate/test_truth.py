@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -85,3 +86,14 @@ def test_the_page_of_the_layout_names_what_its_file_holds(tmp_path: Path) -> Non
     grid = Grid((2, 3, 4), 0.5)
     write_truth(tmp_path / "t.h5", Truth(grid, np.ones(grid.shape, "f4"), np.ones(grid.shape, "u1"), ("ellipsoid",)))
     assert unmatched(paths(tmp_path / "t.h5"), names("Truth file")) == (set(), set())
+
+
+def test_the_truth_of_particles_is_a_table_beside_the_voxels(tmp_path: Path) -> None:
+    small = "phantom.diameter=0.08", "phantom.height=0.05", "phantom.fill=0.3", "phantom.change.state=6"
+    scan = scan_of(open_scene("operando", (*small, "detector.shape=[32,64]")), 0, None, 0.0)
+    write_truth(tmp_path / "t.h5", truth_of(scan.scene.sample, scan.detector, 1))
+    with h5py.File(tmp_path / "t.h5") as file:
+        table = {name: column[:] for name, column in file["entry/particles"].items()}
+    assert table["particle"].size > 5 and {len(column) for column in table.values()} == {table["particle"].size}
+    np.testing.assert_allclose(table["grey"] * (1 + table["growth"]), 1)
+    assert table["growth"].max() > 0.03 and (table["charge"] == 1).all()
