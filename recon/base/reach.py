@@ -118,3 +118,12 @@ class Reach:
         """The box with voxels added until it contains the sample, as far as its reach was measured."""
         box = grid if self.sample is None else grid.reaching(self.sample.radius, geometry)
         return box.as_tall_as_rays(geometry) if self.tall else box
+
+    def is_cut_by(self, grid: Grid, geometry: Geometry) -> bool:
+        """True if the box of `grid` leaves out a part of the sample, by more than a voxel."""
+        if not self.measured and self.edges.beyond(0.0):
+            return True
+        whole = self.box(Grid.matching(geometry), geometry)
+        (low, high), (first, last) = whole.edges, grid.edges
+        room = np.array(grid.spacing[::-1])
+        return bool((first - low > room).any() or (high - last > room).any())

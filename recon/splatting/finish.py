@@ -24,6 +24,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.iterative import solve_views, watched
 from recon.voxels.methods import PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
@@ -135,8 +136,11 @@ def finish(
     """The volume after `sweeps` iterations over all projections, starting from the volume of a fit.
 
     The iterations use the measured projections. This is better by 0.5 to 2 dB than iterations on the residual of the
-    fit. Material outside the box is subtracted from the projections first, see `beyond_voxels`. Single pixels with the
-    same offset in all projections would make rings, so these offsets are subtracted first, too (see `ring_offsets`).
+    fit. If the box cuts off a part of the sample, that part is subtracted from the projections first, see
+    `beyond_voxels`. If it does not, Gaussians outside the box represent an air level and errors of the beam, and the
+    voxels must explain these, too: subtracted, they raise the residual in unseen projections of a measured walnut from
+    0.0050 to 0.0083. Single pixels with the same offset in all projections would make rings, so these offsets are
+    subtracted first, too (see `ring_offsets`).
     Memory: 8 volumes and 5 times the projections.
 
     Args:
@@ -160,7 +164,9 @@ def finish(
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     projector = Projector(problem.geometry, volume.grid, device=problem.device)
     decide = control.decide or Decisions(problem.seed)
-    beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
+    beyond = None
+    if reach_of(problem.views).is_cut_by(volume.grid, problem.geometry):
+        beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     if beyond is not None:
         prepared = replace(prepared, data=prepared.data - beyond)
     n_views, count, made, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()

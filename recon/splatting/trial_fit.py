@@ -13,6 +13,7 @@ from recon.base.geometry import Geometry
 from recon.splatting.finish import FINISH_SWEEPS, beyond_voxels, level_of, refine
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.choice import Prediction, TrialChoice, significantly_better
 from recon.voxels.projector import projection_lines
 from recon.voxels.trial import Trial
@@ -88,8 +89,10 @@ class _Fit:
         model, box = made.gaussians, made.volume.grid
         assert isinstance(model, Gaussians)
 
+        cut = reach_of(views.views).is_cut_by(box, views.geometry)
+
         def beyond(geometry: Geometry) -> F32 | None:
-            lines = beyond_voxels(model, geometry, box, method.fit)
+            lines = beyond_voxels(model, geometry, box, method.fit) if cut else None
             if lines is None:
                 return None
             return times_power(np.ascontiguousarray(projection_lines(lines)[:, cols]), -units.integral)
