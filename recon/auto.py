@@ -125,11 +125,11 @@ class Auto(Method):
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """With "preview", only the first two candidates are tried. With "best", a costlier method is taken even if
         it is only slightly better, each test of a fit runs to its end, and the last iterations use half voxels."""
-        if quality == "preview":
-            return replace(self, candidates=tuple(with_halves(each, False) for each in self.candidates[:2]))
-        if quality == "best":
-            return replace(self, candidates=tuple(with_halves(each, True) for each in self.candidates), least_gain=0.0)
-        return self
+        if quality == "standard":
+            return self
+        best = quality == "best"
+        candidates = tuple(with_halves(each, best) for each in (self.candidates if best else self.candidates[:2]))
+        return replace(self, candidates=candidates, least_gain=0.0 if best else self.least_gain)
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))

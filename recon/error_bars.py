@@ -135,7 +135,8 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
     made_by = (FistaTv(), PnpDct(), *pull_methods()) if isinstance(method, Fit) else (method,)
-    work = max(one.memory(geometry, grid, True) for one in made_by)
+    refits = [one.refit(_SHARE) if isinstance(one, VoxelMethod) else one for one in made_by]
+    work = max(one.memory(geometry, grid, True) for one in refits)
     return work + 4 * (2 * rays + 5 * voxels)
 
 

@@ -239,7 +239,7 @@ def fit(reached: FitReached) -> str:
     """n of N, rate, projections, Gaussians (not for iterations), residuals and remaining time."""
     known = next((name for name in _ITERATIONS if reached.unit.startswith(name)), None)
     word = _ITERATIONS[known] if known else reached.unit or ("steps" if reached.n_gaussians else "iterations")
-    about = "about " if "as a rule" in reached.unit or "usually" in reached.unit else ""
+    about = "about " if "as a rule" in reached.unit else ""
     parts = (
         [f"{reached.step} of {about}{reached.steps} {word}"]
         if reached.steps

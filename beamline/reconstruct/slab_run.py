@@ -175,7 +175,7 @@ class _SlabJob:
             if first or not method.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with fista-tv instead: {error}"
-            return by(FistaTv(), part, box, control), remark
+            return by(FistaTv(half_voxels=False), part, box, control), remark  # the plan has no memory for half voxels
 
 
 def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:

@@ -26,7 +26,7 @@ from recon.splatting.splat import project, voxel_means
 from recon.voxels.iterative import solve_views, watched
 from recon.voxels.methods import PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
-from recon.voxels.priors import NoiseBalance, pnp_dct
+from recon.voxels.priors import NoiseBalance, pnp_dct, tv_prox
 from recon.voxels.projector import Projector
 from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
@@ -75,7 +75,7 @@ def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength
     """Iterations of total variation from x [y, x, z], and PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     parts = Subsets.of(problem, count, to_the_end=False)
-    x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
+    x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, prox=tv_prox(problem, TV_STEPS))
     if not (problem.go_on.going and strength):
         return x
     return pnp_dct(replace(problem, go_on=problem.go_on.after(sweeps)), x, strength, steps=PnpDct.iterations)

@@ -22,17 +22,19 @@ from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.ordered_fista import Subsets, subsets_of
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.ordered_fista import Pull, Subsets, ordered_fista, subsets_of
+from recon.voxels.priors import tv_prox
 from recon.voxels.resolution import smoothed
 from recon.voxels.standstill import ENDED, USUAL_SWEEPS, with_quality
 from recon.voxels.voxel_problem import VoxelProblem, bytes_of
 
 MethodT = TypeVar("MethodT")
+MakePull = Callable[[VoxelProblem, F32], Pull]
 
 COST, USUAL_FURTHER = 3, 30
 """Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 1.1, 0.75, 0.1
+_MORE_VOLUMES = 0.6  # of half voxels: a quarter for the volume of whole ones, the rest for the coarse cells of damping
 _BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 
 
@@ -68,8 +70,42 @@ class HalfVoxels(VoxelMethod):
         return made if wanted is None else with_halves(made, wanted)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Peak memory in bytes: on half voxels, volumes are four times as large."""
-        return bytes_of(self.buffers, geometry, halved(grid) if self.halves(geometry, grid) else grid, weighted)
+        """Peak memory in bytes: on half voxels, volumes are four times as large, and no FBP is made."""
+        whole = bytes_of(self.buffers, geometry, grid, weighted)
+        if not self.halves(geometry, grid):
+            return whole
+        on_halves = replace(self.buffers, volumes=self.buffers.volumes + _MORE_VOLUMES, filtered=False)
+        return max(whole, bytes_of(on_halves, geometry, halved(grid), weighted))
+
+    def in_half_voxels(
+        self, problem: VoxelProblem, x: F32, mu: float, tv_steps: int, pull: MakePull | None = None, first: int = 0
+    ) -> F32:
+        """The volume x [y, x, z] after further iterations on half voxels; x itself if `halves` says that there are
+        none.
+
+        Total variation is a surface times a change of density. Differences between voxels half as wide, summed over
+        four times as many voxels, are twice as large. Therefore the weight is halved.
+
+        Args:
+            x: the volume of whole voxels.
+            mu: weight μ of total variation with whole voxels.
+            tv_steps: dual steps of each proximal step.
+            pull: function of the problem with half voxels and of its first volume; returns the pull of each step.
+            first: number of planned iterations before those that made x, for the progress.
+        """
+        projector, settings = problem.projector, problem.decide.settings
+        if not self.halves(projector.geometry, projector.grid):
+            return x
+        before = int(settings.get(ENDED[1], 0))
+        fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
+        made = ordered_fista(
+            fine, start, mu / 2, subsets_on_halves(fine), sweeps=self.iterations, prox=tv_prox(fine, tv_steps),
+            pull=None if pull is None else pull(fine, start), still=self.still,
+        )  # fmt: skip
+        settings["half_voxel_iterations"] = int(settings.get(ENDED[1], 0))
+        settings[ENDED[1]] = before + settings["half_voxel_iterations"]
+        ny, nx, nz = x.shape
+        return made.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
 
 
 def with_halves(method: MethodT, wanted: bool) -> MethodT:
@@ -108,35 +144,11 @@ def halved(grid: Grid) -> Grid:
     return Grid((nz, 2 * ny, 2 * nx), grid.voxel_size / 2, grid.centre, grid.spacing[0])
 
 
-def in_half_voxels(
-    problem: VoxelProblem,
-    x: F32,
-    weight: NoiseBalance | float,
-    make: Callable[[VoxelProblem, F32, float], F32],
-    first: int = 0,
-) -> F32:
-    """The volume x [y, x, z] after further iterations on half voxels.
-
-    Total variation is a surface times a change of density. Differences between voxels half as wide, summed over four
-    times as many voxels, are twice as large. Therefore the weight is halved.
-
-    Args:
-        x: the volume of whole voxels.
-        weight: weight μ of total variation with whole voxels.
-        make: function of the problem with half voxels, its first volume and its weight; returns the volume.
-        first: number of planned iterations before those that made x, for the progress.
-    """
-    settings = problem.decide.settings
-    before = int(settings.get(ENDED[1], 0))
+def _with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
+    """The problem with half voxels, whose iterations follow `done` iterations on whole ones."""
     projector = replace(problem.projector, grid=halved(problem.projector.grid))
     data = smoothed(problem.views, projector.resolution, None if problem.weight is None else problem.weight > 0)
-    fine = replace(
+    return replace(
         problem, projector=projector, data=data, measured=None if data is problem.views else problem.views,
-        go_on=problem.go_on.after(first + before, COST), _norms=[],
+        go_on=problem.go_on.after(done, COST), _norms=[],
     )  # fmt: skip
-    mu = weight.value if isinstance(weight, NoiseBalance) else weight
-    made = make(fine, np.repeat(np.repeat(x, 2, axis=0), 2, axis=1), mu / 2)
-    settings["half_voxel_iterations"] = int(settings.get(ENDED[1], 0))
-    settings[ENDED[1]] = before + settings["half_voxel_iterations"]
-    ny, nx, nz = x.shape
-    return made.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)

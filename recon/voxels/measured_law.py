@@ -33,7 +33,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.iterative import Iterating, solve
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.priors import NoiseBalance, tv_prox
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
@@ -144,7 +144,7 @@ class _TotalVariation:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
         subsets = Subsets.of(problem, subsets_of(problem.projector.geometry))
-        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
+        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, prox=tv_prox(problem, _TV_STEPS))
 
 
 @dataclass(frozen=True)

@@ -18,22 +18,20 @@ from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels, in_half_voxels, subsets_on_halves
+from recon.voxels.half_voxels import HalfVoxels, with_halves
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, pnp_dct
+from recon.voxels.priors import NoiseBalance, pnp_dct, tv_prox, weight_now
 from recon.voxels.standstill import ENDED, MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     NORM,
     Buffers,
     Momentum,
-    TotalVariationProx,
     VoxelProblem,
     bytes_of,
     density_unit,
-    difference_weights,
     interleaved,
     largest_eigenvalue,
 )
@@ -84,22 +82,17 @@ class FistaTv(HalfVoxels):
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections with the best weight; with `tv_weight`, if it is given."""
+        """The residuals in the held-out projections with the best weight; with `tv_weight`, if it is given.
+
+        The volume is one of whole voxels, because the model of whole voxels predicts the projections.
+        """
         if self.tv_weight is not None or trial.weight is None:
-            return trial.predicted(self)
+            return trial.predicted(with_halves(self, False))
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         x, weight = self.with_weight(problem, x)
-        if not problem.go_on.going or not self.halves(problem.projector.geometry, problem.projector.grid):
-            return x
-        return in_half_voxels(problem, x, weight, self.in_halves)
-
-    def in_halves(self, problem: VoxelProblem, x: F32, mu: float) -> F32:
-        """The volume x [y, x, z] after further iterations with the weight μ, each with all projections."""
-        return ordered_fista(
-            problem, x, mu, subsets_on_halves(problem), sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
-        )
+        return self.in_half_voxels(problem, x, weight_now(weight), self.tv_steps) if problem.go_on.going else x
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None
@@ -118,10 +111,10 @@ class FistaTv(HalfVoxels):
             weight = problem.decide("weight", lambda: share * unit * norm)
         subsets = Subsets.of(problem, subsets_of(projector.geometry, self.subsets, self.to_the_end), self.to_the_end)
         x = ordered_fista(
-            problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps, still=self.still
-        )  # fmt: skip
+            problem, x, weight, subsets, sweeps=self.iterations, prox=tv_prox(problem, self.tv_steps), still=self.still
+        )
         if self.tv_weight is None and unit > 0:
-            used = weight.value if isinstance(weight, NoiseBalance) else weight
+            used = weight_now(weight)
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
@@ -188,7 +181,7 @@ class OsSirtTv(VoxelMethod):
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector, scale = problem.projector, problem.scale
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
-        prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, self.tv_steps)
+        prox = tv_prox(problem, self.tv_steps)
         weight: NoiseBalance | float | None = None
         threshold = 0.0
         # One order of the subsets, because a noisy volume never converges if each sweep ends with another subset.
@@ -201,8 +194,7 @@ class OsSirtTv(VoxelMethod):
                 weight = weight or choose_weight(problem, x, self.usual_sweeps)
                 if isinstance(weight, NoiseBalance):
                     weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
-                mu = weight.value if isinstance(weight, NoiseBalance) else weight
-                threshold = float(mu * problem.decide("pace", lambda: sweeps.pace))
+                threshold = float(weight_now(weight) * problem.decide("pace", lambda: sweeps.pace))
                 prox(x, threshold)
             else:
                 # The unit follows the volume, because the volume is blurred and fainter after the first iterations.
@@ -299,5 +291,5 @@ class PnpDct(VoxelMethod):
         # In addition to the first volume, tests make volumes from copies of the projections (of all if there are few
         # rows).
         trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
-        first = FistaTv().memory(geometry, grid, weighted) + trials
+        first = FistaTv(half_voxels=False).memory(geometry, grid, weighted) + trials
         return max(first, patches)

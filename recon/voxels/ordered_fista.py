@@ -26,15 +26,13 @@ from recon.base.geometry import Geometry
 from recon.base.registry import MethodEntry, in_folders, loaded
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.priors import NoiseBalance, weight_now
 from recon.voxels.projector import Projector
 from recon.voxels.standstill import Standstill
 from recon.voxels.view_weights import angular_weights
 from recon.voxels.voxel_problem import (
     Momentum,
-    TotalVariationProx,
     VoxelProblem,
-    difference_weights,
     interleaved,
     largest_eigenvalue,
     whitened,
@@ -162,7 +160,7 @@ class Pull(Protocol):
 
 
 class Prox(Protocol):
-    """A proximal step for a prior other than total variation, such as one that compares x with another volume."""
+    """The proximal step of a prior: `TotalVariationProx`, or one that compares x with another volume."""
 
     def __call__(self, x: Any, threshold: float) -> None:
         """Replace x [y, x, z], an array of the device, by the proximal point of threshold times the prior."""
@@ -180,7 +178,7 @@ class _Part:
 
 
 class _Descent:
-    """The state of `ordered_fista`: the volume, its momentum, the dual field of total variation, and what a step needs.
+    """The state of `ordered_fista`: the volume, its momentum, the proximal step, and what a step needs.
 
     Attributes:
         x: [y, x, z], on the device.
@@ -188,16 +186,9 @@ class _Descent:
         seen: whitened residuals of some projections of the last sweep.
     """
 
-    def __init__(
-        self, problem: VoxelProblem, x: F32, subsets: Subsets, tv_steps: int | Prox, pull: Pull | None
-    ) -> None:
-        device = self._device = voxel_device(problem.projector.device)
-        self._prox: Prox
-        if isinstance(tv_steps, int):
-            differences = difference_weights(problem.projector.grid)
-            self._prox = TotalVariationProx(x.shape, differences, problem.nonnegative, tv_steps, device)
-        else:
-            self._prox = tv_steps
+    def __init__(self, problem: VoxelProblem, x: F32, subsets: Subsets, prox: Prox, pull: Pull | None) -> None:
+        device, self._prox = voxel_device(problem.projector.device), prox
+        self._device = device
         self._data, self._rays = device.array(problem.data), None
         if problem.weight is not None:
             self._rays = device.array(problem.weight)
@@ -225,7 +216,7 @@ class _Descent:
         parts = self._parts if on_subsets else [self._all]
         count, made = len(parts), self._subsets
         damping, share = (made.damping, 1.0) if on_subsets else (made.damping_of_all, 1 / len(self._parts))
-        mu = (weight.value if isinstance(weight, NoiseBalance) else weight) / count
+        mu = weight_now(weight) / count
         for at, s in enumerate(self._problem.rng.permutation(count)):
             self._residual(parts[s], count, looked_at)
             self._step(mu, count, damping, made.step * share, made.damped_step * share)
@@ -250,7 +241,7 @@ class _Descent:
         part.projector.adjoint_lines(residual, self._gradient)
 
     def _step(self, mu: float, count: int, damping: Damping, step: float, damped_step: float) -> None:
-        """One step: x <- proximal point of total variation after a gradient step; see `ordered_fista`."""
+        """One step: x <- proximal point of the prior after a gradient step; see `ordered_fista`."""
         device, x, length = self._device, self.x, damping.gain * damped_step
         if self._pull is not None:
             pull = self._pull.share / step
@@ -277,7 +268,7 @@ class _Descent:
 
 
 def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int | Prox,
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, prox: Prox,
     pull: Pull | None = None, still: float = STANDS_STILL,
 ) -> F32:  # fmt: skip
     """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume has converged.
@@ -296,12 +287,11 @@ def ordered_fista(
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
         sweeps: largest number of sweeps.
-        tv_steps: dual steps of each proximal step, which continue from the last ones; or the proximal step of another
-            prior.
+        prox: proximal step of the prior, such as `tv_prox` for total variation.
         pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is also minimised.
         still: share of the norm of the volume; 0: all sweeps are made.
     """
-    descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
+    descent, scale, count = _Descent(problem, x, subsets, prox, pull), problem.scale, len(subsets.views)
     n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
     first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(_VIEWS_ON_SUBSETS / n_views))
     standstill = Standstill(problem.decide, still, voxel_device(problem.projector.device), first)

@@ -1,4 +1,4 @@
-"""Priors: the weight of total variation from the noise, and the denoiser of sparse patches (PnP-DCT)."""
+"""Priors: total variation, with its weight from the noise, and the denoiser of sparse patches (PnP-DCT)."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from recon.kernels.cpu.tv import total_variation
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import (
+    TotalVariationProx,
     VoxelProblem,
     density_unit,
     difference_weights,
@@ -101,6 +102,18 @@ class NoiseBalance:
         factor = float(np.clip(ratio**2, 1.0, MOST_BY_RESIDUAL))
         self.value = self.first * factor
         return self.value
+
+
+def weight_now(weight: NoiseBalance | float) -> float:
+    """The weight μ of total variation, which a `NoiseBalance` adapts after each sweep."""
+    return weight.value if isinstance(weight, NoiseBalance) else weight
+
+
+def tv_prox(problem: VoxelProblem, steps: int) -> TotalVariationProx:
+    """The proximal step of total variation on the grid and the device of a problem, with this number of dual steps."""
+    grid, device = problem.projector.grid, voxel_device(problem.projector.device)
+    nz, ny, nx = grid.shape
+    return TotalVariationProx((ny, nx, nz), difference_weights(grid), problem.nonnegative, steps, device)
 
 
 def _by_views(geometry: Geometry) -> float:

@@ -28,7 +28,7 @@ from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoic
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Pull, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, noise_of_volume, pnp_dct
+from recon.voxels.priors import NoiseBalance, noise_of_volume, pnp_dct, tv_prox
 from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.standstill import MOST_SWEEPS
@@ -418,7 +418,7 @@ class Trial:
         """
         most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=most, tv_steps=TV_STEPS, pull=pull, still=STILL_IN_TRIAL
+            part, x, weight, self._subsets, sweeps=most, prox=tv_prox(part, TV_STEPS), pull=pull, still=STILL_IN_TRIAL
         ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:

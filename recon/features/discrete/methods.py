@@ -19,12 +19,12 @@ from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels, in_half_voxels, subsets_on_halves
+from recon.voxels.half_voxels import HalfVoxels
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.priors import NoiseBalance, tv_prox, weight_now
 from recon.voxels.projector import volume_lines
 from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.trial import TV_STEPS, Trial
@@ -124,33 +124,20 @@ class Discrete(HalfVoxels):
         return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        smooth = FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels)
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return smooth.iterate(problem, x)
-        going, trial = problem.go_on, cache(partial(Trial.of, problem))
+            return FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels).iterate(problem, x)
+        trial = cache(partial(Trial.of, problem))
         x, weight = FistaTv(still=self.still).with_weight(problem, x, trial)
-        materials, halves = self.materials(problem, weight, trial), problem.projector
-        if not going.going:
-            return x
-        if materials is not None:
-            x = self.pulled(problem, x, weight, materials, self.first_sweeps)
-        if not going.going or not self.halves(halves.geometry, halves.grid):
+        materials, mu = self.materials(problem, weight, trial), weight_now(weight)
+        if not problem.go_on.going:
             return x
         if materials is None:
-            return in_half_voxels(problem, x, weight, smooth.in_halves)
-        return in_half_voxels(problem, x, weight, partial(self.in_halves, materials), self.first_sweeps)
-
-    def in_halves(self, materials: MaterialPrior, problem: VoxelProblem, x: F32, mu: float) -> F32:
-        """The volume x [y, x, z] after further iterations with a pull to the levels, each with all projections.
-
-        Args:
-            mu: weight of total variation without the pull.
-        """
-        pull = MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))
-        return ordered_fista(
-            problem, x, mu * materials.tv_share, subsets_on_halves(problem), sweeps=self.iterations, tv_steps=TV_STEPS,
-            pull=pull, still=self.still,
-        )  # fmt: skip
+            return self.in_half_voxels(problem, x, mu, TV_STEPS)
+        x = self.pulled(problem, x, weight, materials, self.first_sweeps)
+        if not problem.go_on.going:
+            return x
+        pull = partial(_pull_to, materials)
+        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
 
     def materials(
         self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None]
@@ -174,16 +161,14 @@ class Discrete(HalfVoxels):
     ) -> F32:  # fmt: skip
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
         `to_the_end` as in `Subsets.of`."""
-        where, thin = in_field(problem), thin_parts(x, materials)
-        further = replace(problem, go_on=problem.go_on.after(done))
-        mu = weight.value if isinstance(weight, NoiseBalance) else weight
+        pull, further = _pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
-            further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS, still=self.still,
-            pull=MaterialPull(drawn_apart(materials), where, thin),
+            further, x, weight_now(weight) * materials.tv_share, subsets, sweeps=self.iterations,
+            prox=tv_prox(problem, TV_STEPS), pull=pull, still=self.still,
         )  # fmt: skip
-        share = problem.decide(UNDECIDED, lambda: undecided_share(x[where], materials))
+        share = problem.decide(UNDECIDED, lambda: undecided_share(x[pull.where], materials))
         of_scan = materials.scaled(problem.units.density)._asdict()
         problem.decide.settings |= {UNDECIDED: share, **{name + _OF: value for name, value in of_scan.items()}}
         return x
@@ -204,3 +189,8 @@ class Discrete(HalfVoxels):
         found = MaterialTrial(trial, weight, self.iterations, levels)
         found.choose()
         return found
+
+
+def _pull_to(materials: MaterialPrior, problem: VoxelProblem, x: F32) -> MaterialPull:
+    """The pull of x [y, x, z], the volume of total variation, to these materials in the field of view."""
+    return MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))

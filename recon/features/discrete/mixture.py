@@ -162,7 +162,7 @@ def table_of(materials: MaterialPrior, noise: float) -> MaterialTable:
 
 @dataclass(frozen=True, eq=False)
 class MaterialPull:
-    """The pull of voxels towards discrete levels; a `recon.voxels.priors.Pull`.
+    """The pull of voxels towards discrete levels; a `recon.voxels.ordered_fista.Pull`.
 
     Attributes:
         where: [y, x, z] voxels that are pulled.

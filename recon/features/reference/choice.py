@@ -13,20 +13,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recon.base.arrays import F64
+from recon.base.arrays import F32, F64
 from recon.base.decisions import Prior
 from recon.base.empirical import ONE_IN
 from recon.base.volume import Volume
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, affinely_moved, padded, roughly_moved
 from recon.features.reference.particles import particles_of, placed
-from recon.voxels.choice import LEAST_GAIN, TrialChoice, exceeds_standard_error, significantly_better
+from recon.voxels.choice import (
+    LEAST_GAIN,
+    BestStrength,
+    TrialChoice,
+    exceeds_standard_error,
+    preferred_strength,
+    significantly_better,
+)
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 MARGIN = 16  # voxels beyond the box up to which the reference is kept, because it may have moved
 _FIRST = 1.4  # first weight of the change, divided by the best weight of total variation
-_OCTAVES = 4  # most octaves from the first weight
 _FEW = 6  # sweeps with a displaced copy
 
 
@@ -98,12 +104,13 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     fit.rounds(PLAN)
     if trial.ended or not fit.x.any():
         return ReferenceVerdict(False, "stopped before it was tried")
-    octave, left = _best_octave(trial, fit)
-    alone = _without(trial, fit, smooth, mu)
+    best, alone = _best_weight(trial, fit), _without(trial, fit, smooth, mu)
+    if best is None or alone is None:
+        return ReferenceVerdict(False, "stopped before it was tried")
     least = choice.least
-    others = [("total variation of the same kind without it", trial.in_line_integrals(alone))]
+    others = [("total variation of the same kind without it", trial.in_line_integrals(alone.residuals))]
     others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
-    own = trial.in_line_integrals(left)
+    own = trial.in_line_integrals(best.residuals)
     told = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"
     for name, residuals in others:
         told += f", by {name} {residuals.mean():#.4g}"
@@ -113,7 +120,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
         return ReferenceVerdict(
             False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}"
         )
-    all_views = fit.weight * 2.0**octave * np.sqrt(ONE_IN / (ONE_IN - 1))
+    all_views = best.strength * np.sqrt(ONE_IN / (ONE_IN - 1))
     of_scan = problem.units.prior(Prior(float(all_views)), problem.weight is not None, 1).weight
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
@@ -122,46 +129,27 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 
-def _best_octave(trial: Trial, fit: StateFit) -> tuple[float, F64]:
-    """The weight in octaves from that of `fit` that predicts best, between whole octaves, and the least residuals."""
-    tried: dict[int, F64] = {}
+def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
+    """The weight that predicts best with the reference; None: the trials were stopped."""
 
-    def mean(octave: int) -> float:
-        if octave not in tried:
-            other = fit.again(fit.weight * 2.0**octave, fit.x)
-            other.sharpen(1)
-            tried[octave] = trial.residuals(other.x)
-        return float(tried[octave].mean())
+    def residuals_of(weight: float) -> F64:
+        other = fit.again(weight, fit.x)
+        other.sharpen(1)
+        return trial.residuals(other.x)
 
-    at = _descended(mean)
-    down, up = mean(at - 1) - mean(at), mean(at + 1) - mean(at)
-    vertex = (down - up) / (2 * (down + up)) if min(down, up) >= 0 and down + up > 0 else 0.0
-    return at + vertex, tried[at]
+    return preferred_strength(residuals_of, fit.weight)
 
 
-def _descended(mean: Any) -> int:
-    at = 0
-    for towards in (1, -1):
-        while abs(at + towards) <= _OCTAVES and mean(at + towards) < mean(at):
-            at += towards
-        if at:
-            break
-    return at
+def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrength | None:
+    """The same for total variation with weights that fall as with the reference, but without it; searched from μ."""
 
+    def residuals_of(weight: float) -> F64:
+        other = fit.again(weight, smooth)
+        other.alone()
+        other.sharpen(1)
+        return trial.residuals(other.x)
 
-def _without(trial: Trial, fit: StateFit, smooth: np.ndarray, mu: float) -> F64:
-    """The least residuals of total variation with weights that fall as with the reference, but without it."""
-    tried: dict[int, F64] = {}
-
-    def mean(octave: int) -> float:
-        if octave not in tried:
-            other = fit.again(mu * 2.0**octave, smooth)
-            other.alone()
-            other.sharpen(1)
-            tried[octave] = trial.residuals(other.x)
-        return float(tried[octave].mean())
-
-    return tried[_descended(mean)]
+    return preferred_strength(residuals_of, mu)
 
 
 def _better_displaced(trial: Trial, fit: StateFit) -> str | None:

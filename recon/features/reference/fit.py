@@ -135,7 +135,7 @@ class StateFit:
 
         self.x = ordered_fista(
             replace(self.problem, go_on=GoesOn(go_on)), self.x, self.weight, self._subsets, sweeps=most,
-            tv_steps=self._prox, still=still,
+            prox=self._prox, still=still,
         )  # fmt: skip
 
     def follow(self, steps: Sequence[tuple[int, float]]) -> None:

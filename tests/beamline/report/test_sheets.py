@@ -18,7 +18,7 @@ def _pixels(png: bytes) -> np.ndarray:
 @pytest.mark.parametrize("rows", [20, 1])
 def test_the_sheet_of_darks_and_flats_shows_each_as_it_is_in_its_own_window(rows: int) -> None:
     """A picture that is dark on the left, its mirror image beside the same other picture, and brighter ones."""
-    step = np.repeat(np.float32([[0, 1]]), 15, axis=1).repeat(rows, axis=0)
+    step = np.repeat(np.array([[0, 1]], np.float32), 15, axis=1).repeat(rows, axis=0)
     own, mirrored, brighter = (
         _pixels(reference_sheet({"dark": image, "flats": step}, (10 * rows, 300))).mean(axis=2)
         for image in (step, step[:, ::-1], 50 * step)

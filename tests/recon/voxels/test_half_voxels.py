@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,18 @@ import pytest
 
 import recon
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid
+from recon.error_bars import error_bars_memory
 from recon.kernels.cpu.tv import total_variation
-from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels
+from recon.voxels.choice import TrialChoice
+from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels, with_halves
+from recon.voxels.iterative import scaled_problem
+from recon.voxels.projector import Projector
+from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import difference_weights
 
 
@@ -33,8 +39,8 @@ DISCS = packed()
 SIDE, ROWS = 64, 3
 
 
-def geometry_of(views: int, columns: int = SIDE) -> Geometry:
-    return Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), (ROWS, columns), pixel_pitch=1.0)
+def geometry_of(views: int, columns: int = SIDE, rows: int = ROWS) -> Geometry:
+    return Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), (rows, columns), pixel_pitch=1.0)
 
 
 def exact_views(geometry: Geometry) -> np.ndarray:
@@ -45,7 +51,7 @@ def exact_views(geometry: Geometry) -> np.ndarray:
         away = u - (x * np.cos(geometry.angles) + y * np.sin(geometry.angles))[:, None]
         lines += 2 * density * np.sqrt(np.maximum(radius**2 - away**2, 0))
     pixels = lines.reshape(geometry.n_views, SIDE, 8).mean(2)
-    return np.repeat(pixels[:, None], ROWS, axis=1).astype(np.float32)
+    return np.repeat(pixels[:, None], geometry.detector_shape[0], axis=1).astype(np.float32)
 
 
 def truth() -> np.ndarray:
@@ -140,12 +146,51 @@ def test_a_slab_that_follows_decisions_is_the_same_to_the_bit() -> None:
 
 
 def test_memory_counts_four_times_the_volume_only_with_few_projections() -> None:
-    few, many = geometry_of(20), geometry_of(60)
+    few, many = geometry_of(20, rows=64), geometry_of(60, rows=64)
     method = recon.FistaTv()
     never = replace(method, half_voxels=False)
     grid = Grid.matching(few)
-    assert method.memory(few, grid, False) == method.memory(few, halved(grid), False) > never.memory(few, grid, False)
+    volume = 4 * np.prod(grid.shape)
+    assert method.memory(few, grid, False) > 4 * method.buffers.volumes * volume > never.memory(few, grid, False)
     assert method.memory(many, grid, False) == never.memory(many, grid, False)
+
+
+@pytest.mark.parametrize("method", [recon.FistaTv(2, half_voxels=True), recon.Discrete(2, half_voxels=True)])
+def test_the_stated_memory_is_that_of_the_peak(method: recon.FistaTv | recon.Discrete) -> None:
+    geometry = geometry_of(20, 2 * SIDE, 24)  # in fewer columns the coarse cells of damping are a part of the volume
+    views = np.repeat(exact_views(geometry), 2, axis=2)
+    problem = ReconProblem(Views(views, geometry), Grid.matching(geometry))
+    method.run(problem, RunControl())  # loads kernels
+    tracemalloc.start()
+    method.run(problem, RunControl())
+    peak, stated = tracemalloc.get_traced_memory()[1], method.memory(geometry, problem.grid, False)
+    tracemalloc.stop()
+    assert 0.75 * stated < peak < stated
+
+
+def test_what_never_uses_half_voxels_states_the_memory_of_whole_ones() -> None:
+    few = geometry_of(20, rows=64)
+    grid = Grid.matching(few)
+    halves = recon.FistaTv().memory(few, grid, True)
+    assert recon.PnpDct().memory(few, grid, True) < halves
+    assert error_bars_memory(recon.FistaTv(), few, grid) < halves
+    assert error_bars_memory(recon.FistaTv(), few, grid) == error_bars_memory(
+        with_halves(recon.FistaTv(), False), few, grid
+    )
+
+
+def test_a_trial_with_a_given_weight_compares_whole_voxels() -> None:
+    geometry = geometry_of(20)
+    projector = Projector(geometry, Grid.matching(geometry))
+    views = Views(exact_views(geometry), geometry)
+    scan, _ = scaled_problem(projector, views, None, True, GoesOn(), Decisions(), False)
+    trial = Trial.of(scan)
+    assert trial is not None
+    left = [
+        recon.FistaTv(tv_weight=1e-3, half_voxels=wanted).predict(trial, TrialChoice("")).residuals
+        for wanted in (False, True)
+    ]
+    assert left[0] is not None and left[0] == left[1]
 
 
 def test_best_uses_them_and_a_preview_does_not() -> None:
