@@ -136,6 +136,7 @@ def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry)
 def require_usable(scan: SelectedScan) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
     _usable(scan, lambda sentence: None)
+    scan.selection.step(TiltAndLens).of(scan)
 
 
 def _usable(scan: SelectedScan, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:

@@ -126,15 +126,15 @@ class Discrete(HalfVoxels):
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         if x.any():  # a pull would hide the noise that the refits for error bars must show
             return FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels).iterate(problem, x)
-        going, trial = problem.go_on, cache(partial(Trial.of, problem))
+        trial = cache(partial(Trial.of, problem))
         x, weight = FistaTv(still=self.still).with_weight(problem, x, trial)
         materials, mu = self.materials(problem, weight, trial), weight_now(weight)
-        if not going.going:
+        if not problem.go_on.going:
             return x
         if materials is None:
             return self.in_half_voxels(problem, x, mu, TV_STEPS)
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
-        if not going.going:
+        if not problem.go_on.going:
             return x
         pull = partial(_pull_to, materials)
         return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
@@ -161,8 +161,7 @@ class Discrete(HalfVoxels):
     ) -> F32:  # fmt: skip
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
         `to_the_end` as in `Subsets.of`."""
-        pull = _pull_to(materials, problem, x)
-        further = replace(problem, go_on=problem.go_on.after(done))
+        pull, further = _pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(

@@ -10,7 +10,7 @@ import pytest
 
 import recon
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
@@ -19,7 +19,7 @@ from recon.error_bars import error_bars_memory
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.choice import TrialChoice
 from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels, with_halves
-from recon.voxels.iterative import Watch, scaled_problem
+from recon.voxels.iterative import scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import difference_weights
@@ -183,7 +183,7 @@ def test_a_trial_with_a_given_weight_compares_whole_voxels() -> None:
     geometry = geometry_of(20)
     projector = Projector(geometry, Grid.matching(geometry))
     views = Views(exact_views(geometry), geometry)
-    scan, _ = scaled_problem(projector, views, None, True, Watch(), Decisions(), False)
+    scan, _ = scaled_problem(projector, views, None, True, GoesOn(), Decisions(), False)
     trial = Trial.of(scan)
     assert trial is not None
     left = [
