@@ -16,7 +16,7 @@ from recon.base.units import warn_of_other_quantity
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
-from recon.voxels.field_edges import edges_of
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.held_out import predicted_views
 from recon.voxels.methods import EarlyTv
 
@@ -74,7 +74,8 @@ def axis_by_views(
     data, known = projections, projections
     if lit is not None:
         data, known = (np.where(lit, projections, np.float32(other)) for other in (0, np.nan))
-    width, longer = _WIDER if edges_of(Views(known, geometry)).beyond(0.0) else 1.0, 1 if lit is None else _SHADOWED
+    width = _WIDER if reach_of(Views(known, geometry)).edges.beyond(0.0) else 1.0
+    longer = 1 if lit is None else _SHADOWED
     tried = list[float]()
 
     def ask(column: float) -> None:

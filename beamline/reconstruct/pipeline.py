@@ -38,7 +38,7 @@ from beamline.reconstruct.record import partly_seen_warning, write_result
 from beamline.reconstruct.reference import with_reference
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
-from beamline.reconstruct.scan_facts import ReportContext, ScanFacts, facts_of
+from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts, facts_of
 from beamline.reconstruct.slab_run import keeping
 from beamline.reconstruct.truth import fit_truth
 from beamline.storage.interrupted import next_step
@@ -336,6 +336,6 @@ def reconstruct_file(
             filter=options.filter,
         )  # fmt: skip
         with job.stopping():  # the volume is there: the first signal no longer discards it
-            record = write_result(made, prepared, truth, options.target, context, sink, clock)
+            record = write_result(MadeVolume(made, prepared, truth, options.target, context), sink, clock)
         del made, prepared  # Windows removes no file that is mapped
     return record

@@ -16,10 +16,9 @@ from beamline.core.events import Sink, Warned
 from beamline.core.quantities import cone_facts
 from beamline.core.recon_events import VolumeDone
 from beamline.core.text import spans
-from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.scan_facts import ReportContext, label_of
+from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, label_of
 from beamline.reconstruct.volume_checks import CheckedVolume, check_volume
 from beamline.report.history import history_arrays
 from beamline.storage import hdf5
@@ -56,33 +55,22 @@ def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
     }
 
 
-def write_result(
-    result: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    target: OutputPaths,
-    context: ReportContext,
-    sink: Sink,
-    clock: Clock,
-) -> ReconRecord:
+def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
     """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
     The voxels of the record are read from the file when they are used. If no file is written, the record contains the
     volume.
 
-    Args:
-        in_parts: True if the volume was made in slabs, so that its voxels are on the disk.
-
     Raises:
         DataError: the volume could not be written; no incomplete file remains. If only the report fails, a warning is
             given.
     """
-    phases, ordinary = context.phases, prepared.centred
+    phases, target, ordinary = made.context.phases, made.target, replace(made, prepared=made.prepared.centred)
     phases.enter("checking the volume")
-    checked = check_volume(result, ordinary, truth, target, context, sink, clock)
+    checked = check_volume(ordinary, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
-    context = replace(context, warnings=remarks)
-    record, volumes = _record(result, checked, prepared, target, context, clock.now())
+    context = replace(made.context, warnings=remarks)
+    record, volumes = _record(replace(made, context=context), checked, clock.now())
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
@@ -90,7 +78,7 @@ def write_result(
     if target.report is not None:
         phases.enter("report")
         try:
-            state_time = _report(result, ordinary, truth, checked, volumes, target, record.parameters, context)
+            state_time = _report(replace(ordinary, context=context), checked, volumes, record.parameters)
         except Exception as error:  # the volume stands, whatever its page lacks
             sentence = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
             sink(Warned(sentence, time=clock.now()))
@@ -106,35 +94,23 @@ def write_result(
 
 
 def _report(
-    result: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    checked: CheckedVolume,
-    volumes: Mapping[str, Volume],
-    target: OutputPaths,
-    parameters: Mapping[str, Value],
-    context: ReportContext,
+    made: MadeVolume, checked: CheckedVolume, volumes: Mapping[str, Volume], parameters: Mapping[str, Value]
 ) -> Callable[[float], None]:
     """Write the page; what is returned states on it how long the whole command took, in s."""
     from beamline.reconstruct.report import compose  # here: matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
+    target = made.target
     assert target.report is not None
-    report = compose(result, prepared, truth, volumes, checked, parameters, context)
+    report = compose(made, volumes, checked, parameters)
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(target.report, report, replace=target.replace)
-    return partial(write_timed, target.report, report, label_of(result.method))
+    return partial(write_timed, target.report, report, label_of(made.result.method))
 
 
-def _record(
-    result: Reconstruction,
-    checked: CheckedVolume,
-    prepared: PreparedProjections,
-    target: OutputPaths,
-    context: ReportContext,
-    now: float,
-) -> tuple[ReconRecord, dict[str, Volume]]:
+def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
+    result, prepared, target, context = made.result, made.prepared, made.target, made.context
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))
@@ -147,7 +123,7 @@ def _record(
         title=_title(result, context),
         sample=context.facts.sample or "not stated",
         time=now,
-        parameters=parameters_of(result, prepared, context),
+        parameters=parameters_of(made),
         metrics=checked.metrics[result.method],
         history=history_arrays(result.history),
         model={} if result.gaussians is None else arrays_of_model(result.gaussians, prepared.geometry),
@@ -196,8 +172,9 @@ def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
         return np.asarray(file["entry/data/data"][part])
 
 
-def parameters_of(result: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
+def parameters_of(made: MadeVolume) -> dict[str, Value]:
     """All parameters of the volume, by name."""
+    result, prepared, context = made.result, made.prepared, made.context
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
     done, cols = recorded(in_order(selection), prepared.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.scan_facts import ReportContext, as_text, label_of
+from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, as_text, label_of
 from beamline.reconstruct.volume_checks import CheckedVolume
 from beamline.report import pictures
 from beamline.report.history import (
@@ -39,22 +39,17 @@ _NO_REFERENCE = (
 
 
 def compose(
-    result: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    volumes: Mapping[str, Volume],
-    checked: CheckedVolume,
-    parameters: Mapping[str, Value],
-    context: ReportContext,
+    made: MadeVolume, volumes: Mapping[str, Volume], checked: CheckedVolume, parameters: Mapping[str, Value]
 ) -> Report:
     """The report on a reconstruction."""
+    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
     metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
     } | {f"law: {name}": left for name, left in prepared.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
-        summary=_summary(result, prepared, truth, metrics, context),
+        summary=_summary(made, metrics),
         scan=context.facts.table,
         settings=settings,
         metrics={label_of(method): values for method, values in metrics.items()},
@@ -74,13 +69,8 @@ def compose(
     )
 
 
-def _summary(
-    result: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    metrics: Mapping[str, Mapping[str, float]],
-    context: ReportContext,
-) -> str:
+def _summary(made: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> str:
+    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
     name, geometry = label_of(result.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[result.method]

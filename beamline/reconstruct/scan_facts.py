@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 from beamline.core.durations import Phases
 from beamline.core.text import frames_text
 from beamline.plan.passes import ended_by
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.scan import scan_ended
 from drivers.base.frame import FrameKind
+from recon.base.method import Reconstruction
+from recon.base.volume import Volume
 from recon.methods import by_name
 from recon.voxels.fbp import Filter
 
@@ -183,6 +187,25 @@ class ReportContext:
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True
     filter: Filter = "hann"
+
+
+@dataclass(frozen=True, eq=False)
+class MadeVolume:
+    """A volume, with all that it is judged, recorded and reported by.
+
+    Attributes:
+        result: the volume, and what the method states about it.
+        prepared: the projections that it was made from, and where these come from.
+        truth: the ground truth on the grid of the volume; None: it is not known.
+        target: the files to write.
+        context: the context of the reconstruction.
+    """
+
+    result: Reconstruction
+    prepared: PreparedProjections
+    truth: Volume | None
+    target: OutputPaths
+    context: ReportContext
 
 
 def label_of(method: str) -> str:

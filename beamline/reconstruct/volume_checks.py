@@ -11,8 +11,7 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Note, event_of_sentence
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.scan_facts import ReportContext, label_of
+from beamline.reconstruct.scan_facts import MadeVolume, label_of
 from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
 from recon.base.method import Reconstruction
@@ -53,20 +52,13 @@ class CheckedVolume:
     skipped_text: str = ""
 
 
-def check_volume(
-    result: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    target: OutputPaths,
-    context: ReportContext,
-    sink: Sink,
-    clock: Clock,
-) -> CheckedVolume:
+def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
     """Compare a volume with its projections and with FBP, and send each warning to `sink`.
 
     Checks are left out, with a remark, if they would take longer than the time limit in `context` allows, or if the
     reconstruction was stopped.
     """
+    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
     volumes, warnings = {result.method: result.volume}, list(context.warnings)
 
     def tell(*sentences: str) -> None:
@@ -78,7 +70,7 @@ def check_volume(
         figures = {"residual": result.series.residual, "seconds": result.seconds}
         return CheckedVolume(Judgement(figures), volumes, {result.method: figures}, warnings)
     tell(_sample_radius(result, prepared), _unused_levels(result))
-    aspects, fitted = _aspects(result, prepared, context), by_name(result.method).fitted
+    aspects, fitted = _aspects(made), by_name(result.method).fitted
     time = TimeLeft(clock.now, lambda seconds: not result.ending.early and context.leaves(seconds))
     progress = context.phases.progress
     judgement = judge(
@@ -88,12 +80,12 @@ def check_volume(
     metrics: dict[str, dict[str, float]] = {result.method: {**judgement.figures, "seconds": result.seconds}}
     hiding = _structure(result, judgement)
     tell(not_begun_warning(result, judgement), hiding, _stray_mass(result, judgement) if fitted else "")
-    tell(_needles(result, prepared), odd_views_warning(judgement.odd_views, prepared, context))
+    tell(_needles(result, prepared), odd_views_warning(judgement.odd_views, made))
     skipped = list(judgement.skipped)
-    if fitted and target.report is not None and has_direct_method(prepared.geometry):
+    if fitted and made.target.report is not None and has_direct_method(prepared.geometry):
         if time.leaves(_FBP_WORK * judgement.seconds_of_views):
             before = clock.now()
-            fbp = _fbp(result, prepared, target, context)
+            fbp = _fbp(made)
             seconds, residual = clock.now() - before, aspects & Aspect.RESIDUAL
             of_fbp = judge(fbp, prepared.views, truth, aspects=residual, progress=progress).figures
             volumes = {BASELINE: fbp, **volumes}
@@ -111,17 +103,19 @@ def check_volume(
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
 
-def _aspects(result: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Aspect:
+def _aspects(made: MadeVolume) -> Aspect:
     """The checks that this volume allows. No residual is computed if the projections show more than the volume.
 
     They show more if the volume is only a region, or if the sample is larger than the field of view and the part
     outside was not subtracted. The residual of a direct method contains the blur of its filter.
     """
-    geometry, fitted = prepared.geometry, by_name(result.method).fitted
-    if context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
+    result, prepared = made.result, made.prepared
+    geometry, fitted, reach = prepared.geometry, by_name(result.method).fitted, prepared.lines.reach
+    if made.context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
-        show_more = prepared.lines.reach is not None and prepared.lines.reach.sample is not None
+        subtracted = reach is not None and reach.measured and reach.sample is None
+        show_more = SAMPLE in result.settings and not subtracted
     else:
         show_more = bool(reach_of(prepared.seen).beyond)
     if show_more:
@@ -204,12 +198,12 @@ def _needles(result: Reconstruction, prepared: PreparedProjections) -> str:
     )
 
 
-def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, context: ReportContext) -> str:
+def odd_views_warning(odd: Sequence[OddView], made: MadeVolume) -> str:
     """The warning about projections that do not fit the volume, with frames and pixels of the worst; empty if none."""
     if not odd:
         return ""
-    frames, binning = prepared.ids, context.selection.binning
-    first_row = (context.selection.rows or (0, 0))[0]
+    frames, selection = made.prepared.ids, made.context.selection
+    binning, first_row = selection.binning, (selection.rows or (0, 0))[0]
     places = [
         f"frame {frames[each.view]}, rows {first_row + each.rows[0] * binning} ... "
         f"{first_row + each.rows[1] * binning - 1}, columns {each.cols[0] * binning} ... "
@@ -224,11 +218,12 @@ def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, con
     )
 
 
-def _fbp(result: Reconstruction, prepared: PreparedProjections, target: OutputPaths, context: ReportContext) -> Volume:
+def _fbp(made: MadeVolume) -> Volume:
     """FBP of the same projections."""
+    result, prepared, context = made.result, made.prepared, made.context
     context.phases.enter("FBP for comparison", "slices")
     grid, on_disk = result.volume.grid, isinstance(result.volume.data, np.memmap)
-    out = scratch_array(target.output.parent, grid.shape) if on_disk else None
+    out = scratch_array(made.target.output.parent, grid.shape) if on_disk else None
     lines, progress = prepared.seen.data, context.phases.progress
     volume = direct(lines, prepared.geometry, grid, context.filter, progress, out)
     if (gain := density_gain(prepared.geometry)) != 1:

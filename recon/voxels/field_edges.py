@@ -79,10 +79,11 @@ def edges_of(views: Views) -> FieldEdges:
         return FieldEdges({}, 0.0)
     numbers = spread(np.arange(own.size), _VIEWS)
     part = np.ix_(own[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
-    known = np.isfinite(views.data[part]) & (views.weights is None or views.weights[part] > 0)
+    some = views.data[part]
+    known = np.isfinite(some) & (views.weights is None or views.weights[part] > 0)
     if not (measured := np.flatnonzero(known.any(axis=(0, 1)))).size:
         return FieldEdges({}, 0.0)
-    some = np.where(known, views.data[part], np.nan)[..., measured[0] : measured[-1] + 1]
+    some = np.where(known, some, np.nan)[..., measured[0] : measured[-1] + 1]
     mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
     some = some[:, mass >= _FULL * mass.max()]
     edges = {"left": some[..., :width], "right": some[..., -width:]}

@@ -166,13 +166,14 @@ def _spied(module: str, found: dict[str, str]) -> Any:
     """Notes the line integrals that the module judges its volume by."""
     write = __import__(module, fromlist=["write_result"]).write_result
 
-    def noted(made: Any, prepared: Any, *rest: Any, **named: Any) -> Any:
+    def noted(made: Any, *rest: Any) -> Any:
+        prepared = made.prepared
         views, apart, geometry = prepared.views.seen, prepared.views.unseen, prepared.geometry
         found["line integrals"] = _digest(views.data)
         found["views"] = _digest(views.ids, geometry.angles, geometry.shifts, np.float64(geometry.axis_col))
         found["weights"] = "" if views.weights is None else _digest(views.weights[...])
         found["held out"] = "" if apart is None else _digest(apart.data)
-        return write(made, prepared, *rest, **named)
+        return write(made, *rest)
 
     return patch(f"{module}.write_result", noted)
 

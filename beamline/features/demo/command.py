@@ -135,7 +135,7 @@ def _compare(
     from beamline.projections.views import select
     from beamline.reconstruct.options import OutputPaths, report_beside
     from beamline.reconstruct.record import axis_of, write_result
-    from beamline.reconstruct.scan_facts import ReportContext, facts_of
+    from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, facts_of
     from beamline.report.history import history_from
     from beamline.storage.readers.open import open_scan
     from beamline.storage.writers.recon_file import read_reconstruction
@@ -163,4 +163,4 @@ def _compare(
     if target.live_picture.exists():
         facts = replace(facts, live_picture=target.live_picture.name)
     context = ReportContext(facts, selection, shown.command, shown.seed, warnings, shown.started)
-    write_result(made, prepared, ideal, target, context, sink, clock)
+    write_result(MadeVolume(made, prepared, ideal, target, context), sink, clock)

@@ -21,13 +21,14 @@ from beamline.reconstruct import live_end, live_steps, pipeline
 from beamline.reconstruct.live_states import Feeds, LiveScan
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.record import write_result
+from beamline.reconstruct.scan_facts import MadeVolume
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
-from recon.base.method import Progress, Reconstruction
+from recon.base.method import Progress
 from recon.prep.projections import Projections
 from recon.splatting.stream import StreamingFit
 from recon.splatting.stream_states import Growing
@@ -54,9 +55,9 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> list[PreparedProjections]:
     seen: list[PreparedProjections] = []
     write = write_result
 
-    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
-        seen.append(prepared)
-        return write(outcome, prepared, *rest)
+    def write_and_keep(made: MadeVolume, *rest: Any) -> ReconRecord:
+        seen.append(made.prepared)
+        return write(made, *rest)
 
     monkeypatch.setattr(pipeline, "write_result", write_and_keep)
     return seen

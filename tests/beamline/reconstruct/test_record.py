@@ -15,7 +15,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.record import write_result
-from beamline.reconstruct.scan_facts import ReportContext, facts_of
+from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, facts_of
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -47,7 +47,7 @@ def _written(made: Reconstruction, scan: Scan, output: Path) -> tuple[Any, list[
     """The volume beside a report: the last event's data, and all messages."""
     events: list[Event] = []
     target = OutputPaths(output, output.with_suffix(".html"))
-    write_result(made, scan[0], None, target, scan[1], events.append, SystemClock())
+    write_result(MadeVolume(made, scan[0], None, target, scan[1]), events.append, SystemClock())
     assert target.report is not None and target.report.exists()
     return events[-1].data, [str(event.data.get("message")) for event in events]
 

@@ -11,7 +11,7 @@ import pytest
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.scan_facts import ReportContext, ScanFacts
+from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts
 from beamline.reconstruct.volume_checks import check_volume, not_begun_warning
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -45,7 +45,8 @@ def warnings_of(made: Reconstruction, prepared: PreparedProjections, selection: 
     """Those of a volume without a report."""
     facts = ScanFacts(Path("scan.h5"), "scan.h5", "", {}, "")
     context, target = ReportContext(facts, selection, "", 0), OutputPaths(Path("out.h5"), None)
-    return list(check_volume(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings)
+    whole = MadeVolume(made, prepared, None, target, context)
+    return list(check_volume(whole, lambda event: None, SystemClock()).warnings)
 
 
 def odd(said: list[str]) -> str:

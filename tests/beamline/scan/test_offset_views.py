@@ -23,6 +23,7 @@ from beamline.projections.views import select
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
+from beamline.reconstruct.scan_facts import MadeVolume
 from beamline.reconstruct.volume_checks import check_volume
 from beamline.scan.preflight import dry_run
 from beamline.scan.resume import open_for_resume
@@ -32,7 +33,6 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
-from recon.base.method import Reconstruction
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from tests.beamline.ball_scan import COMMON, shipped, with_scene
@@ -249,9 +249,9 @@ def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
 ) -> None:
     judged: list[int] = []
 
-    def noted(made: Reconstruction, views: PreparedProjections, *more: Any) -> Any:
-        judged.append(views.geometry.n_views)
-        return check_volume(made, views, *more)
+    def noted(made: MadeVolume, *more: Any) -> Any:
+        judged.append(made.prepared.geometry.n_views)
+        return check_volume(made, *more)
 
     monkeypatch.setattr("beamline.reconstruct.record.check_volume", noted)
     used = []
