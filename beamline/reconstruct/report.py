@@ -256,7 +256,7 @@ def _doubts(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
             "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
-            "motion. Last: what the moved reference leaves of the projections, after FBP and a blur of a voxel, divided "
+            "motion. Last: FBP of what the moved reference leaves of the projections, blurred by a voxel and divided "
             "by its standard error. Beyond 4 and -4 the projections themselves show a change."
             + _displaced(result, moved),
             pictures.change(result.volume, result.change, left, unit, kind),

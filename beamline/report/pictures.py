@@ -251,7 +251,8 @@ def change(
     first = looked.start or 0
     at, grid = first + int(np.argmax([np.square(part).sum() for part in change.data[looked]])), volume.grid
     window, most = material_window(volume.data[at]), float(np.percentile(np.abs(change.data[at]), 99.5)) or 1.0
-    figure = new_figure((WIDTH, 3.2 if left is None else 2.6), dpi_for(grid.shape[2], WIDTH / 3.3))
+    down, across = (1, 3) if left is None else (2, 2)
+    figure = new_figure((WIDTH, 3.4 * down), dpi_for(grid.shape[2], WIDTH / 1.3 / across))
     panels = [
         (volume.data[at] - change.data[at], f"Moved reference, slice {at}", window, "gray"),
         (volume.data[at], f"Volume, slice {at}", window, "gray"),
@@ -259,9 +260,9 @@ def change(
     ]
     if left is not None:
         panels.append((left.significance[at - first], "Change / standard error", (-8.0, 8.0), "RdBu_r"))
-    for axes, (image, title, limits, colours) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        drawn = draw_slice(axes, image, planes(grid, unit)[0], title, limits, colours)
-        figure.colorbar(drawn, ax=axes, shrink=0.6)
+    for axes, (image, title, limits, colours) in zip(figure.subplots(down, across).flat, panels, strict=True):
+        drawn = draw_slice(axes, image, planes(grid, unit)[0], title, limits, colours, 8)
+        figure.colorbar(drawn, ax=axes, shrink=0.8)
     return png(figure)
 
 
