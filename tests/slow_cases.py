@@ -1,4 +1,4 @@
-"""Cases of a test that take long: the first ones are quick tests, the others slow."""
+"""Cases of a test that takes long: the first cases are quick tests, the others are slow tests."""
 
 from collections.abc import Iterable
 from typing import Any

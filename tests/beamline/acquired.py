@@ -1,4 +1,4 @@
-"""Runs a scan with the fake instrument to its end, and checks what must hold for its frames and files."""
+"""Runs a scan with the fake instrument to its end, and checks the properties that its frames and files must have."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""A scan in memory that records which parts of it are read."""
+"""A scan in memory that records which of its parts a reader reads."""
 
 from __future__ import annotations
 

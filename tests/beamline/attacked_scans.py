@@ -1,4 +1,4 @@
-"""Small analytic scans of all kinds, correct ones and ones with a fault; test_findings.py stores their findings."""
+"""Small analytic scans of all kinds, with and without a fault; test_findings.py stores their findings."""
 
 from __future__ import annotations
 

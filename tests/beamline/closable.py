@@ -1,4 +1,4 @@
-"""A device that can only be closed; it stands in for one on a port that this computer does not have."""
+"""A device that can only be closed; it replaces a device on a port that this computer does not have."""
 
 
 class Closable:

@@ -1,4 +1,4 @@
-"""The choices of what to measure after a pass, as an event states them."""
+"""The choices after a pass, in the form of an event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An ORCA-Quest, real or simulated, for the conformance suite that is shipped."""
+"""An ORCA-Quest, real or simulated, for the conformance suite of the package."""
 
 from __future__ import annotations
 

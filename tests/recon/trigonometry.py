@@ -1,4 +1,4 @@
-"""Where a point falls on the detector, computed with trigonometry alone."""
+"""The position of a point on the detector, computed only with trigonometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Anomalies: compares where a frame with an anomaly differs from one without it, and its label."""
+"""Anomalies: compares the label of an anomaly with the pixels in which a frame with it differs from a frame without
+it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Bodies: one solid of each kind, where they are by definition, and chords of any ray found by search in that alone."""
+"""Bodies: one solid of each kind, a test by definition of whether a point is inside, and chords that a search with only
+this test finds."""
 
 from __future__ import annotations
 

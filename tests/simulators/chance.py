@@ -1,4 +1,4 @@
-"""Chance: tests of samples against theory, each with one false alarm in a million."""
+"""Chance: tests that compare random samples with theory; each test fails by chance once in a million runs."""
 
 from __future__ import annotations
 

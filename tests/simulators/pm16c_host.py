@@ -1,4 +1,4 @@
-"""A host that talks raw PM16C commands to the simulated controller, on a virtual clock."""
+"""A host that sends raw PM16C commands to the simulated controller, on a virtual clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shots: a scene, the circumstances of an exposure and a frame for tests, each with what the test wants changed."""
+"""Shots: a scene, the conditions of an exposure and a frame for tests, each with the changes of the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""tomoscan's process variables by Channel Access (caproto), a program: lines NAME=VALUE of stdin set them."""
+"""The process variables of tomoscan by Channel Access (caproto), as a program. Lines NAME=VALUE on stdin set them."""
 
 from __future__ import annotations
 

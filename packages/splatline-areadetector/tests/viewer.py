@@ -1,4 +1,4 @@
-"""A viewer of a control room by pvapy (APS), as a program: viewer.py CHANNEL.
+"""A viewer of a control room, made with pvapy (APS), as a program: viewer.py CHANNEL.
 
 It prints a line for each frame: number, CRC-32 of its pixels, width, height, kind. Each new line of stdin ends it.
 """

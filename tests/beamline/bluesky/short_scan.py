@@ -1,4 +1,4 @@
-"""A short scan, and where to find the keys of its documents in its file."""
+"""A short scan, and the places of the keys of its documents in its file."""
 
 SHORT = (
     "scan.angles={scheme: fixed, views: 40}",

@@ -1,4 +1,4 @@
-"""Commands are tested as if they ran in a terminal, wherever the tests run."""
+"""Commands behave as in a terminal, also if the tests run without one."""
 
 import signal
 import sys

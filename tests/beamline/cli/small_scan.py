@@ -1,4 +1,5 @@
-"""Shared by the tests of `beamline recon`: a small scan, a call as a user makes it, and the files it leaves."""
+"""Shared by the tests of `beamline recon`: a small scan, a call as a user makes it, and the files that the call
+writes."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What must hold after any fault: one complete error, an instrument at rest, a file, and a working next scan."""
+"""Checks after any fault: one complete error, an instrument at rest, a file, and a working next scan."""
 
 from __future__ import annotations
 

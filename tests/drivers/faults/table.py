@@ -1,4 +1,4 @@
-"""The fault table: what breaks, how a scan must end, and which faults a controller cannot have.
+"""The fault table: each fault, how a scan must end after it, and the faults that a controller cannot have.
 
 docs/faults.md has a row for each of these, with the same names; `test_page` keeps them the same.
 """

@@ -1,4 +1,5 @@
-"""Where a hard case runs: the CPU kernels, or Triton's (on CUDA if there is one, otherwise interpreted and small)."""
+"""The kernels for a hard case: those of the CPU, or Triton's (on CUDA if there is a GPU, otherwise interpreted and
+small)."""
 
 from __future__ import annotations
 

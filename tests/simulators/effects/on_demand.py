@@ -1,4 +1,4 @@
-"""On demand: a scene with any choice of the catalogue's effects, and frames in which every one of them shows."""
+"""On demand: a scene with any choice of effects of the catalogue, and frames in which each effect is visible."""
 
 from __future__ import annotations
 

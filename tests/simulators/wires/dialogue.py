@@ -1,4 +1,4 @@
-"""Dialogues with a simulated controller, written as a person at a terminal would see them."""
+"""Dialogues with a simulated controller, in the form in which a person at a terminal would see them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a site adds to splatline, one of each kind; `pyproject.toml` says by which entry points."""
+"""The extensions of a site, one of each kind; `pyproject.toml` has their entry points."""

@@ -1,4 +1,4 @@
-"""Small scans, as those of the tests of the storage."""
+"""The small scans of the tests of the storage."""
 
 from tests.beamline.storage.conftest import clock, frames, write
 

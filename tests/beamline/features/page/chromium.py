@@ -1,4 +1,5 @@
-"""A headless Chromium for the tests of the page; a module that imports this is skipped where selenium is absent."""
+"""A headless Chromium for the tests of the page; a module that imports this one is skipped if selenium is not
+installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A packing of discs that moves and changes, projected on a finer grid than it is reconstructed on."""
+"""A packing of discs that moves and changes. Its projections are computed on a finer grid than the reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Where the Triton kernels are tested: on CUDA if there is one, otherwise interpreted; geometries, comparisons."""
+"""The device of the tests of Triton kernels: CUDA if there is a GPU, otherwise the interpreter; geometries,
+comparisons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated Zaber axis: moves in microsteps in closed form, homing, stops, limits and the warning flags they leave.
+"""Simulated Zaber axis: moves in microsteps in closed form, homing, stops, limits and their warning flags.
 
 Native units by the vendor's convention (from memory, not confirmed): speed is microsteps/s times 1.6384, acceleration
 microsteps/s² times 1.6384 / 10 000. A real axis re-plans a move under way; this one says STATUSBUSY.

@@ -1,4 +1,5 @@
-"""A host that talks raw Zaber ASCII to the simulated stage, on a virtual clock, with its own checksum arithmetic."""
+"""A host that exchanges raw Zaber ASCII with the simulated stage, on a virtual clock, with its own checksum
+arithmetic."""
 
 from __future__ import annotations
 

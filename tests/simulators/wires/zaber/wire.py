@@ -1,4 +1,5 @@
-"""Simulated Zaber rotary stage on its wire: ASCII packets in, replies and alerts out, and faults on request.
+"""Simulated Zaber rotary stage behind its wire: it receives ASCII packets, sends replies and alerts, and has faults on
+request.
 
 One device with one rotary axis that turns the sample; one of its digital outputs is cabled to the camera. Behaviour
 follows the vendor's own library, packets also the test vectors of zproto; nothing is shared with the driver. From
