@@ -23,7 +23,6 @@ from beamline.report.metrics import METRICS, formatted
 from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
-from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Volume, VolumeSeries
 from recon.methods import BASELINE
@@ -250,8 +249,7 @@ def _doubts(
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
         moved = Volume(result.volume.data - result.change.data, result.volume.grid)
-        views = Views(prepared.projections.data, prepared.geometry, prepared.ray_weights())
-        left = unexplained_by(moved, views, np.random.default_rng(0))
+        left = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
         yield Picture(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "

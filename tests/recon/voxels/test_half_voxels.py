@@ -183,7 +183,7 @@ def test_a_trial_with_a_given_weight_compares_whole_voxels() -> None:
     geometry = geometry_of(20)
     projector = Projector(geometry, Grid.matching(geometry))
     views = Views(exact_views(geometry), geometry)
-    scan, _ = scaled_problem(projector, views, None, True, GoesOn(), Decisions(), False)
+    scan, _ = scaled_problem(projector, views, None, True, GoesOn(), Decisions())
     trial = Trial.of(scan)
     assert trial is not None
     left = [

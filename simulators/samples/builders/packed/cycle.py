@@ -208,10 +208,10 @@ def _moved(piece: Piece, shift: NDArray[np.float64], turn: float) -> Piece:
     solid, cos, sin = piece.solid, math.cos(turn), math.sin(turn)
     x, y, z = solid.centre
     dx, dy, dz = shift.tolist()
-    piece = _placed(piece, (cos * x - sin * y + dx, sin * x + cos * y + dy, z + dz))
+    centre = (cos * x - sin * y + dx, sin * x + cos * y + dy, z + dz)
     if isinstance(solid, Cylinder):
-        return piece
+        return _placed(piece, centre)
     w, i, j, k = solid.quaternion
     c, s = math.cos(turn / 2), math.sin(turn / 2)
     turned = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)
-    return replace(piece, solid=replace(piece.solid, quaternion=turned))
+    return replace(piece, solid=replace(solid, centre=centre, quaternion=turned))
