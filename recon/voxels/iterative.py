@@ -226,7 +226,7 @@ class VoxelMethod(Iterative):
             wide=problem.wide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
-        return Reconstruction(volume, {**settings, **chosen, **decide.settings, "seed": problem.seed}, tuple(history))
+        return Reconstruction(volume, {**settings, **chosen, **decide.record, "seed": problem.seed}, tuple(history))
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:

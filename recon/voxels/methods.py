@@ -23,7 +23,7 @@ from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import NoiseBalance, pnp_dct, tv_prox, weight_now
-from recon.voxels.standstill import ENDED, MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
+from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     NORM,
@@ -276,8 +276,7 @@ class PnpDct(VoxelMethod):
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not problem.go_on.going:
             return x
-        for name in ENDED:  # of the first volume; patches follow it
-            problem.decide.settings.pop(name, None)
+        problem.decide.ended = None  # that of the first volume; patches follow it
         share = self.patch_threshold
         if share is None:
             strength = choose_patches(problem, weight, trial, self.trial_steps).strength

@@ -280,7 +280,7 @@ def ordered_fista(
     g = v, so that the steps end at the minimum for any L. Without damping (gain 1, L = 0) these are the steps of FISTA.
     After `_VIEWS_ON_SUBSETS` projections, but at least six sweeps, each damped step uses all projections. Steps without
     damping always use subsets. The sweeps end when four of them together change the volume by less than `still` of its
-    norm; the settings `ENDED` say how they ended. If `subsets` are for a fixed number of sweeps, there are `sweeps` of
+    norm; `problem.decide.ended` says how. If `subsets` are for a fixed number of sweeps, there are `sweeps` of
     them. Memory: 8 volumes, 2 x the projections.
 
     Args:

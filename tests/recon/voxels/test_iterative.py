@@ -239,7 +239,7 @@ def test_ordered_subset_sirt_ends_where_many_further_iterations_change_little(no
     by_default, further = OsSirtTv(tv_weight=0.01), OsSirtTv(iterations=200, tv_weight=0.01, still=0.0)
     decide = Decisions(0)
     ended = error(solve(by_default, projector, views, decide=decide), truth)
-    assert decide.settings["ended"] == "still" and decide.settings["ended_after"] < by_default.iterations
+    assert decide.record["ended"] == "still" and decide.record["ended_after"] < by_default.iterations
     assert ended == pytest.approx(error(solve(further, projector, views), truth), rel=0.05)
 
 
