@@ -17,7 +17,7 @@ from recon.kernels.cpu.tv import total_variation
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import CPU
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import tv_prox
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import Projector
 from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights, largest_eigenvalue
@@ -102,7 +102,7 @@ def test_damped_steps_end_at_the_minimum_of_steps_without_damping(cone: bool, we
         made = replace(problem, rng=np.random.default_rng(0))
         subsets = Subsets.of(made, most, damped)
         assert subsets.is_damped is damped
-        x = ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, prox=tv_prox(made, 10), still=0.0)
+        x = ordered_fista(made, start.copy(), TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, 10), still=0.0)
         residual = made.projector.forward_lines(x) - made.data
         weight = 1.0 if made.weight is None else made.weight
         data = 0.5 * float((weight * np.square(residual, dtype=np.float64)).sum())
@@ -128,7 +128,7 @@ def test_the_settings_say_how_the_sweeps_ended(sweeps: int, still: float, stop_a
 
     made, mu = replace(problem, go_on=GoesOn(go_on)), 0.02 * float(problem.data.max())
     subsets = Subsets.of(made, subsets_of(made.projector.geometry))
-    ordered_fista(made, start, mu, subsets, sweeps=sweeps, prox=tv_prox(made, 3), still=still)
+    ordered_fista(made, start, TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, 3), still=still)
     assert made.decide.ended is not None
     how, after, change, _ = made.decide.ended
     assert how == ended and after == len(done) == done[-1]
@@ -142,7 +142,9 @@ def test_steps_that_are_not_damped_make_all_sweeps_and_say_nothing() -> None:
     problem, start = _problem(False, False)
     done: list[int] = []
     made = replace(problem, go_on=GoesOn(lambda sweep, _: not done.append(sweep)))
-    ordered_fista(made, start, 0.1, Subsets.of(made, 1, to_the_end=False), sweeps=25, prox=tv_prox(made, 3), still=1.0)
+    ordered_fista(
+        made, start, TvWeight(0.1), Subsets.of(made, 1, to_the_end=False), sweeps=25, prox=tv_prox(made, 3), still=1.0
+    )
     assert len(done) == 25 and made.decide.ended is None
 
 
@@ -179,7 +181,9 @@ def test_hard_scans_end_no_further_from_the_minimum_than_the_early_end(name: str
 
     def end(subsets: Subsets, sweeps: int, tv_steps: int, still: float) -> F32:
         made = replace(problem, rng=np.random.default_rng(0))
-        return ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, prox=tv_prox(made, tv_steps), still=still)
+        return ordered_fista(
+            made, start.copy(), TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, tv_steps), still=still
+        )
 
     def objective(x: F32) -> float:
         square = np.square(projector.forward_lines(x) - data, dtype=np.float64)
