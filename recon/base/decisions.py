@@ -54,6 +54,29 @@ class Prior(NamedTuple):
         return cls(weight, strength, patches, materials and MaterialPrior(*materials))
 
 
+class Ended(NamedTuple):
+    """How the iterations of a volume ended.
+
+    Attributes:
+        how: "still": the volume converged; "stopped"; "bound": all iterations were made.
+        after: number of iterations.
+        change: share by which the last four iterations changed the volume; inf: not known.
+        on_half_voxels: how many of the iterations used half voxels; None: none were planned.
+    """
+
+    how: str
+    after: int
+    change: float = math.inf
+    on_half_voxels: int | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings that say so in the record of the volume; what is not known is left out."""
+        values = {"ended": self.how, "ended_after": self.after, "last_change": self.change}
+        known = {name: value for name, value in values.items() if value != math.inf}
+        return known if self.on_half_voxels is None else {**known, "half_voxel_iterations": self.on_half_voxels}
+
+
 class Decisions:
     """The decisions that a run derives from its data, by name, in the order in which they were made.
 
@@ -65,15 +88,22 @@ class Decisions:
     Attributes:
         made: the decisions so far, by name: plain numbers and lists of numbers.
         prior: the prior of the volume in the units of the scan, if it was chosen before; None: the method chooses it.
-        settings: values that are recorded with the volume, in addition to the settings of its method.
+        ended: how the iterations ended; None: they end after a fixed number, or have not begun.
+        settings: further values for the record of the volume, in addition to the settings of its method.
     """
 
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
         self.seed = seed
         self.prior: Prior | None = None
+        self.ended: Ended | None = None
         self.settings: dict[str, Any] = {}
         self.made: dict[str, list[Any]] = {}
         self._followed = followed or {}
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """`ended` and `settings`, for the record of the volume."""
+        return {**({} if self.ended is None else self.ended.settings), **self.settings}
 
     def __call__(self, name: str, decide: Callable[[], T]) -> T:
         """The next decision with this name: the stored one if there is one, otherwise the result of `decide`."""

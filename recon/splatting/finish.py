@@ -28,7 +28,7 @@ from recon.voxels.beyond_field import reach_of
 from recon.voxels.iterative import solve_views, watched
 from recon.voxels.methods import PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
-from recon.voxels.priors import NoiseBalance, pnp_dct, tv_prox
+from recon.voxels.priors import TvWeight, pnp_dct, tv_prox
 from recon.voxels.projector import Projector
 from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
@@ -74,7 +74,7 @@ def level_of(beyond: F32) -> F32:
     return beyond.mean(axis=(1, 2), keepdims=True)
 
 
-def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
+def refine(problem: VoxelProblem, x: F32, weight: TvWeight, strength: float, sweeps: int) -> F32:
     """Total-variation iterations that start from x [y, x, z], followed by PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     parts = Subsets.of(problem, count, to_the_end=False)

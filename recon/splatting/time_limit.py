@@ -193,7 +193,7 @@ class FinalFit(Iterative):
             "finish": sweeps,
             "seconds_after_scan": control.now() - begin,
             "gaussians": reached.n_gaussians,
-            **decide.settings,
+            **decide.record,
         }
         seconds = control.now() - self.began
         return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)

@@ -226,7 +226,7 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": problem.use.held_out,
         "device": problem.device, "finish": sweeps, "joined_pixels": views.joined,
         "tv_weight": tv_weight(settings, run.fitting, state.limit), "tv_size": tv_size(settings, views.field),
-        **(decide.settings if sweeps else {}),
+        **(decide.record if sweeps else {}),
     }  # fmt: skip
     return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last), started_from=n_start)
 

@@ -15,6 +15,7 @@ from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.beyond_field import reach_of
 from recon.voxels.choice import Prediction, TrialChoice, significantly_better
+from recon.voxels.priors import TvWeight
 from recon.voxels.projector import projection_lines
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
@@ -114,7 +115,7 @@ class _Fit:
     def _by(self, prior: Prior, strength: float) -> F64:
         def make(problem: VoxelProblem, x: F32) -> F32:
             some = problem if self.beyond is None else replace(problem, data=problem.data - self.beyond)
-            return refine(some, x, prior.weight, strength, FINISH_SWEEPS)
+            return refine(some, x, TvWeight(prior.weight), strength, FINISH_SWEEPS)
 
         other = None if self.beyond_unseen is None else level_of(self.beyond_unseen)
         return self.trial.residuals(self.trial.volume_by(make, self.start), other)

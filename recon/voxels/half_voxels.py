@@ -23,9 +23,9 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.ordered_fista import Pull, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import tv_prox
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.resolution import smoothed
-from recon.voxels.standstill import ENDED, USUAL_SWEEPS, with_quality
+from recon.voxels.standstill import USUAL_SWEEPS, with_quality
 from recon.voxels.voxel_problem import VoxelProblem, bytes_of
 
 MethodT = TypeVar("MethodT")
@@ -93,17 +93,17 @@ class HalfVoxels(VoxelMethod):
             pull: function of the problem with half voxels and of its first volume; returns the pull of each step.
             first: number of planned iterations before those that made x, for the progress.
         """
-        projector, settings = problem.projector, problem.decide.settings
+        projector, decide = problem.projector, problem.decide
         if not self.halves(projector.geometry, projector.grid):
             return x
-        before = int(settings.get(ENDED[1], 0))
+        before = 0 if decide.ended is None else decide.ended.after
         fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
         made = ordered_fista(
-            fine, start, mu / 2, subsets_on_halves(fine), sweeps=self.iterations, prox=tv_prox(fine, tv_steps),
-            pull=None if pull is None else pull(fine, start), still=self.still,
+            fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
+            prox=tv_prox(fine, tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
         )  # fmt: skip
-        settings["half_voxel_iterations"] = int(settings.get(ENDED[1], 0))
-        settings[ENDED[1]] = before + settings["half_voxel_iterations"]
+        if (ended := decide.ended) is not None:
+            decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
         ny, nx, nz = x.shape
         return made.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
 

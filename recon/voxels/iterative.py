@@ -219,7 +219,7 @@ class VoxelMethod(Iterative):
             self, projector, problem.views.masked(), nonnegative=not self.allow_negative, go_on=go_on, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
-        return Reconstruction(volume, {**settings, **chosen, **decide.settings, "seed": problem.seed}, tuple(history))
+        return Reconstruction(volume, {**settings, **chosen, **decide.record, "seed": problem.seed}, tuple(history))
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:

@@ -33,7 +33,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.iterative import Iterating, solve
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, tv_prox
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
@@ -142,7 +142,7 @@ class _TotalVariation:
     iterations: int = MOST_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
+        weight = TvWeight(self.weight * math.sqrt(problem.projector.geometry.n_views))
         subsets = Subsets.of(problem, subsets_of(problem.projector.geometry))
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, prox=tv_prox(problem, _TV_STEPS))
 
@@ -154,7 +154,7 @@ class _WeightByNoise:
     iterations: int = MOST_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        problem.decide("weight", lambda: NoiseBalance.of(problem, x, self.iterations).first)
+        problem.decide("weight", lambda: TvWeight.of_noise(problem, x, self.iterations).first)
         return x
 
 

@@ -22,8 +22,8 @@ from recon.voxels.half_voxels import HalfVoxels, with_halves
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, pnp_dct, tv_prox, weight_now
-from recon.voxels.standstill import ENDED, MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
+from recon.voxels.priors import TvWeight, pnp_dct, tv_prox
+from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     NORM,
@@ -92,29 +92,28 @@ class FistaTv(HalfVoxels):
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         x, weight = self.with_weight(problem, x)
-        return self.in_half_voxels(problem, x, weight_now(weight), self.tv_steps) if problem.go_on.going else x
+        return self.in_half_voxels(problem, x, weight.value, self.tv_steps) if problem.go_on.going else x
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None
-    ) -> tuple[F32, NoiseBalance | float]:
+    ) -> tuple[F32, TvWeight]:
         """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
         projector = problem.projector
         if not x.any():
             problem.first_sweep(x, problem.rng)
-        weight: NoiseBalance | float
         unit = density_unit(x)
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.usual_sweeps, trial)
         else:
             share, rays = self.tv_weight, problem.weight
             norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
-            weight = problem.decide("weight", lambda: share * unit * norm)
+            weight = TvWeight(problem.decide("weight", lambda: share * unit * norm))
         subsets = Subsets.of(problem, subsets_of(projector.geometry, self.subsets, self.to_the_end), self.to_the_end)
         x = ordered_fista(
             problem, x, weight, subsets, sweeps=self.iterations, prox=tv_prox(problem, self.tv_steps), still=self.still
         )
         if self.tv_weight is None and unit > 0:
-            used = weight_now(weight)
+            used = weight.value
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
@@ -182,7 +181,7 @@ class OsSirtTv(VoxelMethod):
         projector, scale = problem.projector, problem.scale
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
         prox = tv_prox(problem, self.tv_steps)
-        weight: NoiseBalance | float | None = None
+        weight: TvWeight | None = None
         threshold = 0.0
         # One order of the subsets, because a noisy volume never converges if each sweep ends with another subset.
         order = problem.rng if self.still == 0 else None
@@ -192,9 +191,9 @@ class OsSirtTv(VoxelMethod):
             error = sweeps.run(x, 1.0, problem.nonnegative, order)
             if self.tv_weight is None:
                 weight = weight or choose_weight(problem, x, self.usual_sweeps)
-                if isinstance(weight, NoiseBalance):
+                if weight.by_noise:
                     weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
-                threshold = float(weight_now(weight) * problem.decide("pace", lambda: sweeps.pace))
+                threshold = float(weight.value * problem.decide("pace", lambda: sweeps.pace))
                 prox(x, threshold)
             else:
                 # The unit follows the volume, because the volume is blurred and fainter after the first iterations.
@@ -269,15 +268,13 @@ class PnpDct(VoxelMethod):
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps = 0 if x.any() else self.first_sweeps
         trial = cache(partial(Trial.of, problem))
-        weight: NoiseBalance | float
         if sweeps:
             x, weight = FistaTv().with_weight(problem, x, trial)
         else:
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not problem.go_on.going:
             return x
-        for name in ENDED:  # of the first volume; patches follow it
-            problem.decide.settings.pop(name, None)
+        problem.decide.ended = None  # that of the first volume; patches follow it
         share = self.patch_threshold
         if share is None:
             strength = choose_patches(problem, weight, trial, self.trial_steps).strength

@@ -26,7 +26,7 @@ from recon.base.geometry import Geometry
 from recon.base.registry import MethodEntry, in_folders, loaded
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
-from recon.voxels.priors import NoiseBalance, weight_now
+from recon.voxels.priors import TvWeight
 from recon.voxels.projector import Projector
 from recon.voxels.standstill import Standstill
 from recon.voxels.view_weights import angular_weights
@@ -210,13 +210,13 @@ class _Descent:
         if self._pull is not None:
             self._target = self._device.array(self._pull.target(self._device.numpy(self.x)))
 
-    def sweep(self, weight: NoiseBalance | float, on_subsets: bool, looked_at: bool) -> None:
+    def sweep(self, weight: TvWeight, on_subsets: bool, looked_at: bool) -> None:
         """One pass over all projections. `go_ahead` adds the momentum after its last step."""
         self.error, self.seen = 0.0, []
         parts = self._parts if on_subsets else [self._all]
         count, made = len(parts), self._subsets
         damping, share = (made.damping, 1.0) if on_subsets else (made.damping_of_all, 1 / len(self._parts))
-        mu = weight_now(weight) / count
+        mu = weight.value / count
         for at, s in enumerate(self._problem.rng.permutation(count)):
             self._residual(parts[s], count, looked_at)
             self._step(mu, count, damping, made.step * share, made.damped_step * share)
@@ -268,7 +268,7 @@ class _Descent:
 
 
 def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, prox: Prox,
+    problem: VoxelProblem, x: F32, weight: TvWeight, subsets: Subsets, *, sweeps: int, prox: Prox,
     pull: Pull | None = None, still: float = STANDS_STILL,
 ) -> F32:  # fmt: skip
     """min ½||A x - p||² + μ TV(x), x >= 0, by sweeps until the volume has converged.
@@ -280,27 +280,27 @@ def ordered_fista(
     g = v, so that the steps end at the minimum for any L. Without damping (gain 1, L = 0) these are the steps of FISTA.
     After `_VIEWS_ON_SUBSETS` projections, but at least six sweeps, each damped step uses all projections. Steps without
     damping always use subsets. The sweeps end when four of them together change the volume by less than `still` of its
-    norm; the settings `ENDED` say how they ended. If `subsets` are for a fixed number of sweeps, there are `sweeps` of
+    norm; `problem.decide.ended` says how. If `subsets` are for a fixed number of sweeps, there are `sweeps` of
     them. Memory: 8 volumes, 2 x the projections.
 
     Args:
         x: [y, x, z], not zero; overwritten.
-        weight: μ, or an object that chooses it after each sweep.
+        weight: μ; if it follows the noise, it is adapted after each sweep.
         sweeps: largest number of sweeps.
         prox: proximal step of the prior, such as `tv_prox` for total variation.
         pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is also minimised.
         still: share of the norm of the volume; 0: all sweeps are made.
     """
     descent, scale, count = _Descent(problem, x, subsets, prox, pull), problem.scale, len(subsets.views)
-    n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
+    n_views = problem.projector.geometry.n_views
     first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(_VIEWS_ON_SUBSETS / n_views))
     standstill = Standstill(problem.decide, still, voxel_device(problem.projector.device), first)
     for k in range(sweeps):
         if k % RENEWED == 0:
             descent.renew_target()
         on_subsets = k < first or not subsets.is_damped
-        descent.sweep(weight, on_subsets, by_noise)
-        if isinstance(weight, NoiseBalance):
+        descent.sweep(weight, on_subsets, weight.by_noise)
+        if weight.by_noise:
             weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(descent.seen)))
         going = problem.go_on(k + 1, math.sqrt(descent.error) / scale)
         if standstill.ends(descent.x, k + 1, going) if subsets.to_the_end else not going:

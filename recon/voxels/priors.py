@@ -36,31 +36,32 @@ MATTER = 0.05  # share of the density unit above which a voxel is material
 
 
 @dataclass(eq=False)
-class NoiseBalance:
-    """The weight μ of total variation in min ½||A x - p||² + μ TV(x), x >= 0, adapted after each sweep over the views.
+class TvWeight:
+    """The weight μ of total variation in min ½||A x - p||² + μ TV(x), x >= 0, and what it follows from.
 
-    It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its number of voxels of material and
-    σ the noise of a ray. This assumes a Laplace distribution, with the mean change, for the change of each voxel. After
-    each sweep the weight is the first weight times (σ / s)², limited to 1 to 4 times the first weight, where s is the
-    noise-like part of the residual. The weight rises if the residual has less noise than the data, because then the
-    volume has fitted the noise. Rings, and errors of the geometry or of the air, which no volume explains, make s large
-    and change the volume like noise. So after three eighths of the sweeps, s replaces σ if it is larger: the weight is
-    (s / σ)² times the first one, at most four times. Here s is the smallest value so far, so that the weight can only
-    fall.
+    A weight that held-out projections, an earlier run or the caller chose stays as it is. A weight that follows the
+    noise is adapted after each sweep over the views. It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered
+    back-projection, N its number of voxels of material and σ the noise of a ray. This assumes a Laplace distribution,
+    with the mean change, for the change of each voxel. After each sweep the weight is the first weight times (σ / s)²,
+    limited to 1 to 4 times the first weight, where s is the noise-like part of the residual. The weight rises if the
+    residual has less noise than the data, because then the volume has fitted the noise. Rings, and errors of the
+    geometry or of the air, which no volume explains, make s large and change the volume like noise. So after three
+    eighths of the sweeps, s replaces σ if it is larger: the weight is (s / σ)² times the first one, at most four times.
+    Here s is the smallest value so far, so that the weight can only fall.
 
     Attributes:
         first: the first weight.
-        noise: noise of a ray, with which the residual is compared: `noise_beside_structure` of the data. With many
-            projections it is up to 1.3 times as large, because then little of the noise fits into a volume (π / 2 times
-            the number of columns determine a slice).
+        noise: None: the weight stays as it is. Otherwise the noise of a ray, with which the residual is compared:
+            `noise_beside_structure` of the data. With many projections it is up to 1.3 times as large, because then
+            little of the noise fits into a volume (π / 2 times the number of columns determine a slice).
         sweeps: number of sweeps of the method. The residual is used after three eighths of them. Before, the residual
             of a method that has not converged would look unexplainable, and the weight and the residual would stay too
             large up to the end.
     """
 
     first: float
-    noise: float
-    sweeps: int
+    noise: float | None = None
+    sweeps: int = 0
     value: float = field(init=False)
     _done: int = field(default=0, init=False)
     _least: float = field(default=math.inf, init=False)
@@ -68,9 +69,14 @@ class NoiseBalance:
     def __post_init__(self) -> None:
         self.value = self.first
 
+    @property
+    def by_noise(self) -> bool:
+        """True if the weight follows the noise, because no projections could be held out."""
+        return self.noise is not None
+
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32 | None, sweeps: int) -> NoiseBalance:
-        """The weight for a problem.
+    def of_noise(cls, problem: VoxelProblem, start: F32 | None, sweeps: int) -> TvWeight:
+        """The weight for a problem by the noise of its data.
 
         Args:
             start: [y, x, z], not zero; the volume x₀ if no direct method can make one. None: then the weight is 0.
@@ -94,7 +100,7 @@ class NoiseBalance:
         """Adapt the weight to the residual (some whitened projections [view, col, row]), and return the weight."""
         self._done += 1
         deviation = median_deviation(residual)
-        if not (deviation > 0 and self.noise > 0):
+        if not (self.noise and deviation > 0):
             return self.value
         self._least = min(self._least, deviation / self.noise)
         unexplained = self._done >= math.ceil(SETTLED * self.sweeps) and self._least > 1
@@ -102,11 +108,6 @@ class NoiseBalance:
         factor = float(np.clip(ratio**2, 1.0, MOST_BY_RESIDUAL))
         self.value = self.first * factor
         return self.value
-
-
-def weight_now(weight: NoiseBalance | float) -> float:
-    """The weight μ of total variation, which a `NoiseBalance` adapts after each sweep."""
-    return weight.value if isinstance(weight, NoiseBalance) else weight
 
 
 def tv_prox(problem: VoxelProblem, steps: int) -> TotalVariationProx:

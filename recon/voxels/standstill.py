@@ -9,14 +9,11 @@ from functools import partial
 from typing import Any, TypeVar
 
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Ended
 from recon.voxels.devices import CPU, VoxelDevice
 
 MOST_SWEEPS, USUAL_SWEEPS = 60, 30
 """Largest number of sweeps, and the usual number until the volume has converged."""
-ENDED = "ended", "ended_after", "last_change"
-"""Names of the settings that say how the sweeps ended ("still": the volume converged; "stopped"; "bound": all were
-made), after how many sweeps, and by which share the last four sweeps changed the volume (left out if not known)."""
 MIRRORED = 4
 """After this many sweeps, total variation uses the same differences again, see `TotalVariationProx`. Therefore the
 volumes that are compared are this many sweeps apart."""
@@ -56,9 +53,10 @@ class Standstill:
         return not going
 
     def report(self) -> None:
-        """Put the settings `ENDED` into the record of the volume."""
-        values = self._ended, self._done, self._change
-        self._decide.settings |= {name: value for name, value in zip(ENDED, values, strict=True) if value != math.inf}
+        """Record how the sweeps ended. The change of the sweeps before counts if that of these is not known."""
+        before = self._decide.ended
+        change = self._change if before is None or self._change < math.inf else before.change
+        self._decide.ended = Ended(self._ended, self._done, change, before and before.on_half_voxels)
 
     def _change_of(self, x: Any) -> float:
         """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""

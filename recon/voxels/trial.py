@@ -28,7 +28,7 @@ from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoic
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Pull, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, noise_of_volume, pnp_dct, tv_prox
+from recon.voxels.priors import TvWeight, noise_of_volume, pnp_dct, tv_prox
 from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.standstill import MOST_SWEEPS
@@ -64,7 +64,7 @@ def _trial_rows(geometry: Geometry, grid: Grid) -> int:
 
 def choose_weight(
     problem: VoxelProblem, start: F32 | None, sweeps: int, trial: Callable[[], Trial | None] | None = None
-) -> NoiseBalance | float:
+) -> TvWeight:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, from held-out projections if there are any, or from the
     noise.
 
@@ -73,20 +73,20 @@ def choose_weight(
     a fit has used the held-out projections, and any weight would then raise their residual.
 
     Args:
-        start, sweeps: as for `NoiseBalance.of`.
+        start, sweeps: as for `TvWeight.of_noise`.
         trial: function that returns the trial of this problem; None: `Trial.of`.
     """
 
     def chosen() -> list[float]:
         if problem.prior is not None:
             return [problem.prior.weight]
-        balance = NoiseBalance.of(problem, start, sweeps)
+        balance = TvWeight.of_noise(problem, start, sweeps)
         judge = (trial() if trial else Trial.of(problem)) if balance.first > 0 else None
         best = None if judge is None else judge.best_weight(balance.first)
-        return [balance.first, balance.noise] if best is None else [best.strength]
+        return [balance.first, balance.noise or 0.0] if best is None else [best.strength]
 
     first, *noise = problem.decide("weight", chosen)
-    return NoiseBalance(first, noise[0], sweeps) if noise else first
+    return TvWeight(first, noise[0], sweeps) if noise else TvWeight(first)
 
 
 class Patches(NamedTuple):
@@ -101,9 +101,7 @@ class Patches(NamedTuple):
     better: bool
 
 
-def choose_patches(
-    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None], steps: int
-) -> Patches:
+def choose_patches(problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None], steps: int) -> Patches:
     """The strength of `pnp_dct` chosen by held-out projections, starting from volumes of total variation with a weight
     μ.
 
@@ -116,14 +114,14 @@ def choose_patches(
     def chosen() -> list[float]:
         if problem.prior is not None:
             return [problem.prior.strength, problem.prior.patches]
-        judge = None if isinstance(weight, NoiseBalance) else trial()
+        judge = None if weight.by_noise else trial()
         first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
-        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
+        if judge is None or first == 0:
             return [first, 0]
-        best = judge.best_patches(weight, first, steps)
+        best = judge.best_patches(weight.value, first, steps)
         if best is None:
             return [first, 0]
-        return [best.strength, bool(best.residuals.mean() < judge.residuals_of_weight(weight).mean())]
+        return [best.strength, bool(best.residuals.mean() < judge.residuals_of_weight(weight.value).mean())]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
@@ -300,7 +298,7 @@ class Trial:
     def weight(self) -> float | None:
         """The weight of total variation for all projections, in the units of the problem; None: the noise decides."""
         weight = choose_weight(self.scan, None, 0, lambda: self)
-        return None if isinstance(weight, NoiseBalance) else weight
+        return None if weight.by_noise else weight.value
 
     @property
     def smooth_residuals(self) -> F64:
@@ -338,7 +336,7 @@ class Trial:
             return None
         if self.wide:
             return Prior(self.weight)
-        return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
+        return Prior(self.weight, *choose_patches(self.scan, TvWeight(self.weight), lambda: self, PATCH_STEPS))
 
     def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> TrialChoice:
         """Which candidate predicts the held-out projections best; a candidate that cannot use the projections is not
@@ -418,7 +416,8 @@ class Trial:
         """
         most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=most, prox=tv_prox(part, TV_STEPS), pull=pull, still=STILL_IN_TRIAL
+            part, x, TvWeight(weight), self._subsets, sweeps=most, prox=tv_prox(part, TV_STEPS), pull=pull,
+            still=STILL_IN_TRIAL,
         ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:

@@ -24,7 +24,7 @@ from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import NoiseBalance, tv_prox, weight_now
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import volume_lines
 from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.trial import TV_STEPS, Trial
@@ -128,7 +128,7 @@ class Discrete(HalfVoxels):
             return FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels).iterate(problem, x)
         trial = cache(partial(Trial.of, problem))
         x, weight = FistaTv(still=self.still).with_weight(problem, x, trial)
-        materials, mu = self.materials(problem, weight, trial), weight_now(weight)
+        materials, mu = self.materials(problem, weight, trial), weight.value
         if not problem.go_on.going:
             return x
         if materials is None:
@@ -140,7 +140,7 @@ class Discrete(HalfVoxels):
         return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
 
     def materials(
-        self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None]
+        self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
     ) -> MaterialPrior | None:
         """The levels in the units of the problem; None if they do not predict held-out projections. Decided once.
 
@@ -156,7 +156,7 @@ class Discrete(HalfVoxels):
         return materials if materials.levels else None
 
     def pulled(
-        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int,
+        self, problem: VoxelProblem, x: F32, weight: TvWeight, materials: MaterialPrior, done: int,
         to_the_end: bool = True,
     ) -> F32:  # fmt: skip
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
@@ -165,7 +165,7 @@ class Discrete(HalfVoxels):
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
-            further, x, weight_now(weight) * materials.tv_share, subsets, sweeps=self.iterations,
+            further, x, TvWeight(weight.value * materials.tv_share), subsets, sweeps=self.iterations,
             prox=tv_prox(problem, TV_STEPS), pull=pull, still=self.still,
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: undecided_share(x[pull.where], materials))
@@ -173,15 +173,15 @@ class Discrete(HalfVoxels):
         problem.decide.settings |= {UNDECIDED: share, **{name + _OF: value for name, value in of_scan.items()}}
         return x
 
-    def _materials(self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Trial | None) -> MaterialPrior:
+    def _materials(self, problem: VoxelProblem, weight: TvWeight, trial: Trial | None) -> MaterialPrior:
         """The levels in the units of the problem; empty if they do not predict held-out projections better."""
         if problem.prior is not None:
             return problem.prior.materials or MaterialPrior()
-        if trial is None or isinstance(weight, NoiseBalance):
+        if trial is None or weight.by_noise:
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
             return MaterialPrior(levels, weights, 1.0, PULLS[-1]).scaled(-problem.units.density)
-        return self._choice(trial, weight).materials
+        return self._choice(trial, weight.value).materials
 
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
         unit = -trial.problem.units.density

@@ -23,6 +23,7 @@ from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, im
 from recon.features.reference.weights import falling
 from recon.kernels.cpu.two_tv import ascend, pace_of, primal
 from recon.voxels.ordered_fista import SUBSETS, Subsets, ordered_fista, subsets_of
+from recon.voxels.priors import TvWeight
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights
 
 OWN = 0.3
@@ -134,7 +135,7 @@ class StateFit:
             return self.going(self._done, left)
 
         self.x = ordered_fista(
-            replace(self.problem, go_on=GoesOn(go_on)), self.x, self.weight, self._subsets, sweeps=most,
+            replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=most,
             prox=self._prox, still=still,
         )  # fmt: skip
 

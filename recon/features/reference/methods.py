@@ -108,7 +108,7 @@ class FromReference(Method):
             go_on=watched(control, problem.geometry.n_views, report=report), decide=decide,
         )  # fmt: skip
         settings = {
-            **decide.settings, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,
+            **decide.record, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,
             "reference_weight": verdict.weight,
         }  # fmt: skip
         return Reconstruction(

@@ -23,6 +23,20 @@ def test_work_that_was_ended_is_not_asked_again() -> None:
     assert not going.going and answers == [True]
 
 
+def test_iterations_that_follow_others_count_on_and_end_with_them() -> None:
+    heard: list[int] = []
+    first = GoesOn(lambda step, residual: not heard.append(step) and step < 8)
+    then = first.after(3, each=2)
+    assert [then(step, 0.1) for step in (1, 2, 3, 4)] == [True, True, False, False]
+    assert heard == [5, 7, 9] and not first.going and not then.going
+
+
+def test_the_end_of_trials_is_not_the_end_of_the_iterations() -> None:
+    nobody, ended = GoesOn(lambda step, residual: True), GoesOn(trials=GoesOn(lambda step, residual: False))
+    assert nobody.trials() and nobody.trials.trials() and nobody()
+    assert not ended.trials() and ended() and ended.after(3).trials is ended.trials
+
+
 def test_a_deadline_ends_work_and_is_nobodys_stop() -> None:
     times = iter([59.9, 60.0])
     stop = Stop(deadline=60.0, now=lambda: next(times))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,9 @@ from recon.kernels.cpu.tv import total_variation
 from recon.voxels.damping import Damping, largest_damped
 from recon.voxels.devices import CPU
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import tv_prox
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import Projector
-from recon.voxels.standstill import ENDED, MOST_SWEEPS
+from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights, largest_eigenvalue
 
 F32 = NDArray[np.float32]
@@ -101,7 +102,7 @@ def test_damped_steps_end_at_the_minimum_of_steps_without_damping(cone: bool, we
         made = replace(problem, rng=np.random.default_rng(0))
         subsets = Subsets.of(made, most, damped)
         assert subsets.is_damped is damped
-        x = ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, prox=tv_prox(made, 10), still=0.0)
+        x = ordered_fista(made, start.copy(), TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, 10), still=0.0)
         residual = made.projector.forward_lines(x) - made.data
         weight = 1.0 if made.weight is None else made.weight
         data = 0.5 * float((weight * np.square(residual, dtype=np.float64)).sum())
@@ -127,21 +128,24 @@ def test_the_settings_say_how_the_sweeps_ended(sweeps: int, still: float, stop_a
 
     made, mu = replace(problem, go_on=GoesOn(go_on)), 0.02 * float(problem.data.max())
     subsets = Subsets.of(made, subsets_of(made.projector.geometry))
-    ordered_fista(made, start, mu, subsets, sweeps=sweeps, prox=tv_prox(made, 3), still=still)
-    settings = made.decide.settings
-    assert settings[ENDED[0]] == ended and settings[ENDED[1]] == len(done) == done[-1]
+    ordered_fista(made, start, TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, 3), still=still)
+    assert made.decide.ended is not None
+    how, after, change, _ = made.decide.ended
+    assert how == ended and after == len(done) == done[-1]
     if stop_at == 3:  # no volume was compared with an earlier one
-        assert ENDED[2] not in settings
+        assert change == math.inf and "last_change" not in made.decide.record
     else:
-        assert (settings[ENDED[2]] < 0.005) is (ended == "still") or still == 0
+        assert (change < 0.005) is (ended == "still") or still == 0
 
 
 def test_steps_that_are_not_damped_make_all_sweeps_and_say_nothing() -> None:
     problem, start = _problem(False, False)
     done: list[int] = []
     made = replace(problem, go_on=GoesOn(lambda sweep, _: not done.append(sweep)))
-    ordered_fista(made, start, 0.1, Subsets.of(made, 1, to_the_end=False), sweeps=25, prox=tv_prox(made, 3), still=1.0)
-    assert len(done) == 25 and not set(ENDED) & made.decide.settings.keys()
+    ordered_fista(
+        made, start, TvWeight(0.1), Subsets.of(made, 1, to_the_end=False), sweeps=25, prox=tv_prox(made, 3), still=1.0
+    )
+    assert len(done) == 25 and made.decide.ended is None
 
 
 HARD = {
@@ -177,7 +181,9 @@ def test_hard_scans_end_no_further_from_the_minimum_than_the_early_end(name: str
 
     def end(subsets: Subsets, sweeps: int, tv_steps: int, still: float) -> F32:
         made = replace(problem, rng=np.random.default_rng(0))
-        return ordered_fista(made, start.copy(), mu, subsets, sweeps=sweeps, prox=tv_prox(made, tv_steps), still=still)
+        return ordered_fista(
+            made, start.copy(), TvWeight(mu), subsets, sweeps=sweeps, prox=tv_prox(made, tv_steps), still=still
+        )
 
     def objective(x: F32) -> float:
         square = np.square(projector.forward_lines(x) - data, dtype=np.float64)

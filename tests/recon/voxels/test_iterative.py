@@ -14,11 +14,13 @@ from scipy.sparse.linalg import lsqr, svds
 from recon.base.decisions import Decisions, GoesOn
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
+from recon.base.method import SWEEPS_OF_TRIALS, RunControl
 from recon.base.volume import Grid, Volume
 from recon.features.iterative.methods import AsdPocs, Cgls, Sart, Sirt
 from recon.reconstruction import reconstruct
+from recon.voxels.choice import MOST_TRIALS
 from recon.voxels.fbp import fbp
-from recon.voxels.iterative import solve
+from recon.voxels.iterative import solve, watched
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
@@ -239,7 +241,7 @@ def test_ordered_subset_sirt_ends_where_many_further_iterations_change_little(no
     by_default, further = OsSirtTv(tv_weight=0.01), OsSirtTv(iterations=200, tv_weight=0.01, still=0.0)
     decide = Decisions(0)
     ended = error(solve(by_default, projector, views, decide=decide), truth)
-    assert decide.settings["ended"] == "still" and decide.settings["ended_after"] < by_default.iterations
+    assert decide.record["ended"] == "still" and decide.record["ended_after"] < by_default.iterations
     assert ended == pytest.approx(error(solve(further, projector, views), truth), rel=0.05)
 
 
@@ -368,3 +370,18 @@ def test_a_typical_density_is_that_of_all_slices(shape: tuple[int, int, int]) ->
     x = np.zeros(shape, np.float32)
     x[..., 1 : 1 + shape[2] // 2] = 3.0
     assert density_unit(x) == pytest.approx(3.0)
+
+
+def test_trials_are_told_as_progress_and_asked_apart() -> None:
+    """As a rule 4 iterations, at most as many as MOST_TRIALS times that."""
+    told: list[tuple[int, int, str]] = []
+    stop = iter([False, False, True])
+    control = RunControl(
+        lambda: False, lambda each: told.append((each.step, each.steps, each.unit)), stop_trials=lambda: next(stop)
+    )
+    iterations: list[int] = []
+    going = watched(control, 90, 1, lambda number, residual: iterations.append(number))
+    assert [going.trials(), going.trials(), going.trials(), going.trials()] == [True, True, False, False]
+    most = round(MOST_TRIALS)
+    assert told == [(1, 1, f"{SWEEPS_OF_TRIALS} as a rule"), (2, max(2, most), f"{SWEEPS_OF_TRIALS} at most")]
+    assert going(1, 0.5) and iterations == [1] and going.trials.trials is going.trials

@@ -15,7 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.reach import SampleRadius
 from recon.base.volume import Grid
 from recon.voxels.measured_law import measured_law
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.priors import TvWeight
 from recon.voxels.voxel_problem import VoxelProblem
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -140,13 +140,13 @@ def test_gaps_last_until_the_views_are_as_many_as_the_sample_is_columns_wide(
 def test_views_of_many_columns_are_binned(monkeypatch: pytest.MonkeyPatch) -> None:
     whole, columns = law_of(192, 300)[0], list[int]()
     monkeypatch.setattr("recon.voxels.measured_law._WORK", 192 * SIDE**2 - 1)
-    balance_of = NoiseBalance.of
+    balance_of = TvWeight.of_noise
 
-    def noted(problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
+    def noted(problem: VoxelProblem, start: F32, sweeps: int) -> TvWeight:
         columns.append(problem.data.shape[1])
         return balance_of(problem, start, sweeps)
 
-    monkeypatch.setattr(NoiseBalance, "of", noted)
+    monkeypatch.setattr(TvWeight, "of_noise", noted)
     binned = measured(192, 300)[0]
     assert columns == [SIDE // 2]
     assert binned.n_views == 192 and binned.exponent == pytest.approx(whole.exponent, abs=0.15)

@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv, OsSirtTv
-from recon.voxels.priors import NoiseBalance
+from recon.voxels.priors import TvWeight
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -44,7 +44,7 @@ def _grains() -> tuple[F32, F32]:
 
 
 def test_it_rises_by_the_square_of_the_missing_noise_in_the_residual() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, sweeps=8)
+    balance = TvWeight(first=2.0, noise=1.0, sweeps=8)
     assert balance.value == 2.0
     balance.after_sweep(_residual(0.8))
     assert balance.value == pytest.approx(2.0 / 0.8**2, rel=0.05)
@@ -53,7 +53,7 @@ def test_it_rises_by_the_square_of_the_missing_noise_in_the_residual() -> None:
 
 
 def test_it_stays_between_its_first_value_and_four_times_that() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, sweeps=8)
+    balance = TvWeight(first=2.0, noise=1.0, sweeps=8)
     values = []
     for sigma in (30.0, 0.01):
         balance.after_sweep(_residual(sigma))
@@ -62,7 +62,7 @@ def test_it_stays_between_its_first_value_and_four_times_that() -> None:
 
 
 def test_what_no_volume_explains_makes_it_heavier_when_three_eighths_are_done() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, sweeps=8)
+    balance = TvWeight(first=2.0, noise=1.0, sweeps=8)
     values = []
     for sigma in (9.0, 3.0, 2.0, 5.0, 1.4, 1.0, 100.0):
         balance.after_sweep(_residual(sigma))
@@ -72,7 +72,7 @@ def test_what_no_volume_explains_makes_it_heavier_when_three_eighths_are_done() 
 
 def test_a_slow_method_is_looked_at_later() -> None:
     """OS-SIRT has not converged after three sweeps; what it still left of the views made the weight too heavy."""
-    balance = NoiseBalance(1.0, 1.0, sweeps=40)
+    balance = TvWeight(1.0, 1.0, sweeps=40)
     assert [balance.after_sweep(_residual(2.0)) for _ in range(14)] == [1.0] * 14
     assert balance.after_sweep(_residual(1.0)) == pytest.approx(1.0, rel=0.05)
 
@@ -98,7 +98,7 @@ def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(
 
 
 def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, sweeps=8)
+    balance = TvWeight(first=2.0, noise=1.0, sweeps=8)
     balance.after_sweep(np.zeros((2, 3, 3), np.float32))
     assert balance.value == 2.0
 

@@ -8,7 +8,7 @@ from recon.base.decisions import GoesOn
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.priors import tv_prox
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -24,7 +24,7 @@ def test_equal_rows_stay_equal_slices() -> None:
     data = projector.forward_lines(np.repeat(DISC[:, :, :1], 9, axis=2))
     problem = VoxelProblem(projector, data, None, True, np.random.default_rng(1), GoesOn())
     start = np.full((48, 48, 9), 0.1, np.float32)
-    volume = ordered_fista(problem, start, 500.0, Subsets.of(problem, 2), sweeps=30, prox=tv_prox(problem, 3))
+    volume = ordered_fista(problem, start, TvWeight(500.0), Subsets.of(problem, 2), sweeps=30, prox=tv_prox(problem, 3))
     assert np.ptp(volume, axis=2).max() < 1e-3
 
 
