@@ -217,7 +217,8 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
         if twice := [name for name, is_given in given.items() if is_given]:
             raise ValueError(f"leave out {' and '.join(twice)}, because the projections are given as Views")
         _refuse_geometry(projections.geometry)
-        return replace(projections, data=_line_integrals(projections.data, projections.geometry))
+        weights = None if projections.weights is None else projections.weights[...]
+        return replace(projections, data=_line_integrals(projections.data, projections.geometry), weights=weights)
     if geometry is None:
         raise ValueError("give the geometry of the projections; only Views contain it")
     _refuse_geometry(geometry)

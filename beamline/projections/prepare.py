@@ -115,6 +115,7 @@ def prepare_projections(
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
+    del projections  # their line integrals may be copied next
     if others.size:
         with suppress(NoViewError):
             held_out = apply(plan, others, warn=warn)

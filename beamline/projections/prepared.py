@@ -111,7 +111,8 @@ class PreparedProjections:
     @property
     def geometry(self) -> Geometry:
         """The geometry of the projections used."""
-        return self.lines.geometry.select(slice(self.n_used))
+        geometry = self.lines.geometry
+        return geometry.select(slice(self.n_used)) if self.lines.held_out.size else geometry
 
     @property
     def n_used(self) -> int:

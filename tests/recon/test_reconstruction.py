@@ -19,7 +19,9 @@ from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
 from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.methods import accepting, build, by_name, names_of_one_volume
+from recon.voxels.beyond_field import whole_reach
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
@@ -345,3 +347,19 @@ def test_a_leaning_axis_asks_for_a_weight_as_no_view_judges_structure_along_it(
 
 
 test_calls_that_are_refused = refused_calls(__file__, globals())
+
+
+def test_views_bring_their_geometry_weights_and_reach(noisy: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As arrays do, to the bit; what they state is neither stated twice nor measured again."""
+    weights, method = np.ones_like(noisy), recon.Sirt(iterations=2)
+    weights[5] = 0.5
+    views = Views(noisy, VIEWS, weights)
+    by_arrays = recon.reconstruct(noisy, VIEWS, method, use=DataUse(weights))
+    views = replace(views, reach=whole_reach(views))
+    monkeypatch.setattr("recon.voxels.beyond_field.edges_of", None)
+    by_views = recon.reconstruct(views, method=method)
+    np.testing.assert_array_equal(by_views.volume.data, by_arrays.volume.data)
+    with pytest.raises(ValueError, match=r"leave out geometry and use\.weights, because .* Views"):
+        recon.reconstruct(views, VIEWS, method, use=DataUse(weights))
+    with pytest.raises(ValueError, match="give the geometry of the projections"):
+        recon.reconstruct(noisy, method=method)
