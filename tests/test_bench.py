@@ -11,6 +11,7 @@ import inspect
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -251,6 +252,20 @@ def test_leagues(monkeypatch: Patch, tmp_path: Path, capsys: pytest.CaptureFixtu
     small(monkeypatch, users, play=lambda *_: users.Score(20.0, 0.5, 0.1, None, None, None, 1.0, 100.0))
     users.play_all(kept, [cell], ["fbp"], False, 10.0)
     assert "fbp" in users.tables(kept, [cell])
+
+
+def test_half_voxels(monkeypatch: Patch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    halves, ends = script("half_voxels"), script("ends")
+    small(monkeypatch, ends, MORE=1, SHARES=())
+    halves.main(["--columns", "48", "--views", "12", "--over", "1.5"])
+    ends.main(["--columns", "48", "--views", "12", "--methods", "fista-tv", "--half-voxels"])
+    assert capsys.readouterr().out.count("fista-tv") == 3
+    toy = toy_case()
+    unseen = toy.projections, toy.geometry, np.ones(toy.projections.shape, bool)
+    ball = {"ball": lambda _: np.ones((8, 8, 8), np.float32)}
+    small(monkeypatch, halves, CUT=12, SIDE=16, CONE_VIEWS=4, OBJECTS=ball)
+    assert halves.measured(halves.cut(replace(toy, unseen=unseen))).startswith("| toy, 12 columns | 0.")
+    assert halves.in_a_cone(tmp_path, "ball").startswith("| ball | ")
 
 
 def test_next_pass(monkeypatch: Patch, tmp_path: Path) -> None:

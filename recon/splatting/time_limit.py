@@ -174,7 +174,7 @@ class FinalFit(Iterative):
             late = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
                 # Gaussians from a fit during the scan do not determine the offset in the middle: -2 dB on grains.
-                made = FistaTv().run(problem, late)
+                made = FistaTv(half_voxels=False).run(problem, late)  # as its memory is stated
                 volume, sweeps = made.volume, len(made.history)
                 plan = plan._replace(sweeps=self.method.finish)
             else:

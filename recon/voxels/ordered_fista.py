@@ -187,8 +187,8 @@ class _Descent:
     """
 
     def __init__(self, problem: VoxelProblem, x: F32, subsets: Subsets, prox: Prox, pull: Pull | None) -> None:
-        device, self._prox = voxel_device(problem.projector.device), prox
-        self._device = device
+        device = self._device = voxel_device(problem.projector.device)
+        self._prox = prox
         self._data, self._rays = device.array(problem.data), None
         if problem.weight is not None:
             self._rays = device.array(problem.weight)

@@ -1,10 +1,12 @@
 """Benchmark of where methods end: what 200 further iterations change, and dB against the number of iterations.
 
 python -m tests.bench.ends [--columns 192] [--views 30 45 90 180] [--photons 1e4] [--scene packed] [--methods NAME ...]
+    [--half-voxels]
 
 It prints a table with a row for each method and number of projections: how many iterations the default made, its PSNR,
 the PSNR after 200 more with the same weights, and the PSNR after some smaller numbers of iterations. Scenes, noise and
-PSNR are those of tests.bench.first_users. All voxels are as wide as pixels.
+PSNR are those of tests.bench.first_users. All voxels are as wide as pixels. With `--half-voxels`, the last iterations
+of fista-tv and discrete use half voxels, and only these are counted.
 """
 
 from __future__ import annotations
@@ -39,19 +41,20 @@ def longer(method: Any, settings: Mapping[str, Any], iterations: int) -> Any:
     return replace(method, **changes)
 
 
-def row(cell: Cell, name: str) -> str:
+def row(cell: Cell, name: str, on_halves: bool) -> str:
     scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views, cell.packing)
     views, rows = noisy(cell, scene), range(cell.rows)
-    method = with_halves(method_named(name), False)
+    method = with_halves(method_named(name), on_halves)
     begin = time.process_time()
     default = recon.reconstruct(views, scene.geometry, method=method)
     seconds = time.process_time() - begin
-    made = int(default.settings.get("ended_after", default.settings["iterations"]))
-    ended = str(default.settings.get("ended", "schedule"))
+    given = default.settings
+    made = int(given.get("half_voxel_iterations", given.get("ended_after", given["iterations"])))
+    ended = str(given.get("ended", "schedule"))
     decibels = judged(default.volume.data, scene, rows)[0]
     line = [name, str(cell.views), str(made), ended, f"{decibels:.2f}"]
     for iterations in (made + MORE, *(max(1, round(share * made)) for share in SHARES)):
-        other = longer(method, default.settings, iterations)
+        other = longer(method, given, iterations)
         volume = recon.reconstruct(views, scene.geometry, method=other).volume.data
         line.append(f"{judged(volume, scene, rows)[0]:.2f}")
     return "| " + " | ".join([*line, f"{seconds:.1f}"]) + " |"
@@ -65,6 +68,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--photons", type=float, default=1e4)
     parser.add_argument("--packing", type=int, default=0)
     parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--half-voxels", action="store_true")
     asked = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
     print("| method | projections | iterations | how it ended | PSNR (dB) | 200 iterations more (dB) "
@@ -72,7 +76,7 @@ def main(arguments: list[str]) -> None:
     for views in asked.views:
         cell = Cell(asked.scene, asked.columns, views, 1.0, asked.photons, 0, asked.packing)
         for name in asked.methods:
-            print(row(cell, name), flush=True)
+            print(row(cell, name, asked.half_voxels), flush=True)
 
 
 if __name__ == "__main__":

@@ -75,18 +75,23 @@ def test_few_projections_use_them(wanted: bool | None, views: int, columns: int,
     assert uses_half_voxels(wanted, geometry, Grid.matching(geometry)) is used
 
 
-def test_never_in_voxels_that_are_already_narrow_nor_by_default_in_a_wide_box() -> None:
+def test_never_in_voxels_that_are_already_narrow() -> None:
     geometry = geometry_of(12)
-    grid = Grid.matching(geometry)
-    assert not uses_half_voxels(True, geometry, halved(grid))
-    wide = replace(grid, shape=(ROWS, 2 * SIDE, 2 * SIDE))
-    assert not uses_half_voxels(None, geometry, wide)
-    assert uses_half_voxels(True, geometry, wide)
+    assert not uses_half_voxels(True, geometry, halved(Grid.matching(geometry)))
 
 
-def test_never_by_default_in_a_cone() -> None:
+def test_by_default_in_a_box_as_wide_as_the_sample() -> None:
+    geometry = geometry_of(12, 512)
+    wide = Grid.matching(geometry)
+    assert uses_half_voxels(None, geometry, replace(wide, shape=(ROWS, 1024, 1024)))
+    assert not uses_half_voxels(None, geometry, replace(wide, shape=(ROWS, 1026, 1026)))
+    assert not uses_half_voxels(None, geometry_of(12), replace(wide, shape=(ROWS, 3 * SIDE, 3 * SIDE)))
+
+
+def test_only_on_request_in_a_cone() -> None:
     cone = Geometry.cone(np.linspace(0, 2 * np.pi, 12), (ROWS, SIDE), pixel_pitch=1.0, sod=200.0, sdd=400.0)
     assert not uses_half_voxels(None, cone, Grid.matching(cone))
+    assert uses_half_voxels(True, cone, Grid.matching(cone))
 
 
 def test_total_variation_doubles_so_that_half_the_weight_is_the_same_prior() -> None:
@@ -116,6 +121,21 @@ def test_total_variation_is_not_farther_from_the_truth() -> None:
         for wanted in (False, True)
     )
     assert halves < whole
+
+
+def test_a_sample_wider_than_the_field_is_closer_to_the_truth() -> None:
+    views = np.random.default_rng(1).normal(exact_views(geometry_of(30)), 0.01).astype(np.float32)
+    first, width = 12, 40
+    geometry = geometry_of(30, width)
+    away = np.arange(width) - (width - 1) / 2
+    seen = np.hypot(away[:, None], away) < 0.9 * width / 2
+    errors = []
+    for wanted in (False, True):
+        made = recon.reconstruct(views[:, :, first : first + width], geometry, recon.Discrete(half_voxels=wanted))
+        assert made.outside is not None
+        true = truth()[first : first + width, first : first + width]
+        errors.append(np.sqrt(np.mean(np.square(made.volume.data - true)[:, seen])))
+    assert errors[1] < 0.9 * errors[0]
 
 
 def test_the_record_says_how_many_iterations_used_them() -> None:
