@@ -37,7 +37,7 @@ _SILENCE = 300.0  # real time in s without output after which the process is end
 _GRACE = 120.0  # real time in s for which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
 _AGAIN = 2  # how often it is started again
-_SHOWN_WITHIN = 10.0  # real s after the scan
+_SHOWN_WITHIN = 5.0  # real s after the scan
 _POLL = 0.1  # real s between two checks of its readiness
 _SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
@@ -253,12 +253,16 @@ class LiveReconstruction:
             self._sink(Warned(message, source="recon"))
         return self._done
 
-    def wait_shown(self, stop: Callable[[], bool]) -> None:
-        """Wait until its picture shows all projections or it has ended, at most 10 s; `stop` ends the wait."""
+    def end_shown(self, stop: Callable[[], bool]) -> None:
+        """Kill it when its picture shows all projections, or after 5 s; `stop` ends the wait."""
+        with self._changing:
+            process, self._wanted = self._process, False
         deadline = time.monotonic() + _SHOWN_WITHIN
-        while self._process is not None and self._process.running and not stop() and time.monotonic() < deadline:
+        while process is not None and process.running and not stop() and time.monotonic() < deadline:
             if self._shown.wait(_POLL):
-                return
+                break
+        if process is not None:
+            process.end()
 
     def close(self) -> None:
         """End the process if it is still running."""

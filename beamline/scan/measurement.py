@@ -210,7 +210,7 @@ class Measurement:
         )
         self.sink(ScanDone(result))
         if follower is not None and draws:
-            follower.wait_shown(lambda: self.stop.aborting or not closed)
+            follower.end_shown(lambda: self.stop.aborting or not closed)
         elif follower is not None:
             useless = not closed or isinstance(ended.error, ReferencesError)
             aborting = abort_watch(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))

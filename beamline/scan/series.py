@@ -121,6 +121,10 @@ def run_series(
         jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
         complete = [(_value(one), job) for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)]
         if series is not None and len(complete) == len(each):
+            if config.scan.states:
+                _volumes(
+                    [(path, commands(one, None)) for one, (_, path) in zip(each, complete, strict=True)], stop, sinks
+                )
             return SeriesRun(series, tuple(complete), ())
         planned = dry_run(config, series or place, whole=[value for value, _ in complete])
         refuse_violations(planned.timeline)

@@ -25,7 +25,8 @@ os.chdir(tempfile.mkdtemp(prefix="series-"))
 # ## The states and the queue
 #
 # Each state is a scene for the simulated camera, and a line of the table `series.csv`. With a real instrument, the
-# table needs no scenes, because the sample itself changes between the scans.
+# table needs no scenes, because the sample itself changes between the scans. If all states have the same settings, you
+# need no table either: `scan.states` takes one scan of each at planned times ([operando](../operando.md)).
 
 # %%
 radii = 0.06, 0.08, 0.10, 0.12  # mm

@@ -3,12 +3,14 @@
 import json
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from beamline.cli.recon import recon as recon_command
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.files import CONTROL
@@ -20,7 +22,7 @@ from beamline.plan.passes import Choice
 from beamline.scan import live_process
 from beamline.scan import measurement as module
 from beamline.scan.live_plan import LivePlan
-from beamline.scan.live_process import Commands, LiveReconstruction, Standby, follow_command
+from beamline.scan.live_process import Commands, LiveReconstruction, Standby, commands_of, follow_command
 from beamline.scan.run import run_scan
 from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument
@@ -33,6 +35,14 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     words = follow_command(small(), LivePlan(4, 2, 10**9))(Path("scan.h5"), Path("recon.h5"))
     assert words[words.index("--bin") + 1] == "4" and words[words.index("--views") + 1] == "every:2"
     assert "--bin" not in follow_command(small())(Path("scan.h5"), Path("recon.h5"))
+    told = small("recon.live=true", f"recon.reference={Path(__file__)}")  # any file that exists
+    how = commands_of(told)
+    assert how.live is not None and how.afterwards is not None and how.draws
+    for command, follows in ((how.live, True), (how.afterwards, False)):
+        words = command(Path("scan.h5"), Path("recon.h5"))
+        assert words[words.index("--method") + 1] == "from-reference" and ("--follow" in words) is follows
+        assert words[words.index("--reference") + 1] == str(Path(__file__)) and "--seconds" not in words
+        recon_command.make_context("recon", list(words[4:]))  # the command understands it
     words = follow_command(small(), earlier=[Path("a.h5"), Path("b.h5")])(Path("c.h5"), Path("recon.h5"))
     assert words[words.index("--follow") :][:5] == ["--follow", "--previous-part", "a.h5", "--previous-part", "b.h5"]
 
@@ -416,3 +426,27 @@ def test_a_process_that_waits_ends_with_its_owner(tmp_path: Path) -> None:
     assert waiting is not None
     waiting.let_go()
     assert waiting.wait(seconds=120) is ProcessEnd.EXITED and waiting.code == 0
+
+
+@pytest.mark.parametrize("shows", [True, False])
+def test_a_process_that_draws_pictures_ends_with_the_scan_and_the_volume_comes_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shows: bool
+) -> None:
+    """It is killed when its picture shows all projections, or soon after the scan, and nobody is warned."""
+    monkeypatch.setattr(live_process, "_SHOWN_WITHIN", 1.0)
+    shown = """print('{"event": "state", "state": "shown", "message": ""}', flush=True)\n""" if shows else ""
+    draws = f"""
+import pathlib, sys, time
+{shown}time.sleep(60)
+"""
+    after = """
+import json, sys
+print(json.dumps({"event": "done", "output": sys.argv[2]}))
+"""
+    events, how = list[Event](), Commands(script(draws), script(after), draws=True)
+    begin = time.monotonic()
+    result = run_scan(small(), tmp_path, [events.append], instrument=FakeInstrument().connected(), live=how)
+    assert result.recon is not None and time.monotonic() - begin < 30
+    names = [event.event for event in events]
+    assert names.index("scan_done") < names.index("recon_done") and "warning" not in names
+    assert ("shown" in [event.data.get("state") for event in events]) is shows

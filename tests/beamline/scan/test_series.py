@@ -259,3 +259,39 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
 def test_flats_of_both_ends_are_of_the_first_state(config: Path) -> None:
     first, *others = each_scan(load(config, ["scan.flats.at=both"]))
     assert first.scan.flats.at == "both" and {other.scan.flats.at for other in others} == {"start"}
+
+
+def test_the_example_of_a_series_of_states_can_run() -> None:
+    planned = dry_run(load(config_folder() / "states.yaml"))
+    assert not planned.timeline.violations
+    assert len(planned.states) == 4 and planned.every == 20 and max(one.duration for one in planned.states) < 20
+
+
+@pytest.mark.slow
+def test_the_volumes_of_a_series_with_a_reference_are_made_after_the_last_state(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those of states that were complete before the series was continued; a volume is made once."""
+    asked = list[list[str]]()
+
+    def reconstruct(words: list[str], log: Path, sink: Any, stop: Any) -> None:
+        asked.append(words)
+        Path(words[words.index("-o") + 1]).touch()
+
+    reference = tmp_path / "good.h5"
+    reference.touch()
+    monkeypatch.setattr("beamline.scan.series.reconstruct", reconstruct)
+    monkeypatch.setattr("beamline.scan.live_process.follow_command", lambda *_: lambda *_: [sys.executable, "-c", ""])
+    words = "--reference", reference, "--set", "recon.live=true", "--set", "scan.states.count=2"
+    with monkeypatch.context() as within:
+        stopped_at(within, FIRST + VIEWS // 2, signal.SIGINT)
+        assert beamline("scan", config, "-o", tmp_path / "runs", *words).exit_code == 4
+    assert not asked
+    (series,) = (tmp_path / "runs").iterdir()
+    assert beamline("scan", "--resume", series).exit_code == 0
+    outputs = [Path(command[command.index("-o") + 1]).parent.name.rpartition("_")[2] for command in asked]
+    assert outputs == ["state1", "state2"]
+    next(series.glob("*_state2")).joinpath("recon.h5").unlink()
+    assert beamline("scan", "--resume", series).exit_code == 0
+    assert len(asked) == 3 and "_state2" in asked[2][4]
+    assert all("from-reference" in command and "--follow" not in command for command in asked)

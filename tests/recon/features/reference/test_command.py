@@ -119,8 +119,8 @@ def test_the_picture_of_a_followed_scan_shows_the_moved_reference_and_the_slit(
 
     monkeypatch.setattr(live_reference, "reference_row", row)
     out = tmp_path / "out.h5"
-    files = str(folder / "state.h5"), "--reference", str(folder / "good_volume.h5")
-    done = beamline("recon", *files, *QUICK[:2], "--follow", "-o", str(out))
+    words = "--reference", str(folder / "good_volume.h5"), *QUICK[:2], "--follow", "-o", str(out)
+    done = beamline("recon", str(folder / "state.h5"), *words)
     assert done.exit_code == 0, done.output
     assert out.exists() and out.with_name("out.live.png").exists()
     (shown,) = drawn
