@@ -45,6 +45,7 @@ _MOST, _LEAST_GAIN = 0.65, 0.5  # share of such particles, and median of the gai
 _GONE = 0.3  # gain below which a particle is gone
 _SEEN = 0.5  # share of a particle that must be in rows that are used
 _CLEAR = 3.0  # standard deviations by which a cracked particle has less than the others
+_TYPICAL = 8  # whole particles, from which the spread is taken of these alone
 _LEAST_CRACK = 0.01  # least share of a particle that is missing in a crack
 
 
@@ -171,19 +172,22 @@ def numbers_of(reference: ReferenceParticles, fit: StateFit) -> StateNumbers:
     """The numbers of a state.
 
     A particle is cracked if its mass is less than the median by three standard deviations of its own error and of the
-    spread of all particles, and by 1 %: a crack that is narrower than a voxel takes mass away.
+    spread of all particles, and by 1 %: a crack that is narrower than a voxel takes mass away. So is one that seems to
+    grow by three of them more than the median while its mass falls by one: a dark core looks like a lower grey level
+    in a larger volume.
     """
     found, deviation = fit.measured, fit.noise
     seen = (fit.seen >= _SEEN) & fit.matches
     gone = seen & (found[:, 0] + 1 < _GONE)
-    mass, some = found[:, 5], seen & ~gone
+    some = seen & ~gone
     verdict = np.where(seen, np.where(gone, "gone", "as before"), "not seen").astype("<U9")
     if some.any():
-        away = mass - np.median(mass[some])
-        spread_ = np.square(1.4826 * np.median(np.abs(away[some]))) - np.median(np.square(deviation[some, 5]))
-        least = np.maximum(_CLEAR * np.sqrt(np.square(deviation[:, 5]) + max(float(spread_), 0.0)), _LEAST_CRACK)
-        verdict[some & (away < -least)] = "cracked"
-        verdict[some & (away > least)] = "closed"
+        typical = some & ~reference.cut if (some & ~reference.cut).sum() >= _TYPICAL else some
+        (lost, of_mass), (wider, of_scale) = (_away(found[:, j], deviation[:, j], typical) for j in (5, 1))
+        least = np.maximum(_CLEAR * of_mass, _LEAST_CRACK)
+        for name, sign in (("cracked", 1), ("closed", -1)):
+            outlier = (sign * wider > _CLEAR * of_scale) & (sign * lost < -of_mass)
+            verdict[some & ((sign * lost < -least) | outlier)] = name
     found, edge = np.where(seen[:, None], found, np.nan), reference.grid.voxel_size
     found[gone, 1:] = np.nan
     level = np.array([body.level for body in reference.bodies])
@@ -193,6 +197,13 @@ def numbers_of(reference: ReferenceParticles, fit: StateFit) -> StateNumbers:
     scale = _interval(1 + found[:, 1], deviation[:, 1])
     shift = edge * _interval(found[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
     return StateNumbers(grey, grey / before[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
+
+
+def _away(value: F64, deviation: F64, some: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """How far values are from the median of `some`, and the standard deviation of that: of its error and the spread."""
+    away = value - np.median(value[some])
+    spread_ = np.square(1.4826 * np.median(np.abs(away[some]))) - np.median(np.square(deviation[some]))
+    return away, np.sqrt(np.square(deviation) + max(float(spread_), 0.0))
 
 
 def _interval(value: F64, deviation: F64) -> F64:

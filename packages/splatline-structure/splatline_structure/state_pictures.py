@@ -21,7 +21,7 @@ NAMES = {"grey": "change of the grey level (%)", "volume": "change of the volume
 
 
 def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], across: str) -> list[Picture]:
-    """All pictures of a page; `states` in the order of `at`."""
+    """All pictures of a page."""
     whole, at = ~reference.cut, np.array([state.at for state in states])
     series = {
         "grey": 100 * np.stack([state.numbers.grey_change[whole] for state in states], axis=1),
@@ -66,6 +66,7 @@ def curves(series: dict[str, F64], verdicts: Any, at: F64, across: str) -> bytes
         finish(axes, "", NAMES[name], size=8, grid=True)
     for name in _COLOURS:
         below.plot(at, (verdicts == name).sum(1), "o-", label=name)
+    below.yaxis.get_major_locator().set_params(integer=True)
     finish(below, across, "particles", size=8, grid=True)
     return png(figure)
 

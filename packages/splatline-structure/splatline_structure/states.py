@@ -244,7 +244,6 @@ def _fitted(
 def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer) -> None:
     """Write the folder, and print a line for each state."""
     path, states, reference, record = series.path, series.states, series.reference, series.record
-    used = sorted(states, key=lambda state: state.at)
     settings = {
         "reference": path, "states": len(states), "command": typed_line(click.get_current_context()),
         **{name: value for name, value in values.items() if value is not None},
@@ -262,7 +261,7 @@ def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer)
     rows = [{"label": state.path.name, "cells": _cells(state, cut), "marked": False} for state in states]
     page = render(
         "trials.html", title=f"Particles of {path.name} in {count(len(states), 'state')}", summary="",
-        sentences=sentences, pictures=state_pictures.pictures_of(reference, used, series.across), bold=False,
+        sentences=sentences, pictures=state_pictures.pictures_of(reference, states, series.across), bold=False,
         heading="States", columns=columns, rows=rows, scan={name: str(each) for name, each in settings.items()},
         command=str(settings["command"]),
     )  # fmt: skip

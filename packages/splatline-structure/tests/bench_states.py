@@ -32,7 +32,7 @@ from splatline_structure.particle_states import (
 from splatline_structure.particles import NECK, cleaned, parted
 from splatline_structure.volumes import box_in
 
-_CRACK = 0.02  # um, from which a particle counts as cracked
+_CRACK, _WIDE = 0.02, 0.325  # um, from which a particle is left out of the errors, and should be called cracked
 _NEAR = 2.0  # voxels between a particle and its truth
 
 
@@ -44,7 +44,7 @@ class Errors:
         usual: whole and without a new crack.
         grey, volume: errors of relative changes, in per cent.
         held: [particle, (grey, volume, z, y, x)] whether the interval holds the truth.
-        cracked, told: truly cracked, and called so; of whole particles.
+        cracked, told: with a new crack of half a pixel or more, and called cracked; of whole particles.
     """
 
     usual: NDArray[np.bool_]
@@ -83,7 +83,7 @@ def errors_of(states: States, reference: ReferenceParticles, numbers: StateNumbe
     told = np.array([each == "cracked" for each in numbers.verdict])
     return Errors(
         whole & ~crack, 100 * (numbers.grey_change[:, 0] + 1 - grey), 100 * (numbers.growth[:, 0] - growth),
-        np.stack(held, axis=1), whole & crack, whole & told,
+        np.stack(held, axis=1), whole & (after["crack_um"][which] >= _WIDE), whole & told,
     )  # fmt: skip
 
 

@@ -214,4 +214,4 @@ def _moved(piece: Piece, shift: NDArray[np.float64], turn: float) -> Piece:
     w, i, j, k = solid.quaternion
     c, s = math.cos(turn / 2), math.sin(turn / 2)
     turned = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)
-    return replace(piece, solid=replace(piece.solid, quaternion=turned))
+    return replace(piece, solid=replace(solid, centre=piece.solid.centre, quaternion=turned))
