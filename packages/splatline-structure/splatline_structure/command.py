@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,28 +15,14 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import atomic_file, refuse_existing
 from beamline.core.sinks import Note
 from beamline.core.text import count, memory_size, safe_name
+from splatline_structure.options import edges_of, numbers_in_text, refuse_together
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import MeasuredStructure
-    from splatline_structure.materials import Spacing
     from splatline_structure.volumes import Box, ReadSlices
 
 _FILE = click.Path(path_type=Path)
 FEWEST_VIEWS = 16  # fewest projections that can be divided, 8 in each half
-
-
-def edges_of(text: str) -> Spacing:
-    """Parse the edges of a voxel (z, y, x) in µm: one number or three. Raises ValueError for other text."""
-    try:
-        z, y, x = map(float, text.split(":") if ":" in text else [text] * 3)
-    except ValueError:
-        z = y = x = math.nan
-    if not all(0 < edge < math.inf for edge in (z, y, x)) or not math.isclose(y, x, rel_tol=1e-3):
-        raise ValueError(
-            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or Z:Y:X, such as 3:1:1, with Y equal to X "
-            "because the pixels of a slice must be squares"
-        )
-    return z, y, x
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +48,18 @@ class Seen:
 @click.command(cls=Repeatable)
 @click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
 @click.option("--compare", is_flag=True, help="Print what changed between two volumes, such as charged and discharged.")
+@click.option(
+    "--states",
+    is_flag=True,
+    help="Measure the particles of the first file, the volume of a careful scan, in all others, which are scans of "
+    "later states with few projections. No volume of a state is needed.",
+)
+@click.option(
+    "--charge",
+    metavar="C,C,...",
+    callback=parsed(numbers_in_text),
+    help="With --states: state of charge of each state, against which curves are drawn. Default: the time.",
+)
 @click.option(
     "--dataset",
     metavar="PATH",
@@ -173,7 +170,9 @@ class Seen:
     help="New folder for the results. Default: name of VOLUME + _structure, in the current folder.",
 )
 @json_option
-def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
+def structure(
+    volumes: tuple[Path, ...], compare: bool, states: bool, output: Path | None, as_json: bool, **values: Any
+) -> None:
     """Measure the microstructure of a volume, each number with an interval.
 
     The command measures fractions of materials, particles, surface, contacts, cracks, connected share and tortuosity.
@@ -185,21 +184,26 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
     Several volumes are a series in time. The new folder contains report.html, numbers.csv, structure.json,
     particles.csv and labels.
 
+    With --states, the command measures each particle of a reference in later scans: grey level, volume, shift, cracked
+    or gone.
+
     Example: beamline structure recon.h5
     """
     from beamline.core.machine import free_memory
     from beamline.storage.interrupted import volume_file
     from splatline_structure.volumes import read_volume
 
-    if compare and len(volumes) != 2:
-        raise click.UsageError(f"--compare needs two volumes, got {len(volumes)}.")
-    if values["parts"] and (len(volumes) > 1 or values["scan"]):
-        raise click.UsageError("--parts needs exactly one volume, and cannot be combined with --scan.")
-    paths = [volume_file(path) for path in volumes]
+    refuse_together(states, compare, len(volumes), values)
+    paths = [volume_file(volumes[0]), *volumes[1:]] if states else [volume_file(path) for path in volumes]
     output = output or Path(f"{safe_name(paths[0].name.split('.')[0])}_structure")
     with answering(as_json) as answer:
         refuse_existing(output)
         memory = free_memory() if values["memory"] is None else values["memory"]
+        if states:
+            from splatline_structure.states import measure_states
+
+            measure_states(paths, output, answer, {**values, "memory": memory})
+            return
         reads = [
             read_volume(
                 path, values["dataset"], values["voxel_um"], values["slices"], memory, values["crop"],

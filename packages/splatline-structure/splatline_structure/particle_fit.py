@@ -1,0 +1,334 @@
+"""Particles of a reference in the projections of a state: grey level, growth and shift of each by least squares.
+
+    min over g, s, c of  ½ |A m - p|²_W,    m(r) = rest(r) + Σ_k g_k a_k(c_k0 + Rᵀ (r - c_k) / s_k)
+
+a_k is what particle k has above the level around it, in the reference; `rest` is everything else, moved with the whole
+sample. Each round of Gauss-Newton solves the linear problem by conjugate gradients. No volume of the state is
+reconstructed, so that few projections suffice (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275, for displacements).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from recon.base.arrays import F32, F64
+from recon.voxels.projector import Projector
+
+UNKNOWNS = 5  # of a particle: gain, growth of its diameter, shift along y, x and z
+MEASURED = np.vstack((np.eye(UNKNOWNS), (1, 3, 0, 0, 0)))
+"""The unknowns, and the change of the mass: of the gain and of the volume."""
+_PRIOR = 1.0, 0.1, 3.0, 3.0, 3.0  # standard deviations of the unknowns, far wider than what is expected
+_LARGEST = 1.0, 0.05, 1.5, 1.5, 1.5  # largest step of a round
+_HALVES = 25  # iterations with half of the projections
+_CRACK = 8  # iterations for what particles with a crack show beside their shape
+_SOLID = 0.5  # share of its level from which a voxel is inside a particle
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A particle of the reference.
+
+    Attributes:
+        number: its label.
+        spline: coefficients of a cubic spline through what it has above the level around it [y, x, z].
+        first: of the reference's voxels, at voxel 0 of the spline.
+        centre: (y, x, z) in voxels of the reference.
+        level: mean of what it has above the level around it, away from its surface, in the unit of the volume.
+        squares: sum of the squares of what it has above the level around it.
+    """
+
+    number: int
+    spline: F32
+    first: F64
+    centre: F64
+    level: float
+    squares: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the particles of a reference are in a state.
+
+    Attributes:
+        gain: [particle], 1: as in the reference.
+        scale: [particle], factor of the diameter.
+        place: [particle, (y, x, z)] in voxels of the state.
+        turn: rotation that all share, [3, 3].
+        rest: change of the gain of all that is no particle.
+        sharper: multiple of the negative Laplacian of all particles that is added, in voxels².
+    """
+
+    gain: F64
+    scale: F64
+    place: F64
+    turn: F64
+    rest: float = 0.0
+    sharper: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A particle in a state.
+
+    Attributes:
+        box: of the voxels of the state.
+        columns: [5, y, x, z] derivatives with respect to its unknowns. The first is its shape with a gain of 1.
+        laplacian: of its shape, negative.
+    """
+
+    box: tuple[slice, slice, slice]
+    columns: F32
+    laplacian: F32
+
+
+def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape: Sequence[int]) -> Patch | None:
+    """The particle in a state, on the voxels (y, x, z) of a volume of this shape; None: it lies outside."""
+    half = np.array(body.spline.shape) / 2
+    reach = scale * (np.abs(turn) @ half) + 1
+    middle = place + scale * turn @ (body.first + half - 0.5 - body.centre)
+    low = np.maximum(np.floor(middle - reach).astype(int), 0)
+    high = np.minimum(np.ceil(middle + reach).astype(int) + 1, shape)
+    if (high - low < 1).any():
+        return None
+    wide_low, wide = low - 1, high - low + 2  # a voxel more on each side, for the slopes
+    matrix = turn.T / scale
+    offset = body.centre - body.first + matrix @ (wide_low - place)
+    wider = ndimage.affine_transform(
+        body.spline, matrix, offset, tuple(wide), order=3, mode="constant", prefilter=False
+    )
+    shown = wider[1:-1, 1:-1, 1:-1]
+    slopes = np.stack([
+        (np.roll(wider, -1, axis) - np.roll(wider, 1, axis))[1:-1, 1:-1, 1:-1] / 2 for axis in range(3)
+    ])  # fmt: skip
+    laplacian = 6 * shown - sum(np.roll(wider, s, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for s in (-1, 1))
+    at = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
+          for axis, (a, b, c) in enumerate(zip(low, high, place, strict=True))]  # fmt: skip
+    growth = -sum(away * slope for away, slope in zip(at, slopes, strict=True)) / scale
+    columns = np.concatenate((shown[None], gain * growth[None], -gain * slopes)).astype(np.float32)
+    box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    return Patch((box[0], box[1], box[2]), columns, laplacian.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class StateViews:
+    """The projections of a state.
+
+    Attributes:
+        projector: of the volume [y, x, z] of the state; lines are [view, col, row].
+        lines: line integrals.
+        weight: of each ray; 0: it is not used.
+        rest: what is no particle [y, x, z], where it is in this state.
+        smooth: the same without its noise; its gain is an unknown.
+        known: [z] slices that are seen, and known from the reference.
+    """
+
+    projector: Projector
+    lines: F32
+    weight: F32
+    rest: F32
+    smooth: F32
+    known: NDArray[np.bool_]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        z, y, x = self.projector.grid.shape
+        return y, x, z
+
+    def subset(self, views: NDArray[np.integer]) -> StateViews:
+        return replace(self, projector=self.projector.subset(views), lines=self.lines[views], weight=self.weight[views])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The problem about an estimate: unknowns are [particle, 5], then the changes of `rest` and `sharper`.
+
+    Attributes:
+        patches: of the particles; None: outside.
+        left: what the estimate leaves of the projections.
+        blocks: [particle, 5, 5] approximation of the normal matrix of a particle by itself.
+    """
+
+    views: StateViews
+    bodies: Sequence[Body]
+    now: Estimate
+    patches: list[Patch | None]
+    left: F32
+    blocks: F64
+    others: F64
+    prior: F64
+
+    @classmethod
+    def of(cls, views: StateViews, bodies: Sequence[Body], now: Estimate) -> Linear:
+        patches = [
+            patch_of(body, g, s, c, now.turn, views.shape)
+            for body, g, s, c in zip(bodies, now.gain, now.scale, now.place, strict=True)
+        ]
+        volume = views.rest + np.float32(now.rest) * views.smooth
+        for patch, gain in zip(patches, now.gain, strict=True):
+            if patch is not None:
+                volume[patch.box] += np.float32(gain) * (patch.columns[0] + np.float32(now.sharper) * patch.laplacian)
+        left = views.lines - views.projector.forward_lines(volume)
+        mean = float(views.weight[views.weight > 0].mean()) * views.projector.geometry.n_views
+        edge = views.projector.grid.voxel_size
+        blocks = np.stack([
+            np.eye(UNKNOWNS)
+            if patch is None or not views.known[patch.box[2]].any()
+            else mean * edge**2 * gram(patch.columns[..., views.known[patch.box[2]]])
+            for patch in patches
+        ])  # fmt: skip
+        noise = float((views.weight * left**2).sum() / max(views.weight.sum(), 1e-30)) * float(views.weight.mean())
+        prior = noise / np.square(_PRIOR)
+        linear = cls(views, bodies, now, patches, left, blocks, np.ones(2), prior)
+        units = []
+        for k in range(2):
+            rays = views.projector.forward_lines(linear._volume(np.zeros((len(patches), UNKNOWNS)), np.eye(2)[k]))
+            units.append(float((views.weight * rays**2).sum(dtype=np.float64)))
+        return replace(linear, others=np.maximum(units, 1e-30))
+
+    def _volume(self, theta: F64, others: F64) -> F32:
+        volume = np.float32(others[0]) * self.views.smooth
+        for patch, of_one, gain in zip(self.patches, theta.astype(np.float32), self.now.gain, strict=True):
+            if patch is not None:
+                volume[patch.box] += np.tensordot(of_one, patch.columns, 1)
+                if others[1]:
+                    volume[patch.box] += np.float32(gain * others[1]) * patch.laplacian
+        return volume
+
+    def back(self, rays: F32) -> F64:
+        """The inner product of each column of the problem with rays."""
+        volume = self.views.projector.adjoint_lines(rays)
+        theta, sharper = np.zeros((len(self.patches), UNKNOWNS)), 0.0
+        for k, patch in enumerate(self.patches):
+            if patch is not None:
+                part = np.ascontiguousarray(volume[patch.box])
+                theta[k] = patch.columns.reshape(UNKNOWNS, -1) @ part.ravel()
+                sharper += self.now.gain[k] * float(np.vdot(patch.laplacian, part))
+        return np.concatenate((theta.ravel(), [float(np.vdot(self.views.smooth, volume)), sharper]))
+
+    def normal(self, v: F64) -> F64:
+        theta = v[:-2].reshape(-1, UNKNOWNS)
+        rays = self.views.projector.forward_lines(self._volume(theta, v[-2:]))
+        out = self.back(rays * self.views.weight)
+        out[:-2] += (self.prior * theta).ravel()
+        return out
+
+    @property
+    def seen(self) -> F64:
+        """[particle] the share of it in slices that the projections show."""
+        return np.array([
+            0.0 if patch is None else float(np.square(patch.columns[0][..., self.views.known[patch.box[2]]]).sum())
+            / (scale**3 * body.squares)
+            for patch, scale, body in zip(self.patches, self.now.scale, self.bodies, strict=True)
+        ])  # fmt: skip
+
+    def solved(self, rays: F32, iterations: int) -> F64:
+        """Unknowns that explain the rays best."""
+        inverse = np.linalg.inv(self.blocks + self.prior * np.eye(UNKNOWNS))
+
+        def scaled(r: F64) -> F64:
+            theta = np.einsum("kij,kj->ki", inverse, r[:-2].reshape(-1, UNKNOWNS))
+            return np.concatenate((theta.ravel(), r[-2:] / self.others))
+
+        return conjugate(self.normal, self.back(rays * self.views.weight), scaled, iterations)
+
+    def noise_by_halves(self, typical: NDArray[np.bool_]) -> F64:
+        """[particle, 6] standard deviations of what `MEASURED` lists.
+
+        Those of a particle by itself, times a factor for each unknown: by how much more the results from both halves
+        of the projections differ, over all `typical` particles.
+        """
+        angles = self.views.projector.geometry
+        order = np.argsort(np.mod(angles.angles, angles.period), kind="stable")
+        halves = []
+        for k in (0, 1):
+            some = np.sort(order[k::2])
+            half = replace(
+                self, views=self.views.subset(some), left=self.left[some], blocks=self.blocks / 2,
+                others=self.others / 2, prior=self.prior / 2,
+            )  # fmt: skip
+            halves.append(half.solved(half.left, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
+        noise = float((self.views.weight * self.left**2).sum() / max(self.views.weight.sum(), 1e-30))
+        inverse = np.linalg.inv(self.blocks + self.prior * np.eye(UNKNOWNS))
+        alone = np.sqrt(noise * np.einsum("mi,kij,mj->km", MEASURED, inverse, MEASURED))
+        ratio = np.abs(halves[0] - halves[1]) / 2 / alone
+        typical = typical & (self.seen > _SOLID)
+        return alone * np.sqrt(np.square(ratio[typical]).mean(0)) if typical.any() else alone
+
+
+def conjugate(normal: Callable[[F64], F64], right: F64, scaled: Callable[[F64], F64], iterations: int) -> F64:
+    """Preconditioned conjugate gradients (Hestenes & Stiefel 1952) from 0."""
+    x, r = np.zeros_like(right), right.copy()
+    z = scaled(r)
+    p, rz = z.copy(), float(r @ z)
+    for _ in range(iterations):
+        q = normal(p)
+        if not (curved := float(p @ q)) > 0:
+            break
+        a = rz / curved
+        x, r = x + a * p, r - a * q
+        z, before = scaled(r), rz
+        rz = float(r @ z)
+        p = z + rz / before * p
+    return x
+
+
+def gram(columns: F32) -> F64:
+    """[5, 5] inner products of the projections of the columns, a mean over angles, in voxels of edge 1.
+
+    The mean over all angles of the products of projections is a product in Fourier space with the weight 1 / (π |k|).
+    """
+    n = tuple(fft.next_fast_len(2 * size) for size in columns.shape[1:3])
+    spectrum = fft.rfft2(columns, n, (1, 2))
+    ky, kx = fft.fftfreq(n[0])[:, None], fft.rfftfreq(n[1])
+    k = np.hypot(ky, kx)
+    k[0, 0] = 1 / (2 * math.log(1 + math.sqrt(2)) * (n[0] + n[1]))  # the mean of 1/|k| over the cell at 0
+    twice = np.where((kx > 0) & ~((n[1] % 2 == 0) & (kx == 0.5)), 2.0, 1.0)
+    flat = (spectrum * np.sqrt(twice / (np.pi * k * n[0] * n[1]))[None, :, :, None]).reshape(len(columns), -1)
+    return np.real(flat @ flat.conj().T)
+
+
+def improved_rounds(views: StateViews, bodies: Sequence[Body], now: Estimate, iterations: Sequence[int]) -> Estimate:
+    """The estimate after rounds of Gauss-Newton, each with this number of iterations."""
+    for each in iterations:
+        linear = Linear.of(views, bodies, now)
+        step = linear.solved(linear.left, each)
+        theta = np.clip(step[:-2].reshape(-1, UNKNOWNS), -np.array(_LARGEST), _LARGEST)
+        theta[[patch is None for patch in linear.patches]] = 0
+        now = replace(
+            now, gain=np.maximum(now.gain + theta[:, 0], 0), scale=np.clip(now.scale + theta[:, 1], 0.5, 2),
+            place=now.place + theta[:, 2:], rest=now.rest + step[-2], sharper=now.sharper + step[-1],
+        )  # fmt: skip
+    return now
+
+
+def inside_of(views: StateViews, bodies: Sequence[Body], now: Estimate, which: NDArray[np.bool_]) -> F32:
+    """[y, x, z] 1 inside these particles, 0 elsewhere."""
+    mask = np.zeros(views.shape, np.float32)
+    for k in np.flatnonzero(which):
+        patch = patch_of(bodies[k], 1.0, now.scale[k], now.place[k], now.turn, views.shape)
+        if patch is not None:
+            mask[patch.box] = np.maximum(mask[patch.box], patch.columns[0] > _SOLID * bodies[k].level)
+    return mask
+
+
+def unexplained(views: StateViews, bodies: Sequence[Body], now: Estimate, mask: F32) -> F32:
+    """[y, x, z] what particles show beside their shape, in the mask: of cracked ones, the crack.
+
+    The fit of the other particles is then not disturbed by it. It is orthogonal to the unknowns of its own particle.
+    """
+    left, weight = Linear.of(views, bodies, now).left, views.weight
+
+    def back(rays: F32) -> F64:
+        return (mask * views.projector.adjoint_lines(rays * weight)).ravel().astype(np.float64)
+
+    def normal(v: F64) -> F64:
+        return back(views.projector.forward_lines(mask * v.reshape(mask.shape).astype(np.float32)))
+
+    found = conjugate(normal, back(left), lambda r: r, _CRACK)
+    return mask * found.reshape(mask.shape).astype(np.float32)

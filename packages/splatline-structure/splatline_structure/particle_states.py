@@ -1,0 +1,327 @@
+"""Numbers of the particles of a reference in a state, each with an interval: from the projections of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import recon
+from recon import Geometry, Grid
+from recon.base.arrays import F32, F64
+from recon.base.views import spread
+from recon.features.reference.motion import Basis, MotionViews, Moved, affinely_moved, improved, padded, roughly_moved
+from recon.features.reference.particles import Particles
+from recon.voxels.projector import Projector, projection_lines, volume_lines
+from splatline_structure.particle_fit import (
+    Body,
+    Estimate,
+    Linear,
+    StateViews,
+    improved_rounds,
+    inside_of,
+    unexplained,
+)
+from splatline_structure.particles import Numbers
+
+WIDE = 1.2816  # standard deviations of an interval that holds the true number in 80 % of cases
+STEPS = 6  # of a state, for the progress
+Verdict = Literal["as before", "cracked", "closed", "gone", "not seen"]
+
+_HALO = 3  # voxels around a particle's label that belong to it
+_SHELL = 2  # voxels beyond them, in which the level around particles is measured
+_CORE = 2  # least distance from the surface of voxels that give a particle's level
+_LARGEST = 0.25  # share of the volume's voxels from which a label is no particle but a wall, or the whole
+_SMOOTH = 3.0  # voxels of the Gaussian after which `rest` has no noise
+_BLUR = 4.0  # pixels of the Gaussian after which line integrals give weights that do not depend on their own noise
+_SPLINES = (4, 2.0), (6, 1.0)  # intervals, and blur in voxels, of the steps after the affine map
+_MOTION_VIEWS = 40
+_SAME = 0.3, 0.1  # most particles of the same sample have a gain and a diameter this near to the median (relative)
+_MOST, _LEAST_GAIN = 0.65, 0.5  # share of such particles, and median of the gain, of the same sample
+_GONE = 0.3  # gain below which a particle is gone
+_SEEN = 0.5  # share of a particle that must be in rows that are used
+_CLEAR = 3.0  # standard deviations by which a cracked particle has less than the others
+_TYPICAL = 8  # whole particles, from which the spread is taken of these alone
+_LEAST_CRACK = 0.01  # least share of a particle that is missing in a crack
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceParticles:
+    """A reference volume in parts, in voxels: attenuation per voxel, [y, x, z].
+
+    Attributes:
+        volume: of the reference.
+        rest: what is no particle.
+        owner: the body, from 1, of each voxel of particles and near them; 0: none.
+        bodies: of the particles.
+        around: level around the particles.
+        grid: of the reference, in mm.
+        labels: [body] numbers in the labelled volume.
+        voxels: [body] number of voxels.
+    """
+
+    volume: F32
+    rest: F32
+    owner: Numbers
+    bodies: tuple[Body, ...]
+    around: float
+    grid: Grid
+    voxels: NDArray[np.int64]
+
+    @property
+    def cut(self) -> NDArray[np.bool_]:
+        """[body] whether it touches the lowest or the highest slice."""
+        ends = np.unique(self.owner[:, :, [0, -1]])
+        return np.isin(np.arange(1, len(self.bodies) + 1), ends)
+
+
+def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferenceParticles:
+    """The parts of a reference.
+
+    Args:
+        volume, labels: [z, y, x], in 1/mm, and the particle of each voxel.
+
+    Raises:
+        ValueError: no label is a particle.
+    """
+    counts = np.bincount(labels.ravel())
+    kept = np.flatnonzero((counts > 0) & (counts < _LARGEST * labels.size))
+    kept = kept[kept > 0]
+    if not kept.size:
+        raise ValueError("no particle was found in it; give --materials and --particles")
+    number = np.zeros(counts.size, np.int32)
+    number[kept] = np.arange(1, kept.size + 1)
+    own = np.ascontiguousarray(number[labels].transpose(1, 2, 0))
+    v = volume_lines(volume) * np.float32(grid.voxel_size)
+    away, near = ndimage.distance_transform_edt(own == 0, return_indices=True)
+    owner = np.where(away <= _HALO, own[tuple(near)], 0).astype(np.int32)
+    shell = (away > _HALO) & (away <= _HALO + _SHELL)
+    around = float(np.median(v[shell])) if shell.any() else 0.0
+    depth, rest, bodies = ndimage.distance_transform_edt(own > 0), v.copy(), []
+    for k, box in enumerate(ndimage.find_objects(owner), 1):
+        mine = owner[box] == k
+        above = np.where(mine, v[box] - np.float32(around), 0).astype(np.float32)
+        rest[box] -= above
+        solid = own[box] == k
+        core = solid & (depth[box] >= _CORE)
+        level = float(above[core if core.any() else solid].mean())
+        first = np.array([each.start for each in box], float)
+        centre = first + ndimage.center_of_mass(np.where(solid, np.maximum(above, 0) + 1e-12, 0))
+        spline = ndimage.spline_filter(np.pad(above, 2), 3, output=np.float32)
+        bodies.append(Body(int(kept[k - 1]), spline, first - 2, centre, level, float(np.square(above).sum())))
+    return ReferenceParticles(v, rest, owner, tuple(bodies), around, grid, counts[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class StateFit:
+    """What the projections of a state say of the bodies.
+
+    Attributes:
+        estimate: in voxels.
+        noise: [body, 6] standard deviations of gain, scale, shift (y, x, z) and mass, from halves of the projections.
+        seen: [body] share of each that the used rows show.
+        motion: [body, (y, x, z)] shift from the reference, in voxels.
+    """
+
+    estimate: Estimate
+    noise: F64
+    seen: F64
+    motion: F64
+
+    @property
+    def measured(self) -> F64:
+        """[body, 6] changes of gain, scale, shift (y, x, z) and mass."""
+        e = self.estimate
+        return np.column_stack((e.gain - 1, e.scale - 1, self.motion, e.gain * e.scale**3 - 1))
+
+    @property
+    def matches(self) -> bool:
+        """Whether most particles of the reference are in this state."""
+        seen = self.seen >= _SEEN
+        gain, scale = self.estimate.gain[seen], self.estimate.scale[seen]
+        if not gain.size or np.median(gain) < _LEAST_GAIN:
+            return False
+        near = [np.abs(each / np.median(each) - 1) < most for each, most in zip((gain, scale), _SAME, strict=True)]
+        return bool((near[0] & near[1]).mean() > _MOST)
+
+
+@dataclass(frozen=True, eq=False)
+class StateNumbers:
+    """Numbers of the bodies of a reference in a state; NaN if not determined.
+
+    Attributes:
+        grey: [body, 3] value, low and high: attenuation in 1/mm.
+        grey_change: [body, 3] relative change of it since the reference.
+        growth: [body, 3] relative change of the volume.
+        shift: [body, axis z y x, 3] in mm.
+        verdict: of each body.
+    """
+
+    grey: F64
+    grey_change: F64
+    growth: F64
+    shift: F64
+    verdict: tuple[Verdict, ...]
+
+
+def numbers_of(reference: ReferenceParticles, fit: StateFit) -> StateNumbers:
+    """The numbers of a state.
+
+    A particle is cracked if its mass is less than the median by three standard deviations of its own error and of the
+    spread of all particles, and by 1 %: a crack that is narrower than a voxel takes mass away. So is one that seems to
+    grow by three of them more than the median while its mass falls by one: a dark core looks like a lower grey level
+    in a larger volume.
+    """
+    found, deviation = fit.measured, fit.noise
+    seen = (fit.seen >= _SEEN) & fit.matches
+    gone = seen & (found[:, 0] + 1 < _GONE)
+    some = seen & ~gone
+    verdict = np.where(seen, np.where(gone, "gone", "as before"), "not seen").astype("<U9")
+    if some.any():
+        typical = some & ~reference.cut if (some & ~reference.cut).sum() >= _TYPICAL else some
+        (lost, of_mass), (wider, of_scale) = (_away(found[:, j], deviation[:, j], typical) for j in (5, 1))
+        least = np.maximum(_CLEAR * of_mass, _LEAST_CRACK)
+        for name, sign in (("cracked", 1), ("closed", -1)):
+            outlier = (sign * wider > _CLEAR * of_scale) & (sign * lost < -of_mass)
+            verdict[some & ((sign * lost < -least) | outlier)] = name
+    found, edge = np.where(seen[:, None], found, np.nan), reference.grid.voxel_size
+    found[gone, 1:] = np.nan
+    level = np.array([body.level for body in reference.bodies])
+    before = (level + reference.around) / edge
+    around = reference.around * (1 + fit.estimate.rest)
+    grey = _interval((around + level * (1 + found[:, 0])) / edge, level * deviation[:, 0] / edge)
+    scale = _interval(1 + found[:, 1], deviation[:, 1])
+    shift = edge * _interval(found[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
+    return StateNumbers(grey, grey / before[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
+
+
+def _away(value: F64, deviation: F64, some: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """How far values are from the median of `some`, and the standard deviation of that: of its error and the spread."""
+    away = value - np.median(value[some])
+    spread_ = np.square(1.4826 * np.median(np.abs(away[some]))) - np.median(np.square(deviation[some]))
+    return away, np.sqrt(np.square(deviation) + max(float(spread_), 0.0))
+
+
+def _interval(value: F64, deviation: F64) -> F64:
+    """[..., 3] value, low and high."""
+    return np.stack((value, value - WIDE * deviation, value + WIDE * deviation), axis=-1)
+
+
+def fit_state(
+    reference: ReferenceParticles, lines: F32, geometry: Geometry, weights: F32 | None,
+    tell: Callable[[], None] = lambda: None,
+) -> StateFit:  # fmt: skip
+    """Fit the bodies of a reference to the projections of a state.
+
+    Args:
+        lines: [view, row, col] line integrals, finite.
+        geometry: of a parallel beam, with pixels as wide as the voxels of the reference.
+        weights: of each ray; None: 1 everywhere.
+        tell: is called after each of `STEPS` steps.
+    """
+    edge = reference.grid.voxel_size
+    geometry = geometry.scaled(1 / edge)
+    grid = Grid.matching(geometry)
+    projector, p = Projector(geometry, grid), projection_lines(lines)
+    weight = np.exp(-ndimage.gaussian_filter(np.maximum(p, 0), (0, _BLUR, _BLUR)))
+    if weights is not None:
+        weight *= projection_lines(weights)
+    offset = (np.array(grid.first) - np.array(reference.grid.first) / edge)[[1, 2, 0]]
+    u, turn = _moved(reference, projector, p, weight, offset)
+    tell()
+    places = _places_of(reference, u, offset)
+    at = _sampled(u, offset)
+    rest = ndimage.map_coordinates(reference.rest, at, order=1, mode="nearest")
+    known = ((at[2] > -0.5) & (at[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
+    weight[:, :, ~_rows_of(known, geometry, grid)] = 0
+    views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _SMOOTH), known)
+    n = len(reference.bodies)
+    estimate = Estimate(np.ones(n), np.ones(n), places, turn)
+    estimate = improved_rounds(views, reference.bodies, estimate, (10, 20))
+    tell()
+    tell()
+    dark = inside_of(views, reference.bodies, estimate, _less(estimate))
+    if dark.any():
+        views = replace(views, lines=p - projector.forward_lines(unexplained(views, reference.bodies, estimate, dark)))
+    tell()
+    estimate = improved_rounds(views, reference.bodies, estimate, (20,))
+    tell()
+    linear = Linear.of(views, reference.bodies, estimate)
+    noise = linear.noise_by_halves(~_less(estimate))
+    tell()
+    shift = estimate.place - np.array([body.centre for body in reference.bodies]) + offset
+    return StateFit(estimate, noise, linear.seen, shift)
+
+
+def _less(estimate: Estimate) -> NDArray[np.bool_]:
+    """The bodies of which less is there than of most."""
+    mass = estimate.gain * estimate.scale**3
+    middle = float(np.median(mass))
+    spread_ = 1.4826 * float(np.median(np.abs(mass - middle)))
+    return mass < middle - np.maximum(_CLEAR * spread_, _LEAST_CRACK)
+
+
+def _rows_of(known: NDArray[np.bool_], geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
+    """[row] whether the slices that a row sees are known."""
+    heights = (np.arange(geometry.detector_shape[0]) - geometry.axis_row) * geometry.sample_pitch
+    slices = (heights - grid.first[0]) / grid.spacing[0]
+    last = known.size - 1
+    return known[np.floor(slices).astype(int).clip(0, last)] & known[np.ceil(slices).astype(int).clip(0, last)]
+
+
+def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: F32, offset: F64) -> tuple[F32, F64]:
+    """How the whole has moved, roughly: displacement u [3, y, x, z] in voxels, and the rotation in it."""
+    grid, geometry = projector.grid, projector.geometry
+    nz, ny, nx = grid.shape
+    still = np.zeros((3, ny, nx, nz), np.float32)
+    level = float(np.median([body.level for body in reference.bodies]))
+    parts = Particles(
+        reference.rest, reference.volume - reference.rest, np.minimum(reference.owner, 1), reference.around, level
+    )
+    first = np.rint(offset).astype(int).tolist()
+    moved = Moved(parts, (first[0], first[1], first[2]), still, np.ones(2))
+    width = 2 * geometry.reach
+    affine = Basis.affine(grid, width)
+    lines = np.ascontiguousarray(p.transpose(0, 2, 1))
+    fbp = volume_lines(recon.reconstruct(lines, geometry, recon.Fbp(), grid=grid).volume.data)
+    c = roughly_moved(moved, fbp, grid, width)
+    moved = replace(moved, u=padded(affine.field(c)))
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+    some = np.sort(spread(order, _MOTION_VIEWS))
+    views, nothing = MotionViews(projector.subset(some), p[some], weight[some]), np.zeros_like(fbp)
+    moved = affinely_moved(views, moved, affine, nothing)
+    c = affine.nearest(moved.u)
+    # Places in the reference change by the identity plus these slopes from voxel to voxel of the state.
+    slopes = np.eye(3)
+    for axis, at in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+        slopes[: affine.axes, axis] += c[:, *at] * 2 / width
+    left, _, right = np.linalg.svd(slopes)
+    for intervals, blur in _SPLINES:
+        moved = improved(views, moved, Basis.splines(grid, width, intervals), blur, nothing, False)
+    return moved.u + np.float32(np.array(first) - offset).reshape(3, 1, 1, 1), (left @ right).T
+
+
+def _sampled(u: F32, offset: F64) -> F32:
+    """[3, y, x, z] the place in the reference of each voxel of the state."""
+    return np.stack([
+        u[axis] + np.float32(offset[axis])
+        + np.arange(u.shape[axis + 1], dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
+        for axis in range(3)
+    ])  # fmt: skip
+
+
+def _places_of(reference: ReferenceParticles, u: F32, offset: F64) -> F64:
+    """[body, (y, x, z)] the place in the state of each body of the reference."""
+    goal = np.array([body.centre for body in reference.bodies]) - offset
+    place = goal.copy()
+    for _ in range(8):
+        place = goal - _shift_at(u, place)
+    return place
+
+
+def _shift_at(u: F32, place: F64) -> F64:
+    return np.stack([ndimage.map_coordinates(part, place.T, order=1, mode="nearest") for part in u], axis=1)

@@ -1,0 +1,109 @@
+"""Pictures of particles in several states: curves, distributions, and the particles in a slice of the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from beamline.report.figures import WIDTH, draw_slice, finish, grey_window, new_figure, planes, png
+from beamline.report.html import Picture
+from recon.base.arrays import F64
+
+if TYPE_CHECKING:
+    from splatline_structure.particle_states import ReferenceParticles
+    from splatline_structure.states import MeasuredState
+
+_LINES = 60  # most curves of single particles
+_COLOURS = {"cracked": (1, 0.1, 0.1, 0.6), "closed": (0.1, 0.8, 0.1, 0.6), "gone": (0.2, 0.3, 1, 0.6)}
+NAMES = {"grey": "change of the grey level (%)", "volume": "change of the volume (%)"}
+
+
+def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], across: str) -> list[Picture]:
+    """All pictures of a page."""
+    whole, at = ~reference.cut, np.array([state.at for state in states])
+    series = {
+        "grey": 100 * np.stack([state.numbers.grey_change[whole] for state in states], axis=1),
+        "volume": 100 * np.stack([state.numbers.growth[whole] for state in states], axis=1),
+    }
+    verdicts = np.array([state.numbers.verdict for state in states])[:, whole]
+    return [
+        Picture(
+            "Particles against the states",
+            "Thin: single particles, with the interval of one of them. Thick: the median, with a band from 10 % to "
+            "90 % of the particles. Below: how many particles are cracked, closed or gone.",
+            curves(series, verdicts, at, across),
+        ),
+        Picture(
+            "Distribution over the particles", "Share of the particles below a value, for each state.",
+            distributions(series, [state.path.name for state in states]),
+        ),
+        Picture(
+            "The last state", "The middle slice of the reference. Red: cracked; green: a crack closed; blue: gone.",
+            map_of(reference, states[-1]),
+        ),
+    ]  # fmt: skip
+
+
+def curves(series: dict[str, F64], verdicts: Any, at: F64, across: str) -> bytes:
+    """Numbers [particle, state, 3] with the median and the spread, and the number of particles of each verdict."""
+    figure = new_figure((WIDTH, 7.5))
+    *panels, below = np.ravel(figure.subplots(3, 1, sharex=True))
+    for axes, (name, each) in zip(panels, series.items(), strict=True):
+        value = each[..., 0]
+        shown = np.flatnonzero(np.isfinite(value).any(1))
+        some = shown[np.linspace(0, max(shown.size - 1, 0), min(_LINES, shown.size)).astype(int)]
+        axes.plot(at, value[some].T, ".-", color="0.7", linewidth=0.5, markersize=2)
+        if shown.size:
+            one = each[shown[shown.size // 2]]
+            axes.errorbar(at, one[:, 0], np.abs(one[:, 1:].T - one[:, 0]), color="C1", capsize=2, linewidth=1)
+        seen = np.isfinite(value).any(0)
+        if seen.any():
+            low, middle, high = np.nanpercentile(value[:, seen], (10, 50, 90), axis=0)
+            axes.fill_between(at[seen], low, high, alpha=0.3)
+            axes.plot(at[seen], middle, "o-")
+        finish(axes, "", NAMES[name], size=8, grid=True)
+    for name in _COLOURS:
+        below.plot(at, (verdicts == name).sum(1), "o-", label=name)
+    below.yaxis.get_major_locator().set_params(integer=True)
+    finish(below, across, "particles", size=8, grid=True)
+    return png(figure)
+
+
+def distributions(series: dict[str, F64], names: Sequence[str]) -> bytes:
+    """The share of particles below each value."""
+    figure = new_figure((WIDTH, 3.2))
+    for axes, (name, each) in zip(np.ravel(figure.subplots(1, 2, sharey=True)), series.items(), strict=True):
+        for state, label in enumerate(names):
+            value = np.sort(each[:, state, 0])
+            value = value[np.isfinite(value)]
+            axes.plot(value, (np.arange(value.size) + 0.5) / max(value.size, 1), label=label if name == "grey" else "")
+        finish(axes, NAMES[name], "share of the particles", size=8, grid=True)
+    return png(figure)
+
+
+def map_of(reference: ReferenceParticles, state: MeasuredState) -> bytes:
+    """The middle slice of the reference with its particles coloured by growth, and by verdict."""
+    grid, growth = reference.grid, 100 * state.numbers.growth[:, 0]
+    at = grid.shape[0] // 2
+    volume, owner = reference.volume[:, :, at] / grid.voxel_size, reference.owner[:, :, at]
+    inside = (
+        volume
+        > reference.around / grid.voxel_size + 0.5 * np.median([b.level for b in reference.bodies]) / grid.voxel_size
+    )
+    figure = new_figure((WIDTH, WIDTH / 2 * grid.shape[1] / grid.shape[2] + 0.6))
+    left, right = np.ravel(figure.subplots(1, 2, sharex=True, sharey=True))
+    plane = planes(grid, "mm")[0]
+    shown = draw_slice(left, volume, plane, "verdict", grey_window([volume]), size=7)
+    colours = np.zeros((*volume.shape, 4))
+    for name, colour in _COLOURS.items():
+        numbers = 1 + np.flatnonzero(np.array(state.numbers.verdict) == name)
+        colours[np.isin(owner, numbers) & inside] = colour
+    left.imshow(colours, extent=shown.get_extent(), interpolation="nearest")
+    of_owner = np.concatenate(([np.nan], growth))[owner]
+    window = tuple(np.nanpercentile(growth, (2, 98))) if np.isfinite(growth).any() else (0.0, 1.0)
+    drawn = draw_slice(right, np.where(inside, of_owner, np.nan), plane, NAMES["volume"], window, "viridis", 7)
+    figure.colorbar(drawn, ax=right, shrink=0.7)
+    right.label_outer()
+    return png(figure)
