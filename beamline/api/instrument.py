@@ -108,7 +108,7 @@ class Instrument:
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
             stop: request with which another thread can end the scan.
-            on_event: function that gets every event of the run. It is called in a separate thread.
+            on_event: function that gets every event of the run. The calls come from a separate thread.
 
         Raises:
             ConfigError: a value is wrong, exceeds a limit, or would require opening the devices again. Nothing has

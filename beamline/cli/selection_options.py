@@ -257,8 +257,9 @@ _BEFORE = (
         default="all",
         show_default=True,
         metavar="SPEC",
-        help="Projections to use. fixed:N: N evenly spread ones. sector:A-B[:N]: those from A to B degrees (N of "
-        "them). random:N[:SEED]: N random ones. first:N: the first N. every:K: every K-th.",
+        help="Projections to use. fixed:N: N evenly spread projections. sector:A-B[:N]: the projections from A to B "
+        "degrees, or N of them. random:N[:SEED]: N random projections. first:N: the first N projections. every:K: "
+        "every K-th projection.",
     ),
     option(
         "--rows",

@@ -18,7 +18,7 @@ from drivers.base.errors import DeviceError
 
 
 class BeamlineError(Exception):
-    """An error for the operator. Its message says what happened, what was expected, what to do, and what is
+    """An error for the operator. The message says what happened, what was expected, what to do, and what is
     unchanged."""
 
     exit_code = 1
@@ -30,8 +30,8 @@ class ConfigError(BeamlineError):
     """Wrong usage or configuration; nothing was started.
 
     Args:
-        faults: list of single errors. Each has the place of the value (`my.yaml:12`) and a sentence without its full
-            stop. Empty if the message is complete without the list.
+        faults: list of single errors. Each error has the place of the value (`my.yaml:12`) and a sentence without its
+            full stop. Empty if the message is complete without the list.
     """
 
     exit_code = 2

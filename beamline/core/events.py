@@ -35,7 +35,7 @@ def spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **o
 @dataclass_transform(frozen_default=True, field_specifiers=(field, spread))
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened during a run. Each kind of event is a frozen dataclass.
+    """A change during a run. Each kind of event is a frozen dataclass.
 
     A field that has its default value is not written to JSON.
 

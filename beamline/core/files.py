@@ -342,7 +342,7 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
         partial.write_bytes(data)
         bring_to_disk(partial)
         if partial.read_bytes() != data:
-            raise OSError(errno.EIO, "the data that were read back differ from those written")
+            raise OSError(errno.EIO, "the data that were read back differ from the written data")
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequence[str] = ()) -> None:

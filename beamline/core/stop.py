@@ -199,9 +199,8 @@ class StopRequest:
     """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). A request cannot be
     undone.
 
-    Any thread or signal handler can make the request. A signal handler may interrupt another handler, and would then
-    wait for ever for a lock that the other handler holds. Therefore each flag is set by a single assignment, without a
-    lock.
+    Any thread or signal handler can make the request. A signal handler may interrupt another handler. It would then
+    wait for ever for a lock of the other handler. Therefore a single assignment sets each flag, without a lock.
 
     Args:
         now: a clock that gives real time in s.

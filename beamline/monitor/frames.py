@@ -130,7 +130,7 @@ class TimingCheck(Logged):
     unit: ClassVar[str] = "trigger periods"
     meaning: ClassVar[str] = "the frame came early or late (fly scans)"
 
-    warn: float = setting(0.25, "periods by which a frame may come early or late", ge=0)
+    warn: float = setting(0.25, "largest time, in periods, by which a frame may be early or late", ge=0)
 
     start = TimingState
 

@@ -81,7 +81,9 @@ class ReferenceLimits:
     light_gone: float = setting(0.5, "fraction of the intensity of the brightest flats that may be missing", gt=0, lt=1)
     uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
     unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
-    light_in_darks: float = setting(0.2, "level and variance of darks, relative to those of flats", gt=0, lt=1)
+    light_in_darks: float = setting(
+        0.2, "level and variance of darks, relative to level and variance of flats", gt=0, lt=1
+    )
 
 
 DARK, FLAT = FrameKind.DARK, FrameKind.FLAT

@@ -67,7 +67,9 @@ class RunValues:
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
     pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
-    options: tuple[str, ...] = published("Options", "what can be measured after this pass: next, again, wide ...", ())
+    options: tuple[str, ...] = published(
+        "Options", "choices for the measurement after this pass: next, again, wide ...", ()
+    )
     option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
     option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")
     option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
@@ -83,7 +85,7 @@ class RunValues:
         0.0,
         "s",
     )
-    decision: str = published("Decision", "what was chosen last, by whom, and why", "")
+    decision: str = published("Decision", "the last choice, who made it, and the reason", "")
     predicted_gain: float = published("PredictedGain", "improvement predicted for an earlier choice", math.nan, "dB")
     measured_gain: float = published("MeasuredGain", "improvement measured for an earlier choice", math.nan, "dB")
 

@@ -26,7 +26,7 @@ class ScanNeeds:
         n_frames, total_bytes: number of frames and bytes of the files, without projections that are taken again.
             dose_gy: dose in Gy that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated. volume_seconds:
             longest time in s from the last projection until the live volume is finished.
-        operator: what the operator is asked to do.
+        operator: requests to the operator.
     """
 
     parts: Mapping[str, float] = field(default_factory=dict)

@@ -40,8 +40,8 @@ class PlannedScan:
         source: the file of its configuration, or the line of its table (day.csv:3).
         sample: name of the sample; empty if the configuration cannot be read.
         faults: reasons why the scan cannot run; empty: the scan can run. warnings: sentences on unusual values, for
-            example because of a wrong unit. needs: time, frames, bytes, dose, and what the operator has to do; all are
-            0 if they cannot be computed. disk: an existing folder on the disk of the file; None: there is no file.
+            example because of a wrong unit. needs: time, frames, bytes, dose, and requests to the operator; all are 0
+            if they cannot be computed. disk: an existing folder on the disk of the file; None: there is no file.
         config: the configuration; None if it cannot be read.
         worked: the plan with its timeline and limits; None if it cannot be computed.
     """
@@ -71,9 +71,9 @@ class QueuePlan:
     """Several scans, one after the other, planned without devices.
 
     Attributes:
-        scans: the scans in their order. faults: reasons why not all scans can run although each alone could, such as a
-            disk that is too small for all files. needs: needs of all scans that can run, together. free_bytes: free
-            space in bytes on the fullest of the disks; 0 if no scan can run.
+        scans: the scans in their order. faults: reasons why the scans cannot all run, although each scan could run
+            alone; for example a disk that is too small for all files. needs: needs of all scans that can run, together.
+            free_bytes: free space in bytes on the fullest of the disks; 0 if no scan can run.
     """
 
     scans: tuple[PlannedScan, ...]

@@ -14,11 +14,9 @@ class DeviceError(Exception):
 
     Attributes:
         device: name of the device.
-        problem: what happened.
-        request: what was sent to the device.
-        reply: what it answered.
-        expected: the reply that was expected. advice: what to do. state: what was changed or moved, and what was not.
-        wire: the last lines sent and received.
+        problem: the problem. request: the text that was sent to the device. reply: the answer of the device. expected:
+            the reply that was expected. advice: the action to take. state: the changes and moves that were made, and
+            those that were not. wire: the last lines sent and received.
     """
 
     def __init__(

@@ -213,8 +213,8 @@ class Geometry:
         """Whether the sample moves along the rotation axis by half the height of the detector or more, as in a helical
         scan.
 
-        Only the middle half of all displacements is measured, so that single displaced projections do not count. In a
-        helical scan, the middle half spans half of the full displacement.
+        Only the middle half of the sorted displacements counts, so that single displaced projections have no effect. In
+        a helical scan, the middle half spans half of the full displacement.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
@@ -242,8 +242,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        The half angle is the smallest tilt of the axis along the beam. The half angle is 0 if this tilt moves the edge
-        of the field of view by at most half a pixel.
+        This angle is the smallest tilt of the axis along the beam. It is 0 if this tilt moves the edge of the field of
+        view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0

@@ -19,7 +19,7 @@ class Kernel(StrEnum):
 
     R is chosen so that both kernels have the same second moment. Therefore a covariance describes the same width for
     both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for m =
-    3/2. The compact kernel ends by itself, so it need not be cut off. ∫ (1
+    3/2. The compact kernel has a finite radius, so it need not be cut off. ∫ (1
     - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The projection of the compact kernel is steeper at
     the edge and has no tail. This suits samples with sharp edges.
     """

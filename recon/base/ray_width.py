@@ -33,7 +33,7 @@ class RayWidth(Checked):
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:
-        """The same width after binning by factor x factor. The area over which a pixel averages becomes that of the
+        """The same width after binning by factor x factor. The area over which a pixel averages becomes the area of the
         binned pixel."""
         return replace(self, blur=self.blur / factor)
 

@@ -75,9 +75,9 @@ class Grid:
         """A box around the rotation axis that contains everything that any projection sees, for any axis position.
 
         The box includes everything that shifted projections see, and it exists even if the axis is outside the
-        detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Material
-        outside this field of view is in the beam only at angles at which it is far from the source, so few projections
-        see it. The box of a wide cone ends before its source.
+        detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Few
+        projections see material outside this field of view: it is in the beam only at angles at which it is far from
+        the source. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size

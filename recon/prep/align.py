@@ -227,9 +227,8 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
-    Returns:
-        The estimate from all projections. If that is not confident and another estimate (opposite projections, ends,
-        pair) is, the other estimate.
+    Returns: The estimate from all projections. If this estimate is not confident, but another one (opposite
+    projections, ends, pair) is confident, the other estimate.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.

@@ -45,9 +45,9 @@ class CorrectionSettings:
             line integral is -log(floor).
         hot_threshold: limit in robust standard deviations. A pixel is masked if its dark, or its response to the beam,
             differs from its neighbours by more. inf: no pixel is masked.
-        zinger_threshold: limit in standard deviations. A pixel counts as a zinger if it is brighter by this than its
-            surroundings and than the same pixel in the neighbouring projections, see `recon.prep.spots.spots`. inf: no
-            zinger is removed.
+        zinger_threshold: limit in standard deviations. A pixel is a zinger if it exceeds both its surroundings and the
+            same pixel in the neighbouring projections by this limit, see `recon.prep.spots.spots`. inf: no zinger is
+            removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
             Each projection is divided by the level of its air columns. If both sides have air columns, the projection
             is divided by a straight line between the levels of the left and the right side.

@@ -40,7 +40,7 @@ class R2(Fit):
             steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
             learning rates decay over this time. If `warm_up` was not called, the compilation of kernels counts, too.
-            Start and first step are made even if the time is too short.
+            The fit always makes its start and its first step, even if the time is too short.
         gaussians: number of Gaussians at the start, or the Gaussians to start from. None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
@@ -92,8 +92,8 @@ class R2(Fit):
         return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """How well the fit predicts held-out projections. The test includes the voxel refinement if a number of steps
-        ends the fit, but not if a time limit ends it."""
+        """The residuals of the fit in the held-out projections. The test includes the voxel refinement if a number of
+        steps ends the fit, but not if a time limit ends it."""
         other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if other or self.early_stop or trial.prior is None:
             return trial.predicted(self)

@@ -210,7 +210,7 @@ class FitSettings:
         paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
-        truncation: where Gaussians are cut off. A compact kernel ends by itself.
+        truncation: distance at which Gaussians are cut off. A compact kernel has a finite radius, so it is not cut off.
         smallest: smallest standard deviation in pixels. A thinner Gaussian could lie between the points at which pixels
             are sampled.
         views_per_step: number of projections whose gradients are averaged in a step.

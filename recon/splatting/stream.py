@@ -94,7 +94,7 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """Whether the fit has a model. It has none as long as there are too few projections."""
+        """True if the fit has a model. It has no model as long as there are too few projections."""
         return isinstance(self._stage, Growing)
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:

@@ -7,7 +7,7 @@ electrons:
     # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
     # or:    kind cathode or foam (samples.builders.cathode, ...), or volume, from a file (voxels)
     #        {kind: foam, change: {kind: settle, share: 0.2, over_s: 9}}      # while it is scanned (builders.change)
-    beam: {photons_per_s: 1.0e5}        # detected a second and sensor pixel (quantum efficiency included)
+    beam: {photons_per_s: 1.0e5}        # detected per second in each sensor pixel (with quantum efficiency)
     axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels
     effects: [photon_noise, {kind: zingers, rate: 5.0}]
     detector: {shape: [512, 512]}       # for `beamline simulate`; an instrument's configuration brings its own

@@ -110,7 +110,7 @@ class RideSection(Section):
         None, "Approximate time between frames, for the size of the queue; null: 100 frames a second."
     )
     bits: int | None = setting(
-        None, "Bits of a pixel, for the saturation value; null: those of the pixel type.", ge=1, le=16
+        None, "Bits of a pixel, for the saturation value; null: all bits of the pixel type.", ge=1, le=16
     )
     queue_s: float = setting(1.0, "Frames that the server buffers for this program, in seconds.", gt=0, le=60)
     queue_mb: float = setting(512.0, "Largest memory of the IOC for this buffer, in MB.", gt=0, le=65_536)

@@ -49,8 +49,8 @@ class EnergyViews:
     """Projections of one sample at several energies. A projection shows each material with its attenuation at the
     energy of the projection.
 
-    A series in time has the same mathematical form: the moments take the place of the energies, and the volumes that of
-    the materials.
+    A series in time has the same mathematical form: the moments replace the energies, and the volumes replace the
+    materials.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.

@@ -28,10 +28,10 @@ class TimeSeries(Series):
     """Reconstructs volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
-        volumes: number of volumes, 2 or more, from the time of the first projection to that of the last. Each volume
-            needs at least twelve projections.
-        moves: True: the sample also moves. False: only densities change. None: held-out projections decide between the
-            two.
+        volumes: number of volumes, 2 or more, from the time of the first projection to the time of the last. Each
+            volume needs at least twelve projections.
+        moves: True: the sample also moves. False: only densities change. None: held-out projections decide whether it
+            moves.
         sweeps: number of iterations of the fit.
         weight: weight of total variation, `tv_weight` of `fit_series`; None: held-out projections decide.
 

@@ -86,7 +86,7 @@ def fit_materials(
     spectra in one step.) Memory: seven volumes per material, three times the projections.
 
     Args:
-        grid: grid of the volumes; None: that of the geometry.
+        grid: grid of the volumes; None: the grid of the geometry.
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
         sweeps: number of iterations. An iteration has about nine steps, which use all projections equally often.
         go_on: function called with (iteration, residual) after each iteration. During the test reconstructions for the

@@ -31,7 +31,7 @@ def test_what_is_read_back_is_compared(tmp_path: Path, monkeypatch: pytest.Monke
     path = tmp_path / "table.csv"
     write_whole(path, "old")
     monkeypatch.setattr(files, "bring_to_disk", lambda partial: partial.write_bytes(b"nex"))
-    with pytest.raises(DataError, match=r"read back differ from those written.*existing file was not changed"):
+    with pytest.raises(DataError, match=r"read back differ from the written data.*existing file was not changed"):
         write_whole(path, "new", replace=True)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
