@@ -54,7 +54,7 @@ class Prior(NamedTuple):
         return cls(weight, strength, patches, materials and MaterialPrior(*materials))
 
 
-class Ended(NamedTuple):
+class IterationEnd(NamedTuple):
     """How the iterations of a volume ended.
 
     Attributes:
@@ -95,7 +95,7 @@ class Decisions:
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
         self.seed = seed
         self.prior: Prior | None = None
-        self.ended: Ended | None = None
+        self.ended: IterationEnd | None = None
         self.settings: dict[str, Any] = {}
         self.made: dict[str, list[Any]] = {}
         self._followed = followed or {}

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions, Ended
+from recon.base.decisions import Decisions, IterationEnd
 from recon.voxels.devices import CPU, VoxelDevice
 
 MOST_SWEEPS, USUAL_SWEEPS = 60, 30
@@ -56,7 +56,7 @@ class Standstill:
         """Record how the sweeps ended. The change of the sweeps before counts if that of these is not known."""
         before = self._decide.ended
         change = self._change if before is None or self._change < math.inf else before.change
-        self._decide.ended = Ended(self._ended, self._done, change, before and before.on_half_voxels)
+        self._decide.ended = IterationEnd(self._ended, self._done, change, before and before.on_half_voxels)
 
     def _change_of(self, x: Any) -> float:
         """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""

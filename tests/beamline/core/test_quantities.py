@@ -59,7 +59,7 @@ TYPICAL = {  # by the names of the ranges
 NUMBERS = sorted(numbers_of(config.schema()))
 WITHOUT_UNIT = re.compile(
     r"(index|roi|channel|device|axis|output|starter|repeater|trigger_line|trigger_times|usb_product|binning|.*_value"
-    r"|status_open|speed_unit|pause_below|resume_above|scale|exposure_tolerance|places|axis_col|seed|passes|speed"
+    r"|status_open|speed_unit|pause_below|resume_above|scale|exposure_tolerance|places|axis_col|seed|state|passes|speed"
     r"|preview_bin|flush_every|frames_per_view|quality_db|dose|absorbed|aperture|light|transmission)$"
 )  # counts of things, names, shares, dB, and what has the unit of another key
 

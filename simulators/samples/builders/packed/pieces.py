@@ -64,7 +64,7 @@ def check_roles(settings: PieceBuilder) -> None:
             raise ValueError(f"{key}: {unknown('part of this phantom', others[0], roles)}")
 
 
-class Change(Protocol):
+class PieceChange(Protocol):
     """A change of pieces in time."""
 
     def moment(self, seconds: float) -> float:
@@ -175,11 +175,10 @@ class Charge(_InTime):
         )
 
 
-def _changes() -> Mapping[str, type[Change]]:
+def _changes() -> Mapping[str, type[PieceChange]]:
     """Every change by the name that scenes use."""
-    from simulators.samples.builders.packed.cycle import Cycle  # which knows the cathode, and so this module
-
-    return {"settle": Settle, "charge": Charge, "cycle": Cycle}
+    cycle: type[PieceChange] = import_module(f"{__package__}.cycle").Cycle  # its module imports this one
+    return {"settle": Settle, "charge": Charge, "cycle": cycle}
 
 
 def phantom(name: str, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
@@ -207,7 +206,7 @@ def phantom(name: str, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sa
 
     if "change" not in mapping:
         return made_of(first)
-    change: Change = choose(f"{where}.change", _changes(), mapping["change"])
+    change: PieceChange = choose(f"{where}.change", _changes(), mapping["change"])
 
     @lru_cache(2)
     def at(moment: float) -> Sample:
