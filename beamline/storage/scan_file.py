@@ -86,9 +86,9 @@ def opened(path: Path, follow: bool = False) -> ScanFile | None:
 
     Raises:
         DataError: it cannot be read.
-        NotReadyError: it is just being created (`follow`).
+        NotReadyError: it is missing or just being created (`follow`).
     """
-    if not path.is_file() or not hdf5.is_hdf5(path, follow):
+    if path.is_dir() or not (follow or path.is_file()) or not hdf5.is_hdf5(path, follow):
         return None
     file = hdf5.open_hdf5(path, follow)
     with hdf5.closed_on_error(file), hdf5.readable(path):
