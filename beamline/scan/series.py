@@ -274,7 +274,8 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> None:
     """Report how the series can be continued; remove its folder if it contains no scan."""
     if any(path.is_dir() for path in folder.iterdir()):
-        said = f"The series of {of} scans ended at {name[0].lower()}{name[1:]}. `beamline scan --resume {folder}` continues it."
+        at = f"{name[0].lower()}{name[1:]}"
+        said = f"The series of {of} scans ended at {at}. `beamline scan --resume {folder}` continues it."
         _tell(Warned(said), sinks)
         return
     (folder / CONFIG).unlink()
