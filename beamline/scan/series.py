@@ -140,7 +140,9 @@ def run_series(
                 scans.append((_value(one), job))
                 later.append((job, commands(one, None) if config.scan.states else Commands()))
                 continue
-            _tell(StateEntered(_kind(config), f"{_named(one)} ({n} of {len(each)})"), sinks)
+            number = f"{n} of {len(each)}"
+            which = f"State {number}" if config.scan.states else f"Energy {number}: {_value(one):.7g} keV"
+            _tell(StateEntered(_kind(config), which), sinks)
             for warning in job.left_out if job else ():
                 _tell(Warned(warning), sinks)
             try:
@@ -272,7 +274,8 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> None:
     """Report how the series can be continued; remove its folder if it contains no scan."""
     if any(path.is_dir() for path in folder.iterdir()):
-        said = f"The series of {of} scans ended at {name.lower()}. `beamline scan --resume {folder}` continues it."
+        at = f"{name[0].lower()}{name[1:]}"
+        said = f"The series of {of} scans ended at {at}. `beamline scan --resume {folder}` continues it."
         _tell(Warned(said), sinks)
         return
     (folder / CONFIG).unlink()
