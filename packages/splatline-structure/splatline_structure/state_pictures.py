@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamline.report.figures import WIDTH, draw_slice, finish, grey_window, new_figure, planes, png
+from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
 from beamline.report.html import Picture
-from recon.base.arrays import F64
+from splatline_structure.materials import F64
 
 if TYPE_CHECKING:
-    from splatline_structure.particle_states import ReferenceParticles
+    from recon.features.reference.particle_states import ReferenceParticles
     from splatline_structure.states import MeasuredState
 
 _LINES = 60  # most curves of single particles
@@ -95,7 +95,7 @@ def map_of(reference: ReferenceParticles, state: MeasuredState) -> bytes:
     figure = new_figure((WIDTH, WIDTH / 2 * grid.shape[1] / grid.shape[2] + 0.6))
     left, right = np.ravel(figure.subplots(1, 2, sharex=True, sharey=True))
     plane = planes(grid, "mm")[0]
-    shown = draw_slice(left, volume, plane, "verdict", grey_window([volume]), size=7)
+    shown = draw_slice(left, volume, plane, "verdict", (0.0, float(np.percentile(volume, 99.5)) or 1.0), size=7)
     colours = np.zeros((*volume.shape, 4))
     for name, colour in _COLOURS.items():
         numbers = 1 + np.flatnonzero(np.array(state.numbers.verdict) == name)

@@ -22,12 +22,8 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.views import select
 from beamline.report.html import render
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
-from recon.base.arrays import F32
-from splatline_structure import results, state_pictures
-from splatline_structure.materials import label_values, labelled, materials_of
-from splatline_structure.particle_states import (
+from recon.features.reference.particle_states import (
     STEPS,
     ReferenceParticles,
     StateFit,
@@ -36,11 +32,13 @@ from splatline_structure.particle_states import (
     numbers_of,
     reference_particles,
 )
+from splatline_structure import results, state_pictures
+from splatline_structure.materials import F32, label_values, labelled, materials_of
 from splatline_structure.particles import Numbers, cleaned, parted
 from splatline_structure.volumes import box_in
 
-BYTES_A_VOXEL, BYTES_A_RAY = 260, 60
-"""Peak memory, as measured: 232 bytes a voxel and 52 a ray, see docs/structure.md."""
+BYTES_A_VOXEL, BYTES_A_RAY = 230, 30
+"""Peak memory; measured: 185 bytes a voxel and 21 a ray, with 0.2 GB for the program."""
 _PITCH = 0.01  # largest relative difference between a pixel of a state and a voxel of the reference
 _VERDICTS = "as before", "cracked", "closed", "gone", "not seen"
 _HEAD = (
@@ -79,7 +77,7 @@ class Series:
     """
 
     path: Path
-    record: ReconRecord
+    record: Any
     reference: ReferenceParticles
     labels: Numbers
     states: list[MeasuredState]
@@ -128,7 +126,7 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
     _write(series, output, values, answer)
 
 
-def _volume(path: Path, values: dict[str, Any]) -> tuple[ReconRecord, F32]:
+def _volume(path: Path, values: dict[str, Any]) -> tuple[Any, F32]:
     """The reference, with lengths in mm, and its voxels."""
     with opened_volume(path, values["dataset"]) as record:
         if record.length_unit != "mm":
@@ -153,9 +151,7 @@ def _volume(path: Path, values: dict[str, Any]) -> tuple[ReconRecord, F32]:
         return record, data
 
 
-def _particles(
-    path: Path, data: F32, record: ReconRecord, values: dict[str, Any]
-) -> tuple[ReferenceParticles, Numbers]:
+def _particles(path: Path, data: F32, record: Any, values: dict[str, Any]) -> tuple[ReferenceParticles, Numbers]:
     """The parts of the reference, and the labels of its particles [z, y, x]."""
     n_materials = values["materials"] or 2
     particles = values["particles"] or n_materials
@@ -178,7 +174,7 @@ def _particles(
         raise DataError(f"{path} cannot be the reference: {error}. Nothing was written.") from error
 
 
-def _first_time(path: Path, record: ReconRecord, values: dict[str, Any]) -> float:
+def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
     """Time of the first projection in s; NaN if the file has no times. Raises DataError if the scan cannot be used."""
     with open_scan(path) as source:
         if source.cone is not None:
@@ -215,7 +211,7 @@ def _abscissa(charge: list[float] | None, begun: list[float]) -> tuple[str, list
 
 def _fitted(
     path: Path,
-    record: ReconRecord,
+    record: Any,
     reference: ReferenceParticles,
     warn: Callable[[str], None],
     tell: Callable[[], None],

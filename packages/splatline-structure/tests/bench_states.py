@@ -21,14 +21,14 @@ from state_scenes import PITCH, States
 
 from recon import Grid
 from recon.base.arrays import F32
-from splatline_structure.materials import materials_of
-from splatline_structure.particle_states import (
+from recon.features.reference.particle_states import (
     ReferenceParticles,
     StateNumbers,
     fit_state,
     numbers_of,
     reference_particles,
 )
+from splatline_structure.materials import materials_of
 from splatline_structure.particles import NECK, cleaned, parted
 from splatline_structure.volumes import box_in
 

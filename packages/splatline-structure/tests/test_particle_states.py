@@ -11,7 +11,7 @@ from state_scenes import PITCH, States
 
 import recon
 from recon import Grid
-from splatline_structure.particle_states import ReferenceParticles, fit_state, numbers_of, reference_particles
+from recon.features.reference.particle_states import ReferenceParticles, fit_state, numbers_of, reference_particles
 
 SCENE = States(31, columns=96, rows=32, others=("phantom.size_um=8", "phantom.fill=0.35"))
 OTHER = States(32, columns=96, rows=32, others=SCENE.others)

@@ -16,9 +16,9 @@ from test_particle_states import SCENE, VIEWS, seen, truth
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
+from recon.features.reference.particle_fit import Estimate
+from recon.features.reference.particle_states import STEPS, StateFit
 from splatline_structure import state_pictures, states
-from splatline_structure.particle_fit import Estimate
-from splatline_structure.particle_states import STEPS, StateFit
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.test_cone_files import INFO, _write
 
@@ -151,7 +151,7 @@ def test_after_ctrl_c_nothing_is_left(here: Path, monkeypatch: pytest.MonkeyPatc
         (("good.h5", *STATES, "--particles", "3"), "There is no material 3"),
         (("good.h5", *STATES, "--particles", "1"), "--particles 1 is the least dense material"),
         (("good.h5", *STATES, "--memory", "1M"), "good.h5: not enough memory. 32 x 96 x 96 voxels need"),
-        (("good.h5", *STATES, "--memory", "80M"), "state_a.h5: not enough memory"),
+        (("good.h5", *STATES, "--memory", "70M"), "state_a.h5: not enough memory"),
         (("good.h5", "none.h5"), "none.h5"),
         (("good.h5", "good.h5"), "good.h5"),
         (("volume.npy", *STATES), "does not state the voxel size"),

@@ -310,7 +310,7 @@ def improved_rounds(views: StateViews, bodies: Sequence[Body], now: Estimate, it
 def inside_of(views: StateViews, bodies: Sequence[Body], now: Estimate, which: NDArray[np.bool_]) -> F32:
     """[y, x, z] 1 inside these particles, 0 elsewhere."""
     mask = np.zeros(views.shape, np.float32)
-    for k in np.flatnonzero(which):
+    for k in np.flatnonzero(which).tolist():
         patch = patch_of(bodies[k], 1.0, now.scale[k], now.place[k], now.turn, views.shape)
         if patch is not None:
             mask[patch.box] = np.maximum(mask[patch.box], patch.columns[0] > _SOLID * bodies[k].level)

@@ -10,8 +10,7 @@ from scipy import ndimage
 
 import recon
 from recon import Grid
-from recon.voxels.projector import Projector
-from splatline_structure.particle_fit import (
+from recon.features.reference.particle_fit import (
     UNKNOWNS,
     Body,
     Estimate,
@@ -21,6 +20,7 @@ from splatline_structure.particle_fit import (
     improved_rounds,
     patch_of,
 )
+from recon.voxels.projector import Projector
 
 N, NZ, VIEWS = 48, 20, 30
 GEOMETRY = recon.Geometry.parallel(np.arange(VIEWS) * np.pi / VIEWS, (NZ, N))

@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-import recon
-from recon import Geometry, Grid
 from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
 from recon.base.views import spread
+from recon.base.volume import Grid
 from recon.features.reference.motion import Basis, MotionViews, Moved, affinely_moved, improved, padded, roughly_moved
-from recon.features.reference.particles import Particles
-from recon.voxels.projector import Projector, projection_lines, volume_lines
-from splatline_structure.particle_fit import (
+from recon.features.reference.particle_fit import (
     Body,
     Estimate,
     Linear,
@@ -26,10 +24,14 @@ from splatline_structure.particle_fit import (
     inside_of,
     unexplained,
 )
-from splatline_structure.particles import Numbers
+from recon.features.reference.particles import Particles
+from recon.reconstruction import reconstruct
+from recon.voxels.direct import Fbp
+from recon.voxels.projector import Projector, projection_lines, volume_lines
 
 WIDE = 1.2816  # standard deviations of an interval that holds the true number in 80 % of cases
 STEPS = 6  # of a state, for the progress
+Numbers = NDArray[np.int32]
 Verdict = Literal["as before", "cracked", "closed", "gone", "not seen"]
 
 _HALO = 3  # voxels around a particle's label that belong to it
@@ -287,7 +289,7 @@ def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: 
     width = 2 * geometry.reach
     affine = Basis.affine(grid, width)
     lines = np.ascontiguousarray(p.transpose(0, 2, 1))
-    fbp = volume_lines(recon.reconstruct(lines, geometry, recon.Fbp(), grid=grid).volume.data)
+    fbp = volume_lines(reconstruct(lines, geometry, Fbp(), grid=grid).volume.data)
     c = roughly_moved(moved, fbp, grid, width)
     moved = replace(moved, u=padded(affine.field(c)))
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
