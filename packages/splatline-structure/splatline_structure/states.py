@@ -254,7 +254,11 @@ def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer)
         "in it.",
     ]
     cut = reference.cut
-    rows = [{"label": state.path.name, "cells": _cells(state, cut), "marked": False} for state in states]
+    cells = [_cells(state, cut) for state in states]
+    rows = [
+        {"label": state.path.name, "cells": values, "marked": False}
+        for state, values in zip(states, cells, strict=True)
+    ]
     page = render(
         "trials.html", title=f"Particles of {path.name} in {count(len(states), 'state')}", summary="",
         sentences=sentences, pictures=state_pictures.pictures_of(reference, states, series.across), bold=False,
@@ -269,8 +273,8 @@ def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer)
     with atomic_file(output) as partial:
         results.write_all(partial, texts, {f"particles.{values['labels']}": series.labels}, record, record.grid)
     lines = [
-        f"{state.path.name}: " + ", ".join(f"{name} {cell}" for name, cell in zip(columns, cells["cells"], strict=True))
-        for state, cells in zip(states, rows, strict=True)
+        f"{state.path.name}: " + ", ".join(f"{name} {value}" for name, value in zip(columns, values, strict=True))
+        for state, values in zip(states, cells, strict=True)
     ]
     answer.done({"output": output, "across": series.across, "states": summary}, *lines, f"output  {output}")
 
@@ -282,7 +286,7 @@ def _whole(state: MeasuredState, cut: np.ndarray) -> np.ndarray:
 
 def _summary(state: MeasuredState) -> dict[str, Any]:
     """The state for programs."""
-    verdicts = list(state.numbers.verdict)
+    verdicts: list[str] = list(state.numbers.verdict)
     return {
         "scan": state.path, "at": state.at, "projections": state.n_views, "matches": state.matches,
         **{name.replace(" ", "_"): verdicts.count(name) for name in _VERDICTS},
