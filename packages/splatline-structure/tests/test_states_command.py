@@ -12,12 +12,12 @@ import h5py
 import numpy as np
 import pytest
 from state_scenes import PITCH
-from test_particle_states import SCENE, VIEWS, seen, truth
+from test_particle_states import SCENE, VIEWS, reference, seen, truth
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from recon.features.reference.particle_fit import Estimate
-from recon.features.reference.particle_states import STEPS, StateFit
+from recon.features.reference.particle_states import STEPS, StateFit, fit_state, numbers_of
 from splatline_structure import state_pictures, states
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.test_cone_files import INFO, _write
@@ -182,12 +182,18 @@ def test_charge_needs_states(here: Path) -> None:
 
 
 @pytest.mark.slow
-def test_files_of_a_reference_and_a_state_give_the_numbers_of_the_scene(here: Path) -> None:
-    geometry = SCENE.geometry(VIEWS)
-    written(here / "charged.h5", SCENE.lines(6, VIEWS), geometry.angles)
+def test_files_of_a_reference_and_a_state_give_the_numbers_of_the_library(here: Path) -> None:
+    """Up to a third of the noise, because the command estimates the rotation axis from the projections.
+
+    How accurate the numbers are is tested with the library, see test_particle_states.py.
+    """
+    geometry, lines = SCENE.geometry(VIEWS), SCENE.lines(6, VIEWS)
+    written(here / "charged.h5", lines, geometry.angles)
     result = beamline("structure", "--states", "good.h5", "charged.h5", "-o", "out")
     assert result.exit_code == 0, result.output
-    whole = [row for row in rows(here / "out/particles.csv") if row["cut"] == "0" and row["verdict"] == "as before"]
-    growth, grey = (np.median([float(row[name]) for row in whole])
-                    for name in ("volume_change_percent", "grey_change_percent"))  # fmt: skip
-    assert growth == pytest.approx(4, abs=0.8) and grey == pytest.approx(-3.8, abs=0.8)
+    whole = [row for row in rows(here / "out/particles.csv") if row["cut"] == "0"]
+    numbers = numbers_of(reference(), fit_state(reference(), lines, geometry, None))
+    own = np.flatnonzero(~reference().cut)
+    assert len(own) > 8 and [row["verdict"] for row in whole] == [numbers.verdict[k] for k in own]
+    for column, of_library in (("volume_change_percent", numbers.growth), ("grey_change_percent", numbers.grey_change)):
+        np.testing.assert_allclose([float(row[column]) for row in whole], 100 * of_library[own, 0], atol=1.0)
