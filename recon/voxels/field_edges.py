@@ -70,7 +70,7 @@ def edges_of(views: Views) -> FieldEdges:
     quarter of the scan counts, because a beam drifts away from its flats, but a sample is there from the first
     projection to the last. In a 360° scan with the axis off the middle, the edge near the axis is truncated on purpose,
     because the other half of the scan sees the missing part. So this edge is ignored. Values that are not finite, or
-    have weight 0, do not count; the field ends at the last column with a value that counts.
+    have weight 0, do not count. An edge without any other value counts as air, because the box of voxels contains it.
     """
     own = np.flatnonzero(views.geometry.is_centred)
     geometry, cols = views.geometry.select(own), views.data.shape[2]
@@ -81,9 +81,9 @@ def edges_of(views: Views) -> FieldEdges:
     part = np.ix_(own[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
     some = views.data[part]
     known = np.isfinite(some) & (views.weights is None or views.weights[part] > 0)
-    if not (measured := np.flatnonzero(known.any(axis=(0, 1)))).size:
+    if not known.any():
         return FieldEdges({}, 0.0)
-    some = np.where(known, some, np.nan)[..., measured[0] : measured[-1] + 1]
+    some = np.where(known, some, np.nan)
     mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
     some = some[:, mass >= _FULL * mass.max()]
     edges = {"left": some[..., :width], "right": some[..., -width:]}
