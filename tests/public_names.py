@@ -78,7 +78,7 @@ FOR_PACKAGES = {
     "recon.base.setting": ("Count", "NonNegative", "Positive", "Setting", "setting"),
     "recon.base.view_data": ("Views",),
     "recon.features.reference.particle_states": (
-        "STEPS", "ReferenceParticles", "StateFit", "StateNumbers", "fit_state", "numbers_of", "reference_particles",
+        "STEPS", "ReferenceParticles", "ParticleFit", "StateNumbers", "fit_state", "numbers_of", "reference_particles",
     ),
     "recon.splatting.initialise": ("first_volume",),
     "recon.voxels.voxel_problem": ("density_unit",),

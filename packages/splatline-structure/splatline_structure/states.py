@@ -25,8 +25,8 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
 from recon.features.reference.particle_states import (
     STEPS,
+    ParticleFit,
     ReferenceParticles,
-    StateFit,
     StateNumbers,
     fit_state,
     numbers_of,
@@ -215,7 +215,7 @@ def _fitted(
     reference: ReferenceParticles,
     warn: Callable[[str], None],
     tell: Callable[[], None],
-) -> tuple[StateFit, int]:
+) -> tuple[ParticleFit, int]:
     """The fit of a scan, and the number of its projections."""
     facts = record.parameters
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))

@@ -16,8 +16,8 @@ from test_particle_states import SCENE, VIEWS, reference, seen, truth
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
-from recon.features.reference.particle_fit import Estimate
-from recon.features.reference.particle_states import STEPS, StateFit, fit_state, numbers_of
+from recon.features.reference.particle_fit import ParticleEstimate
+from recon.features.reference.particle_states import STEPS, ParticleFit, fit_state, numbers_of
 from splatline_structure import state_pictures, states
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.test_cone_files import INFO, _write
@@ -48,10 +48,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def fitted(gain: float = 0.96, scale: float = 1.01) -> Callable[..., StateFit]:
+def fitted(gain: float = 0.96, scale: float = 1.01) -> Callable[..., ParticleFit]:
     """A fit that takes no time: all particles alike, but the first is gone and the second has lost mass."""
 
-    def fit(reference: Any, lines: Any, geometry: Any, weights: Any, tell: Callable[[], None]) -> StateFit:
+    def fit(reference: Any, lines: Any, geometry: Any, weights: Any, tell: Callable[[], None]) -> ParticleFit:
         n = len(reference.bodies)
         gains = np.full(n, gain)
         gains[:2] = 0.01, 0.8 * gain
@@ -59,7 +59,9 @@ def fitted(gain: float = 0.96, scale: float = 1.01) -> Callable[..., StateFit]:
         for _ in range(STEPS):
             tell()
         noise = np.full((n, 6), 0.005)
-        return StateFit(Estimate(gains, np.full(n, scale), centres, np.eye(3)), noise, np.ones(n), np.full((n, 3), 0.5))
+        return ParticleFit(
+            ParticleEstimate(gains, np.full(n, scale), centres, np.eye(3)), noise, np.ones(n), np.full((n, 3), 0.5)
+        )
 
     return fit
 
@@ -129,7 +131,7 @@ def test_a_state_of_another_sample_is_told_and_alone_it_is_refused(here: Path, m
 
 
 def test_after_ctrl_c_nothing_is_left(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(*given: Any) -> StateFit:
+    def stopped(*given: Any) -> ParticleFit:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(states, "fit_state", stopped)

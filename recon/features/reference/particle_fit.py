@@ -52,7 +52,7 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ParticleEstimate:
     """Where the particles of a reference are in a state.
 
     Attributes:
@@ -156,7 +156,7 @@ class Linear:
 
     views: StateViews
     bodies: Sequence[Body]
-    now: Estimate
+    now: ParticleEstimate
     patches: list[Patch | None]
     left: F32
     blocks: F64
@@ -164,7 +164,7 @@ class Linear:
     prior: F64
 
     @classmethod
-    def of(cls, views: StateViews, bodies: Sequence[Body], now: Estimate) -> Linear:
+    def of(cls, views: StateViews, bodies: Sequence[Body], now: ParticleEstimate) -> Linear:
         patches = [
             patch_of(body, g, s, c, now.turn, views.shape)
             for body, g, s, c in zip(bodies, now.gain, now.scale, now.place, strict=True)
@@ -293,7 +293,9 @@ def gram(columns: F32) -> F64:
     return np.real(flat @ flat.conj().T)
 
 
-def improved_rounds(views: StateViews, bodies: Sequence[Body], now: Estimate, iterations: Sequence[int]) -> Estimate:
+def improved_rounds(
+    views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, iterations: Sequence[int]
+) -> ParticleEstimate:
     """The estimate after rounds of Gauss-Newton, each with this number of iterations."""
     for each in iterations:
         linear = Linear.of(views, bodies, now)
@@ -307,7 +309,7 @@ def improved_rounds(views: StateViews, bodies: Sequence[Body], now: Estimate, it
     return now
 
 
-def inside_of(views: StateViews, bodies: Sequence[Body], now: Estimate, which: NDArray[np.bool_]) -> F32:
+def inside_of(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, which: NDArray[np.bool_]) -> F32:
     """[y, x, z] 1 inside these particles, 0 elsewhere."""
     mask = np.zeros(views.shape, np.float32)
     for k in np.flatnonzero(which).tolist():
@@ -317,7 +319,7 @@ def inside_of(views: StateViews, bodies: Sequence[Body], now: Estimate, which: N
     return mask
 
 
-def unexplained(views: StateViews, bodies: Sequence[Body], now: Estimate, mask: F32) -> F32:
+def unexplained(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, mask: F32) -> F32:
     """[y, x, z] what particles show beside their shape, in the mask: of cracked ones, the crack.
 
     The fit of the other particles is then not disturbed by it. It is orthogonal to the unknowns of its own particle.

@@ -17,8 +17,8 @@ from recon.base.volume import Grid
 from recon.features.reference.motion import Basis, MotionViews, Moved, affinely_moved, improved, padded, roughly_moved
 from recon.features.reference.particle_fit import (
     Body,
-    Estimate,
     Linear,
+    ParticleEstimate,
     StateViews,
     improved_rounds,
     inside_of,
@@ -119,7 +119,7 @@ def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferencePa
 
 
 @dataclass(frozen=True, eq=False)
-class StateFit:
+class ParticleFit:
     """What the projections of a state say of the bodies.
 
     Attributes:
@@ -129,7 +129,7 @@ class StateFit:
         motion: [body, (y, x, z)] shift from the reference, in voxels.
     """
 
-    estimate: Estimate
+    estimate: ParticleEstimate
     noise: F64
     seen: F64
     motion: F64
@@ -170,7 +170,7 @@ class StateNumbers:
     verdict: tuple[Verdict, ...]
 
 
-def numbers_of(reference: ReferenceParticles, fit: StateFit) -> StateNumbers:
+def numbers_of(reference: ReferenceParticles, fit: ParticleFit) -> StateNumbers:
     """The numbers of a state.
 
     A particle is cracked if its mass is less than the median by three standard deviations of its own error and of the
@@ -216,7 +216,7 @@ def _interval(value: F64, deviation: F64) -> F64:
 def fit_state(
     reference: ReferenceParticles, lines: F32, geometry: Geometry, weights: F32 | None,
     tell: Callable[[], None] = lambda: None,
-) -> StateFit:  # fmt: skip
+) -> ParticleFit:  # fmt: skip
     """Fit the bodies of a reference to the projections of a state.
 
     Args:
@@ -242,7 +242,7 @@ def fit_state(
     weight[:, :, ~_rows_of(known, geometry, grid)] = 0
     views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _SMOOTH), known)
     n = len(reference.bodies)
-    estimate = Estimate(np.ones(n), np.ones(n), places, turn)
+    estimate = ParticleEstimate(np.ones(n), np.ones(n), places, turn)
     estimate = improved_rounds(views, reference.bodies, estimate, (10, 20))
     tell()
     tell()
@@ -256,10 +256,10 @@ def fit_state(
     noise = linear.noise_by_halves(~_less(estimate))
     tell()
     shift = estimate.place - np.array([body.centre for body in reference.bodies]) + offset
-    return StateFit(estimate, noise, linear.seen, shift)
+    return ParticleFit(estimate, noise, linear.seen, shift)
 
 
-def _less(estimate: Estimate) -> NDArray[np.bool_]:
+def _less(estimate: ParticleEstimate) -> NDArray[np.bool_]:
     """The bodies of which less is there than of most."""
     mass = estimate.gain * estimate.scale**3
     middle = float(np.median(mass))

@@ -133,11 +133,13 @@ class StageWobble(PoseEffect):
 class Runout(PoseEffect):
     """Radial and axial error motion (ISO 230-7:2015), synchronous (harmonics) and asynchronous (drawn for each frame).
 
-    Attributes: radial: motion of the axis across the beam and along the beam: waves per turn, micrometres, phase in
-    degrees. 1 wave is equivalent to a sample next to the axis, 0 waves to an axis at another place. Other numbers come
-    from the bearing. A negative number turns against the sample. axial: the same for the vertical motion.
-    radial_random_um: standard deviation of the random part across the beam, and along the beam. axial_random_um:
-    standard deviation of the random vertical part.
+    Attributes:
+        radial: motion of the axis across the beam and along the beam: waves per turn, micrometres, phase in degrees.
+            1 wave is equivalent to a sample next to the axis, 0 waves to an axis at another place. Other numbers come
+            from the bearing. A negative number turns against the sample.
+        axial: the same for the vertical motion.
+        radial_random_um: standard deviation of the random part across the beam, and along the beam.
+        axial_random_um: standard deviation of the random vertical part.
     """
 
     radial: Waves = ()

@@ -13,8 +13,8 @@ from recon import Grid
 from recon.features.reference.particle_fit import (
     UNKNOWNS,
     Body,
-    Estimate,
     Linear,
+    ParticleEstimate,
     StateViews,
     gram,
     improved_rounds,
@@ -42,10 +42,10 @@ def body(number: int, radius: float) -> Body:
 
 OFF = (0.8, -0.6, 0.5), (-1.0, 0.4, -0.4), (0.3, 0.9, 0.6)
 BODIES = [body(1, 4.0), body(2, 5.0), body(3, 4.5)]
-TRUTH = Estimate(np.array([0.9, 1.0, 1.05]), np.array([1.03, 0.98, 1.0]), PLACES, np.eye(3))
+TRUTH = ParticleEstimate(np.array([0.9, 1.0, 1.05]), np.array([1.03, 0.98, 1.0]), PLACES, np.eye(3))
 
 
-def volume_of(estimate: Estimate) -> np.ndarray:
+def volume_of(estimate: ParticleEstimate) -> np.ndarray:
     volume = np.zeros((N, N, NZ), np.float32)
     for k, each in enumerate(BODIES):
         patch = patch_of(each, 1.0, estimate.scale[k], estimate.place[k], estimate.turn, volume.shape)
@@ -120,7 +120,7 @@ def test_the_normal_matrix_of_a_particle_by_itself_is_near_the_true_one() -> Non
 
 def test_rounds_find_gain_scale_and_place() -> None:
     lines = PROJECTOR.forward_lines(volume_of(TRUTH))
-    start = Estimate(np.ones(3), np.ones(3), PLACES + np.array(OFF), np.eye(3))
+    start = ParticleEstimate(np.ones(3), np.ones(3), PLACES + np.array(OFF), np.eye(3))
     found = improved_rounds(views_of(lines), BODIES, start, (20, 20, 20, 20))
     np.testing.assert_allclose(found.gain, TRUTH.gain, atol=5e-3)
     np.testing.assert_allclose(found.scale, TRUTH.scale, atol=2e-3)
