@@ -67,9 +67,8 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
 def level_of(beyond: F32) -> F32:
     """The mean of `beyond_voxels` in each projection, [view, 1, 1]. A test fit uses only this mean, see `trial_fit`.
 
-    Gaussians far outside the box can represent an air level that is not zero; voxels cannot. An example is a walnut in
-    a cone beam whose air level is wrong by 2 % of the largest line integral. Without this mean, the walnut loses 5.7
-    dB. Whatever else these Gaussians represent is not part of the volume.
+    Gaussians far outside the box can represent an air level that is not zero. Whatever else they represent is not part
+    of the volume.
     """
     return beyond.mean(axis=(1, 2), keepdims=True)
 

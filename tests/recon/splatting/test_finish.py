@@ -23,6 +23,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
+from recon.voxels.beyond_field import reach_of
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
@@ -204,3 +205,17 @@ def test_a_longer_fit_changes_less(voxels: int, seconds: float | None) -> None:
     made = reconstruct(data, cone, method, grid=grid).settings
     assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 2)
     assert made["finish"] == 8
+
+
+def test_only_a_box_that_cuts_the_sample_leaves_a_part_of_it_to_the_gaussians() -> None:
+    views = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (4, 32))
+    whole = Grid.matching(views)
+    z, y, x = np.meshgrid(*whole.coordinates(), indexing="ij")
+    data = Projector(views, whole).forward((0.02 * (np.hypot(x, y) < 10)).astype(np.float32))
+    reach = reach_of(Views(data, views))
+    assert not reach.is_cut_by(whole, views)
+    assert not reach.is_cut_by(replace(whole, shape=(4, 30, 30)), views)  # a voxel on each side
+    assert reach.is_cut_by(replace(whole, shape=(4, 16, 16)), views)
+    assert reach.is_cut_by(replace(whole, shape=(4, 32, 32), centre=(0.0, 0.0, 5.0)), views)
+    wide = Projector(views, whole.widened(2, views)).forward(np.full((4, 64, 64), 0.02, np.float32))
+    assert reach_of(Views(wide, views)).is_cut_by(whole, views)  # how far it goes beyond the field is not known
