@@ -120,7 +120,7 @@ class Reach:
         return box.as_tall_as_rays(geometry) if self.tall else box
 
     def is_cut_by(self, grid: Grid, geometry: Geometry) -> bool:
-        """True if the box of `grid` leaves out more than a voxel of the field of view, or of a sample that goes beyond it."""
+        """True if the box of `grid` cuts more than a voxel off the field of view, or off a sample that is wider."""
         if not self.measured and self.edges.beyond(0.0):
             return True
         whole = self.box(Grid.matching(geometry), geometry)

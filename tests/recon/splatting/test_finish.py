@@ -210,7 +210,7 @@ def test_a_longer_fit_changes_less(voxels: int, seconds: float | None) -> None:
 def test_only_a_box_that_cuts_the_sample_leaves_a_part_of_it_to_the_gaussians() -> None:
     views = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (4, 32))
     whole = Grid.matching(views)
-    z, y, x = np.meshgrid(*whole.coordinates(), indexing="ij")
+    _, y, x = np.meshgrid(*whole.coordinates(), indexing="ij")
     data = Projector(views, whole).forward((0.02 * (np.hypot(x, y) < 10)).astype(np.float32))
     reach = reach_of(Views(data, views))
     assert not reach.is_cut_by(whole, views)
