@@ -61,7 +61,7 @@ def test_halves_of_some_slices_are_those_of_their_rows(here: Path, monkeypatch: 
     monkeypatch.setattr(volumes, "_BESIDE", 2)
     shapes, reconstruct = [], recon.reconstruct
     monkeypatch.setattr(
-        volumes.recon, "reconstruct", lambda data, *of, **by: shapes.append(data.shape) or reconstruct(data, *of, **by)
+        volumes.recon, "reconstruct", lambda views, **by: shapes.append(views.data.shape) or reconstruct(views, **by)
     )
     whole, middle = (read_volume(Path("v.h5"), None, None, part, 10**9, "square") for part in (None, (3, 12)))
     scan = Path("scan.h5")
