@@ -179,14 +179,17 @@ class Trial:
             iteration of OS-SIRT.
         unseen: the held-out projections.
         all_columns: the same rows with all columns.
+        above: number of rows from the middle of all rows to the middle of the trial's; 0 for a cone, whose rows keep
+            their heights.
         smooth: the volume of total variation that predicts the held-out projections best so far.
         settings: settings of the run to which the trial belongs.
     """
 
     def __init__(
         self, scan: VoxelProblem, slab: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns,
-        settings: TrialSettings,
+        settings: TrialSettings, above: float = 0.0,
     ) -> None:  # fmt: skip
+        self.above = above
         self._going = scan.go_on.trials
         self.scan, self.problem, self.start = scan, replace(slab, go_on=self._going), start
         self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
@@ -254,7 +257,9 @@ class Trial:
         others, judges = split_views(views)
         all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
         part = replace(seen, with_all_columns=all_columns.seen if matter else None)
-        return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings)
+        whole = problem.projector.geometry
+        above = 0.0 if whole.is_cone else (rows.start + rows.stop - whole.detector_shape[0]) / 2
+        return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings, above)
 
     @property
     def ended(self) -> bool:

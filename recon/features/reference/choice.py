@@ -77,6 +77,13 @@ def width_of(problem: VoxelProblem) -> float:
     return 2 * problem.projector.geometry.reach
 
 
+def _at_rows(reference: Volume, trial: Trial) -> Volume:
+    """The reference with z from the middle of the trial's rows, as the trial has it in a parallel beam."""
+    z, y, x = reference.grid.centre
+    pitch = trial.problem.units.projector(trial.problem.projector, 1).grid.spacing[0]
+    return Volume(reference.data, replace(reference.grid, centre=(z - trial.above * pitch, y, x)))
+
+
 def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerdict:
     """The three questions, on the rows and projections of a trial; `choice` is that of `auto`.
 
@@ -85,7 +92,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     problem, mu = trial.problem, trial.weight
     if problem.projector.geometry.is_cone:
         return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
-    moved = not_moved(reference, problem)
+    moved = not_moved(_at_rows(reference, trial), problem)
     if mu is None or moved is None:
         return ReferenceVerdict(
             False, "the reference shows no material here" if mu else "the weights could not be chosen"
@@ -98,7 +105,9 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     moved = replace(moved, u=padded(affine.field(c)))
     beside = np.where(moved.known(), 0, smooth).astype(np.float32)
     moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
-    coefficients, gains = affine.nearest(moved.u), moved.gains[:2].tolist()
+    coefficients, gains = affine.nearest(moved.u) * affine.used, moved.gains[:2].tolist()
+    about_all = coefficients.copy()  # with z from the middle of all rows instead of the trial's
+    about_all[:, 0, 0, 0] -= coefficients[:, 0, 0, 1] * 2 * trial.above * grid.spacing[0] / width
     start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
     fit = StateFit(problem, moved, start, _FIRST * mu, width)
     fit.rounds(PLAN)
@@ -125,7 +134,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-    mm = [(edge * each).ravel().tolist() for each in (coefficients, bent.mean(-1, keepdims=True))]
+    mm = [(edge * each).ravel().tolist() for each in (about_all, bent.mean(-1, keepdims=True))]
     return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 

@@ -67,6 +67,7 @@ class FromReference(Method):
         Raises:
             ValueError: the reference is elsewhere, or no method can use these projections.
         """
+        in_slabs = control.decide is not None  # only slabs share their decisions, and none knows its height
         decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
         control = replace(control, decide=decide)
 
@@ -76,19 +77,24 @@ class FromReference(Method):
             return choice
 
         choice = TrialChoice.of(decide("method", compared))
-        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials)))
+        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials, in_slabs)))
         if verdict.used:
             return self._from_reference(verdict, problem, control)
         made = self.otherwise.run_chosen(choice, problem, control)
         settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
         return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
-    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
+    def _asked(self, choice: TrialChoice, trials: list[Trial | None], in_slabs: bool) -> ReferenceVerdict:
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
             return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
         if self.reference is None:
             return ReferenceVerdict(False, "none was given")
+        if in_slabs:
+            return ReferenceVerdict(
+                False,
+                "this volume is made in slabs, and a reference needs all of it in memory; allow more memory",
+            )
         return asked(trial, choice, self.reference)
 
     def _from_reference(self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl) -> Reconstruction:

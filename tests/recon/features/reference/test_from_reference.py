@@ -9,6 +9,7 @@ import pytest
 
 import recon
 from recon.base.arrays import F32
+from recon.base.decisions import Decisions
 from recon.base.method import DataUse, RunControl
 from recon.base.volume import Volume
 from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, packed, psnr, scanned
@@ -131,3 +132,32 @@ def test_in_a_cone_the_volume_is_that_of_auto(before: Volume, state: tuple[F32, 
     made = recon.reconstruct(data, cone, recon.FromReference(before, AUTO))
     assert made.settings["reference_because"] == "a reference is used only with a parallel beam, and this is a cone"
     np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, cone, AUTO).volume.data)
+
+
+def _balls_near_one_end(rng: np.random.Generator) -> F32:
+    """A cylinder [z, y, x] of 40 slices, with balls in its lower half: there a trial has its rows."""
+    z, y, x = np.indices((40, 48, 48)) - np.array([19.5, 23.5, 23.5])[:, None, None, None]
+    volume = np.where(np.hypot(y, x) < 22, 0.005, 0).astype(np.float32)
+    for _ in range(60):
+        centre, radius = rng.uniform([-18, -16, -16], [-5, 16, 16]), rng.uniform(2.5, 4)
+        apart = np.sqrt((z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2)
+        if volume[apart < radius + 1].max() < 0.01:
+            volume[apart < radius] = 0.025
+    return volume
+
+
+@pytest.mark.slow
+def test_the_height_of_the_reference_is_that_of_the_rows_that_are_tested(rng: np.random.Generator) -> None:
+    truth = _balls_near_one_end(rng)
+    geometry = recon.Geometry.parallel(np.pi * np.arange(30) / 30, (40, 48))
+    grid = recon.Grid.matching(geometry)
+    exact = recon.Projector(geometry, grid).forward(truth)
+    data = -np.log(np.maximum(rng.poisson(1e4 * np.exp(-exact)), 1) / 1e4).astype(np.float32)
+    method = recon.FromReference(Volume(truth, grid), AUTO)
+    made = recon.reconstruct(data, geometry, method)
+    assert made.settings["reference_used"] and made.displacement is not None
+    assert psnr(made.volume.data, truth) > psnr(recon.reconstruct(data, geometry, AUTO).volume.data, truth) + 6
+    material = truth > 0.02
+    assert np.median(np.abs(made.displacement[0][material])) < 0.1, "it has not moved along the axis"
+    in_slabs = recon.reconstruct(data, geometry, method, control=RunControl(decide=Decisions()))
+    assert not in_slabs.settings["reference_used"] and "made in slabs" in in_slabs.chosen
