@@ -99,7 +99,7 @@ class HalfVoxels(VoxelMethod):
         if not self.halves(projector.geometry, projector.grid):
             return x
         before = 0 if decide.ended is None else decide.ended.after
-        fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
+        fine, start = _with_half_voxels(problem, first + before), in_halves(in_halves(x, 0), 1)
         made = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
             prox=tv_prox(fine, tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
@@ -148,6 +148,19 @@ def halved(grid: Grid) -> Grid:
     """The grid with voxels half as wide along y and x, and with the same slices."""
     nz, ny, nx = grid.shape
     return Grid((nz, 2 * ny, 2 * nx), grid.voxel_size / 2, grid.centre, grid.spacing[0])
+
+
+def in_halves(x: F32, axis: int) -> F32:
+    """The volume x with voxels half as wide along this axis, by linear interpolation.
+
+    Half voxels start from it. It is smoother than the same value in both halves, which needs 4 more iterations of about
+    30.
+    """
+    lines = np.moveaxis(x, axis, 0)
+    padded = np.concatenate([lines[:1], lines, lines[-1:]])
+    further = (padded[2:] - padded[:-2]) / 8  # slope (a central difference) times a quarter of a voxel
+    made = np.stack([lines - further, lines + further], axis=1).reshape(2 * len(lines), *lines.shape[1:])
+    return np.ascontiguousarray(np.moveaxis(made, 0, axis))
 
 
 def _with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
