@@ -16,7 +16,7 @@ from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
 from recon.base.setting import Count, NonNegative
 from recon.base.volume import Volume
-from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
+from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, in_field
 from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.half_voxels import HalfVoxels
@@ -47,10 +47,9 @@ class Discrete(HalfVoxels):
     φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
     `recon.features.discrete.mixture`. Memory: as `FistaTv`, plus 2 volumes.
 
-    Held-out projections choose the number of levels, their values, the factor on the FISTA-TV weight μ,
-    and β. The result is the FISTA-TV
-    volume if discrete levels do not predict the held-out projections significantly better, or if there are too few
-    projections to hold any out. If it starts from a given first volume, the method uses total variation alone.
+    Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
+    is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, if a weaker
+    pull predicts them better, or if there are too few projections to hold any out. If it starts from a given first volume, the method uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
@@ -180,7 +179,7 @@ class Discrete(HalfVoxels):
         if trial is None or weight.by_noise:
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
-            return MaterialPrior(levels, weights, 1.0, PULLS[-1]).scaled(-problem.units.density)
+            return MaterialPrior(levels, weights, 1.0, WEAK_PULL).scaled(-problem.units.density)
         return self._choice(trial, weight.value).materials
 
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
