@@ -8,10 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F64
+from recon.base.arrays import F32, F64
 from recon.base.decisions import MaterialPrior
 from recon.base.empirical import ONE_IN
-from recon.features.discrete.mixture import LEAST_NOISE, NOISE, MaterialPull, are_apart, fitted_levels
+from recon.features.discrete.mixture import (
+    LEAST_NOISE,
+    NOISE,
+    MaterialPull,
+    are_apart,
+    drawn_apart,
+    fitted_levels,
+    thin_parts,
+)
 from recon.voxels.choice import LEAST_GAIN, significantly_better
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
@@ -41,6 +49,11 @@ def in_field(problem: VoxelProblem) -> NDArray[np.bool_]:
     return np.repeat(field[:, :, None], problem.projector.grid.shape[0], axis=2)
 
 
+def pull_to(materials: MaterialPrior, problem: VoxelProblem, x: F32) -> MaterialPull:
+    """The pull of x [y, x, z], the volume of total variation, to these materials in the field of view."""
+    return MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))
+
+
 class MaterialTrial:
     """Test reconstructions with discrete levels, compared in held-out projections.
 
@@ -60,7 +73,12 @@ class MaterialTrial:
         self.best, self.materials = self.smooth, MaterialPrior()
 
     def choose(self) -> None:
-        """Choose the number of levels and the share of total variation; or no levels, if a weaker pull predicts better.
+        """Choose the number of levels, the share of total variation and the noise of a voxel; or no levels.
+
+        The levels are rejected if a weaker pull predicts better, see `WEAK_PULL`. The noise is `NOISE`, or
+        `LEAST_NOISE` if a volume as it will be made predicts worse than total variation, because too many voxels
+        between two levels are then pulled. (Polyhedra of two densities from 36 and 60 projections with 10⁵ photons: 0.6
+        and 1.2 dB worse than total variation with `NOISE`, 1.0 and 0.5 dB better with `LEAST_NOISE`.)
 
         If the sample is wider than the field of view (`Trial.wide`), the weight of total variation is not lowered.
         Held-out projections then also contain the sample outside the field of view, and prefer an eighth to a half of
@@ -91,7 +109,13 @@ class MaterialTrial:
             continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
             if not significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
                 return
-        self.best, self.materials = best, chosen._replace(tv_share=tv_share)
+        materials = chosen._replace(tv_share=tv_share)
+        if (
+            self._trial.residuals(self._volume_by(pull_to(materials, self._trial.problem, self._start))).mean()
+            >= self.smooth.mean()
+        ):
+            materials = materials._replace(noise=LEAST_NOISE)
+        self.best, self.materials = best, materials
 
     def _share_of_smoothing(
         self, best: F64, chosen: MaterialPrior, least_share: float
@@ -133,8 +157,13 @@ class MaterialTrial:
         )
         if self._trial.ended or (self._levels is None and not are_apart(levels)):
             return np.full(self.smooth.shape, np.inf), MaterialPrior()
-        first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull)
+        first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull, NOISE)
         none_thin, noise = np.broadcast_to(np.int8(0), self._start.shape), min(NOISE, LEAST_NOISE / math.sqrt(tv_share))
-        towards = MaterialPull(first, self._where, none_thin, noise, follows=self._levels is None)
-        x = self._trial.volume_of_weight(self._weight * tv_share, self._start, self._sweeps, towards)
-        return self._trial.residuals(x), towards.materials_in(x)
+        towards = MaterialPull(first._replace(noise=noise), self._where, none_thin, follows=self._levels is None)
+        x = self._volume_by(towards)
+        return self._trial.residuals(x), towards.materials_in(x)._replace(noise=NOISE)
+
+    def _volume_by(self, pull: MaterialPull) -> F32:
+        """The volume of total variation that is pulled to these levels."""
+        weight = self._weight * pull.materials.tv_share
+        return self._trial.volume_of_weight(weight, self._start, self._sweeps, pull)

@@ -16,8 +16,8 @@ from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
 from recon.base.setting import Count, NonNegative
 from recon.base.volume import Volume
-from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
+from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, pull_to
+from recon.features.discrete.mixture import NOISE, probabilities, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.half_voxels import HalfVoxels
 from recon.voxels.held_out import CHOICE_SWEEPS
@@ -37,7 +37,7 @@ The decisions are the levels in the units of the scan, and the expected share of
 of the middle between two levels).
 """
 _REFIT_SWEEPS = 16  # iterations of which error bars make a share
-_TRIALS = 6  # usual number of test reconstructions with levels
+_TRIALS = 7  # usual number of test reconstructions with levels
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Discrete(HalfVoxels):
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if not problem.go_on.going:
             return x
-        pull = partial(_pull_to, materials)
+        pull = partial(pull_to, materials)
         return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
 
     def materials(
@@ -160,7 +160,7 @@ class Discrete(HalfVoxels):
     ) -> F32:  # fmt: skip
         """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
         `to_the_end` as in `Subsets.of`."""
-        pull, further = _pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
+        pull, further = pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
@@ -179,7 +179,7 @@ class Discrete(HalfVoxels):
         if trial is None or weight.by_noise:
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
-            return MaterialPrior(levels, weights, 1.0, WEAK_PULL).scaled(-problem.units.density)
+            return MaterialPrior(levels, weights, 1.0, WEAK_PULL, NOISE).scaled(-problem.units.density)
         return self._choice(trial, weight.value).materials
 
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
@@ -188,8 +188,3 @@ class Discrete(HalfVoxels):
         found = MaterialTrial(trial, weight, self.iterations, levels)
         found.choose()
         return found
-
-
-def _pull_to(materials: MaterialPrior, problem: VoxelProblem, x: F32) -> MaterialPull:
-    """The pull of x [y, x, z], the volume of total variation, to these materials in the field of view."""
-    return MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.features.discrete.choose import PULL, WEAK_PULL, MaterialTrial
+from recon.features.discrete.mixture import LEAST_NOISE, NOISE
 from recon.voxels.standstill import USUAL_SWEEPS
 from recon.voxels.trial import TrialSettings
 
@@ -20,12 +21,15 @@ VIEWS_HELD_OUT = 3
 
 
 class ToldTrial:
-    """A trial whose volumes leave what `residuals_by_share` says; pulled weakly, `weakly`; with three materials more."""
+    """A trial whose volumes leave what `residuals_by_share` says; with other shares `own`, as the volume will be made;
+    pulled weakly, `weakly`; with three materials more than all."""
 
     ended, settings = False, TrialSettings()
 
-    def __init__(self, residuals_by_share: dict[float, float], *, wide: bool = False, weakly: float = 1.5) -> None:
-        self.wide, self._weakly = wide, weakly
+    def __init__(
+        self, residuals_by_share: dict[float, float], *, wide: bool = False, weakly: float = 1.5, own: float = 0.9
+    ) -> None:
+        self.wide, self._weakly, self._own = wide, weakly, own
         self.problem = SimpleNamespace(projector=SimpleNamespace(grid=recon.Grid.matching(VIEWS), geometry=VIEWS))
         self.smooth = np.array((0.25, 0.5, 1.0), np.float32)[np.arange(16 * 16 * 4).reshape(16, 16, 4) % 3]
         self._by_share, self._by_volume = residuals_by_share, {id(self.smooth): 1.0}
@@ -33,7 +37,10 @@ class ToldTrial:
 
     def volume_of_weight(self, weight: float, start: F32, sweeps: int, pull: Any = None) -> F32:
         two = pull is not None and len(pull.materials.levels) == 2
-        by_pull = {PULL: lambda: self._by_share[pull.materials.tv_share], WEAK_PULL: lambda: self._weakly}
+        by_pull = {
+            PULL: lambda: self._by_share.get(pull.materials.tv_share, self._own),
+            WEAK_PULL: lambda: self._weakly,
+        }
         self.made.append(start.copy())
         self._by_volume[id(self.made[-1])] = by_pull[pull.share]() if two else 1.5
         return self.made[-1]
@@ -83,6 +90,16 @@ def test_levels_are_rejected_if_a_weaker_pull_predicts_better(weakly: float, rej
     choice.choose()
     assert (not choice.materials.levels) is rejected
     assert choice.best[0] == pytest.approx(1.0 if rejected else 0.70)
+
+
+@pytest.mark.parametrize(("own", "noise"), [(0.99, NOISE), (1.01, LEAST_NOISE)])
+def test_fewer_voxels_are_pulled_if_the_volume_would_predict_worse_than_total_variation(
+    own: float, noise: float
+) -> None:
+    trial: Any = ToldTrial({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, own=own)
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert choice.materials.levels and choice.materials.noise == noise
 
 
 def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() -> None:
