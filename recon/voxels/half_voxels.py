@@ -35,6 +35,14 @@ MakePull = Callable[[VoxelProblem, F32], Pull]
 
 COST, USUAL_FURTHER = 3, 30
 """Time of a sweep on half voxels, divided by that of a sweep on whole ones (2.6 to 4), and their usual number."""
+_DUAL_STEPS = 8
+"""Factor on the dual steps of each proximal step.
+
+Total variation reaches twice as many half voxels as whole ones. With the factor 1, the errors of the proximal steps
+accumulate in scans with heavy weights: a cathode from 45 projections of 512 columns had 21.9 dB and had not converged
+after 60 iterations. With 4 it has 23.9 dB, with 8 it has 24.1 dB after 25 iterations. Elsewhere the factor changes the
+volume by up to 0.05 dB, and the time by less than a tenth, because fewer iterations are needed.
+"""
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 2.2, 0.75, 0.1
 _MORE_VOLUMES = 0.6  # of half voxels: a quarter for the volume of whole ones, the rest for the coarse cells of damping
 _BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
@@ -91,7 +99,7 @@ class HalfVoxels(VoxelMethod):
         Args:
             x: the volume of whole voxels.
             mu: weight μ of total variation with whole voxels.
-            tv_steps: dual steps of each proximal step.
+            tv_steps: dual steps of each proximal step with whole voxels.
             pull: function of the problem with half voxels and of its first volume; returns the pull of each step.
             first: number of planned iterations before those that made x, for the progress.
         """
@@ -102,7 +110,7 @@ class HalfVoxels(VoxelMethod):
         fine, start = _with_half_voxels(problem, first + before), in_halves(in_halves(x, 0), 1)
         made = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
-            prox=tv_prox(fine, tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
+            prox=tv_prox(fine, _DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
