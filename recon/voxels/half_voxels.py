@@ -110,7 +110,8 @@ class HalfVoxels(VoxelMethod):
         fine, start = _with_half_voxels(problem, first + before), in_halves(in_halves(x, 0), 1)
         made = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
-            prox=tv_prox(fine, _DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
+            prox=tv_prox(fine, _DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start),
+            still=self.still,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
