@@ -36,7 +36,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
     out: dict[str, Value] = {
         "projections": hashlib.sha256(data.data).hexdigest(),
         "n_views": prepared.geometry.n_views,
-        "length_unit": prepared.length_unit,
+        "length_unit": prepared.origin.length_unit,
     }
     out |= arrays_of(prepared.geometry)
     out |= {f"setting {name}": str(value) for name, value in asdict(settings).items()}

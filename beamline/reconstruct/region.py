@@ -200,7 +200,7 @@ def box_around_sample(scan: SelectedScan) -> Region:
     look = scan.selecting(replace(selection.asked, views=views, binning=side * coarse).with_steps(*unlearnt))
     prepared = prepare_projections(look, lambda warning: None)  # they come again, of the views used
     data, geometry = prepared.seen.data, prepared.geometry
-    grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
+    grid = Grid.matching(selection.geometry(prepared.origin.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
     if cut := reach_of(prepared.seen).beyond:

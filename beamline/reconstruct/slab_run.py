@@ -241,7 +241,7 @@ def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, no
     path = Path(options.source.path)
     return ReconRecord(
         volume=prepared.stretched(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
-        length_unit=prepared.length_unit,
+        length_unit=prepared.origin.length_unit,
         raw_file=str(path.resolve()),
         title=f"Partial reconstruction of {path.name}",
         sample="not stated",

@@ -58,7 +58,7 @@ CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], F
     "angles": (_turned, SETTINGS, OTHERS),
     "axis_col": (lambda p: _seen_by(p, replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
     "pixel_pitch": (lambda p: _seen_by(p, replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
-    "length_unit": (lambda p: replace(p, length_unit="px"), SETTINGS, OTHERS),
+    "length_unit": (lambda p: p.stating(length_unit="px"), SETTINGS, OTHERS),
     "loss": (lambda p: p, replace(SETTINGS, loss="l2"), OTHERS),
     "kernel": (lambda p: p, replace(SETTINGS, kernel=OTHER), OTHERS),
     "policy": (lambda p: p, replace(SETTINGS, policy=None), OTHERS),
