@@ -68,7 +68,7 @@ class Auto(Method):
         return self.run_chosen(choice, problem, replace(control, decide=decide))
 
     def run_chosen(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The same as `run`, for a choice that was made before. `control.decide` must be given."""
+        """Reconstruct with the method that `choose` has already chosen. `control.decide` must be given."""
         assert control.decide is not None
         control.decide.prior = choice.prior
         chosen, result = self._run_choice(choice, problem, control)
@@ -98,8 +98,9 @@ class Auto(Method):
         return self.tried(problem, control)[0]
 
     def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
-        """The choice, as from `choose`, and the test reconstructions. These are None if there were none, or if they
-        were stopped."""
+        """The choice that `choose` returns, and the test reconstructions that led to it. The second value is None if no
+        test reconstruction was made, or if the run was stopped.
+        """
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("all projections are zero, so there is nothing to reconstruct")

@@ -80,7 +80,7 @@ def reconstruct(
         DataError: the path is not a scan, no volume can be made from its data, or the output exists or cannot be
             written.
 
-    If an error is raised, nothing has been written.
+    If one of these errors is raised, no file has been written.
     """
     refuse_wrong_arguments(reconstruct, locals())
     source, chosen = SourceOptions(scan_file(path), frames_per_view=None), _method(method)

@@ -27,7 +27,7 @@ class BeamlineError(Exception):
 
 
 class ConfigError(BeamlineError):
-    """Wrong usage or configuration; nothing was started.
+    """An argument or the configuration is wrong. Nothing was started.
 
     Args:
         faults: list of single errors. Each error has the place of the value (`my.yaml:12`) and a sentence without its

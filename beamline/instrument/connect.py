@@ -191,7 +191,7 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer. The devices that were opened before it are closed again.
+        DeviceError: a device does not answer. The devices that are already open are closed again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

@@ -110,7 +110,7 @@ class ScanVerdict:
         alarmed: numbers of the frames with an alarm, without those that were taken again.
         retaken: numbers of the projections that were taken again.
         references: what is wrong with darks and flats, a text for each group.
-        altered: a sentence on what in the file differs from its stored checksums; "" if nothing differs.
+        altered: a sentence that says which data in the file do not match their checksums; "" if all data match.
         aside: which checks skipped how many projections, and which checks failed with an error.
     """
 

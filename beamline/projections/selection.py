@@ -66,11 +66,13 @@ class Selection:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
-        """The step of the class `kind` in this selection; if there is none, a new step with default settings."""
+        """The correction step of the class `kind`. If the selection does not contain such a step, a new step with
+        default settings.
+        """
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:
-        """The same selection with these steps; each replaces the step of the same class."""
+        """The same selection with these correction steps. Each step replaces the step of the same class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 

@@ -65,7 +65,7 @@ class Geometry:
             grows along u cos(roll) + v sin(roll).
         tilt: float64 [view], radians; tilt of the rotation axis along the beam. The row number of a tilted projection
             grows along v cos(tilt) + d sin(tilt), with d the direction of the beam.
-        width: width of all rays; see `seen_with`.
+        width: the causes that make rays wide (`RayWidth`); the same for all rays.
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
@@ -221,8 +221,7 @@ class Geometry:
 
     @property
     def lean(self) -> float:
-        """Largest displacement along the rotation axis that roll and tilt give a point in the field of view, in mm at
-        the rotation axis."""
+        """Largest distance in mm, along the rotation axis, by which roll and tilt move a point in the field of view."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
         return self.reach * float(across.max())
 
@@ -231,9 +230,9 @@ class Geometry:
         """Angle in radians after which projections repeat the same rays: π for a parallel beam with the axis in the
         middle, otherwise 2π.
 
-        The period is 2π in three cases: for a cone beam; if the axis is tilted along the beam so much that the edge of
-        the field of view moves by more than half a pixel; and if the axis is off the detector's middle by more than a
-        twentieth of the detector's width, because opposite projections then see different parts of the sample.
+        The period is 2π in three cases. (1) The beam is a cone. (2) The axis is tilted along the beam so much that the
+        edge of the field of view moves by more than half a pixel. (3) The axis is off the detector's middle by more
+        than a twentieth of the detector's width: opposite projections then see different parts of the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
@@ -265,7 +264,7 @@ class Geometry:
 
     @property
     def offsets(self) -> F64:
-        """Pixels (col, row) from (axis_col, axis_row) to the image of the object's origin, [view, 2]."""
+        """[view, 2] pixels (col, row): how far the image of the object's origin lies from (axis_col, axis_row)."""
         if not self.centres.any():
             return self.shifts
         u, v, w = np.einsum("vij,vj->iv", [self.axes(view) for view in range(self.n_views)], -self.centres)
@@ -358,8 +357,8 @@ class Geometry:
         projections.
 
         Raises:
-            ValueError: the angles are not valid. Or shift, roll, tilt or centre differ between projections, so that the
-                values at the new angles are unknown.
+            ValueError: there are no angles, or an angle is not finite. The error is also raised if the shift, roll,
+                tilt or centre differs between projections, because its value at a new angle is then unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -390,11 +389,11 @@ class Geometry:
         return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same projections, with a ray width and with a skew: the angle from one row to the next (rolling shutter).
+        """The same projections with rays of this width, and with this skew (see the attributes of `Geometry`).
 
         Raises:
-            ValueError: the skew is not finite. Or the skew is not 0 and the beam is a cone, or projections are rolled
-                or tilted: a slice of the volume then does not belong to one row.
+            ValueError: the skew is not finite. A skew other than 0 also raises the error for a cone beam, and for
+                rolled or tilted projections, because one detector row then sees several slices.
         """
         return replace(self, width=width, skew=float(skew))
 

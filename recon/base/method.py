@@ -142,7 +142,7 @@ class RunControl(Checked):
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
-        """The same control with a deadline in s of its clock."""
+        """The same control with a deadline: the run ends when the clock of this control shows `deadline` (s)."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 

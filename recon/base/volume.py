@@ -52,8 +52,8 @@ class Grid:
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
-        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis, at their
-        height.
+        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. Its middle
+        slice is at the height of the middle detector row.
 
         If projections are shifted, the function counts how many projections see each position along the columns and
         along the rows. The grid covers the positions that are seen at least half as often as the position that is seen
@@ -111,7 +111,7 @@ class Grid:
         return replace(self, shape=(nz, across, across))
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
-        """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis.
+        """A wider box: voxels are added on all four sides until each side is `radius` mm from the rotation axis.
 
         For a cone beam, the box is limited so that its corners do not reach the source.
         """
@@ -128,7 +128,9 @@ class Grid:
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
 
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
-        """The box with whole slices added until it contains all rays of a cone, which rise or fall to its corners."""
+        """A taller box: slices are added at the top and at the bottom until the box contains every ray of a cone beam.
+        The extra slices are needed because the rays rise or fall on their way to the corners of the box.
+        """
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
         # how far the rays of a row rise over this distance
         row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch
@@ -159,7 +161,9 @@ class Grid:
         return z, y, x
 
     def part(self, z: slice, y: slice, x: slice) -> Grid:
-        """The box of these voxels; each slice must have a start and a stop."""
+        """The part of this box that contains only the voxels [z, y, x]. Each of the three slices must have a start and
+        a stop.
+        """
         slices = (z, y, x)
         centre = tuple(
             first + (part.start + part.stop - 1) / 2 * edge

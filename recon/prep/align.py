@@ -227,8 +227,9 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
-    Returns: The estimate from all projections. If this estimate is not confident, but another one (opposite
-    projections, ends, pair) is confident, the other estimate.
+    Returns: The estimate from all projections, if it is confident. Otherwise a confident estimate from opposite
+        projections, from the two ends of the scan, or from one pair of projections. If no estimate is confident, the
+        estimate from all projections.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.

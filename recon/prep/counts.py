@@ -48,9 +48,9 @@ class Photons:
 class Counts:
     """Detector counts with the sample, without the sample (flat), and without the beam (dark).
 
-    The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
-    1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
-    variance / gain². The model assumes that flat and dark have no noise, because they are means of many frames.
+    The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, JOSA A 10, 1014; Yavuz & Fessler 1998): (counts
+    - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is variance / gain².
+    The model assumes that flat and dark have no noise, because they are means of many frames.
 
     Attributes:
         counts: [view, row, col], any real type.

@@ -198,9 +198,9 @@ class FitSettings:
             is lower, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
-        tv_moves: True: total variation may move centres. In the published code (weight 0.05), this gradient is too
-            small by the square of the voxel size and has no effect. The correct gradient improves the walnut by 0.2 dB
-            (60 projections) and the battery by 0.4 dB (90 projections).
+        tv_moves: True: total variation may move centres. In the published code (weight 0.05), this gradient is wrong:
+            it is too small by the square of the voxel size, so it has no effect. The correct gradient improves the
+            walnut by 0.2 dB (60 projections) and the battery by 0.4 dB (90 projections).
         rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
             quaternions and raw densities.
         pace: factor on all rates. The published rates are for 30 000 steps; a fit of 1000 steps with the published

@@ -189,11 +189,11 @@ class StreamingFit:
 
     @property
     def last_steps(self) -> int:
-        """Number of steps of the final fit. Together with the steps during the scan, they make up a fit to all
-        projections at once.
+        """Number of steps of the final fit. The steps during the scan and the final steps together are as many as in a
+        fit of the finished scan.
 
-        The number is at least one step per projection, and never more than in a fit of the finished scan. A fit that
-        was too slow during the scan therefore catches up in the final fit.
+        The final fit uses each projection at least once, and it never has more steps than a fit of the finished scan.
+        If the fit was too slow during the scan, the final fit makes the missing steps.
         """
         each_view_once = math.ceil(self.n_views / self.settings.views_per_step)
         taken = self._stage.state.step if isinstance(self._stage, Growing) else 0

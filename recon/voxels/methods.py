@@ -41,17 +41,18 @@ from recon.voxels.voxel_problem import (
 class FistaTv(HalfVoxels):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`.
 
-    The iterations end when the volume has converged: after about 20 with 180 projections, 35 with 30. Memory: 8 volumes
-    and 2 times the projections.
+    The iterations end when the volume has converged: after about 20 iterations with 180 projections, and about 35 with
+    30 projections. Memory: 8 volumes and 2 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
         tv_weight: None: μ follows from held-out projections, or from the noise of the data, see `choose_weight`. A
             number: the threshold of one FISTA step in density units, μ = tv_weight x density unit x ||A||².
-        subsets: largest number of subsets in the first iterations, with one step each.
+        subsets: largest number of subsets into which the first iterations divide the projections. Each subset is one
+        step.
         tv_steps: dual steps of total variation in each step.
         still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
-            all iterations are made.
+            all `iterations` are made.
         half_voxels: whether further iterations use voxels half as wide; None: with few projections, see
             `recon.voxels.half_voxels`.
     """
@@ -77,14 +78,13 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """`EarlyTv` with this share of its iterations."""
+        """The method of the refits for error bars: `EarlyTv` with `share` times its number of iterations."""
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections with the best weight; with `tv_weight`, if it is given.
-
-        The volume is one of whole voxels, because the model of whole voxels predicts the projections.
+        """The residuals in the held-out projections with the weight `tv_weight`; None: with the best weight. The volume
+        has voxels of the full size, not half voxels: the projections are predicted with voxels of the full size.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))
@@ -97,7 +97,9 @@ class FistaTv(HalfVoxels):
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None
     ) -> tuple[F32, TvWeight]:
-        """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
+        """The volume after the iterations, and the weight μ of total variation. `trial` is explained in
+        `choose_weight`.
+        """
         projector = problem.projector
         if not x.any():
             problem.first_sweep(x, problem.rng)
@@ -137,9 +139,9 @@ class OsSirtTv(VoxelMethod):
 
     The iterations end when the volume has converged. SIRT weighs rays by the inverse of their length in the volume.
     Rays through much material carry fewer photons, so the method suits very few photons (10 to 30 per pixel: up to 2 dB
-    better than FISTA-TV). For a cone its weight follows the noise: on a thorax it is 2.3 dB behind FISTA-TV, whose
-    weight is chosen by held-out projections. The momentum is that of Kim, Ramani & Fessler (2015, IEEE Trans. Med.
-    Imaging 34, 167). Memory: 9 volumes and 3 times the projections.
+    better than FISTA-TV). For a cone beam, the weight of total variation is set from the noise. On a thorax the PSNR is
+    2.3 dB lower than that of FISTA-TV, which chooses its weight by held-out projections. The momentum is that of Kim,
+    Ramani & Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -248,7 +250,7 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """None, because the number of steps is fixed."""
+        """Empty: no time limit can end the method, because the number of its steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:

@@ -59,8 +59,8 @@ class _Rays(NamedTuple):
 class Projector:
     """Line integrals A through the voxels of `grid` along the rays of `geometry`, and their transpose Aᵀ.
 
-    Joseph's interpolation (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192): a ray is sampled once in each plane
-    of voxels, bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
+    Joseph's interpolation (P. M. Joseph 1982, IEEE TMI 1, 192): a ray is sampled once in each plane of voxels,
+    bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
 
     Attributes:
         matched: True if projections are sharpened to the resolution of the measured ones.
@@ -113,12 +113,13 @@ class Projector:
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
-        """How much sharpening raises the largest eigenvalue of AᵀWA: the ratio with and without sharpening, at most.
-        `weight` is W, the weight of each ray.
+        """An upper limit of the factor by which sharpening raises the largest eigenvalue of AᵀWA. `weight` is W, the
+        weight of each ray.
 
-        Sharpening by s raises the finest detail by the factor 1 + 2 s. Along rows, this concerns all projections. Along
-        columns, it concerns only projections whose columns differ by less than a voxel at the edge of the field of
-        view. All projections contribute to the largest eigenvector, unless a few rays weigh more than the others.
+        Sharpening by s raises the finest detail by the factor 1 + 2 s. Detail along the rotation axis is raised by all
+        projections. Detail across the axis is raised only by projections whose directions nearly agree: they differ by
+        less than a voxel at the edge of the field of view. All projections contribute to the largest eigenvector,
+        unless a few rays weigh more than the others.
         """
         if self.sharpened is None:
             return 1.0

@@ -55,7 +55,7 @@ class Discrete(HalfVoxels):
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
-            voxels are pulled weakly to given levels.
+            voxels are pulled weakly to the given `levels`.
         still, half_voxels: as in `FistaTv`.
     """
 
@@ -79,7 +79,9 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """`EarlyTv` with a part of its iterations: `share` times the number that the calibration of error bars used."""
+        """The method of the refits for error bars: `EarlyTv` with `share` times the number of iterations that was used
+        to calibrate error bars.
+        """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
     @property
@@ -142,7 +144,8 @@ class Discrete(HalfVoxels):
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
     ) -> MaterialPrior | None:
-        """The levels in the units of the problem; None if they do not predict held-out projections. Decided once.
+        """The grey levels in the units of the problem. None if discrete levels do not predict held-out projections
+        better. The levels are found once and then reused.
 
         Args:
             weight: weight of total variation.
@@ -159,8 +162,10 @@ class Discrete(HalfVoxels):
         self, problem: VoxelProblem, x: F32, weight: TvWeight, materials: MaterialPrior, done: int,
         to_the_end: bool = True,
     ) -> F32:  # fmt: skip
-        """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
-        `to_the_end` as in `Subsets.of`."""
+        """Continue from the volume x [y, x, z], with a pull to the grey levels, and return the new volume [y, x, z]. At
+        most `iterations` iterations are made. `done` is the number of iterations that were made before, for the
+        progress. `to_the_end` is explained in `Subsets.of`.
+        """
         pull, further = _pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)

@@ -72,8 +72,8 @@ class Cgls(VoxelMethod):
     early.
 
     Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about eight
-    iterations. From then on, the method needs one iteration more than it would need in exact arithmetic for the same
-    residual. Memory: 3 volumes and 3 times the projections.
+    iterations. After that, the method is about one iteration behind exact arithmetic. Memory: 3 volumes and 3 times the
+    projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -119,7 +119,7 @@ class Cgls(VoxelMethod):
 
 @dataclass(frozen=True)
 class AsdPocs(VoxelMethod):
-    """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
+    """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, PMB 53, 4777).
 
     Each iteration makes one SART iteration, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times
     as long as the change of the first SART iteration. If the steps undo more than `ratio` of the SART iteration, and

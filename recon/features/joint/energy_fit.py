@@ -88,7 +88,7 @@ class EnergyViews:
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
-        """Some projections, and a range of their rows."""
+        """The same data with only these projections, and only these detector rows."""
         first, stop, _ = rows.indices(self.projections.shape[1])
         weight = None if self.weight is None else self.weight[views, rows]
         geometry = self.geometry.select(views).rows(first, stop)
