@@ -276,7 +276,7 @@ class PnpDct(VoxelMethod):
             weight = choose_weight(problem, x, self.first_sweeps, trial)
         if not problem.go_on.going:
             return x
-        problem.decide.ended = None  # that of the first volume; patches follow it
+        problem.decide.ended = None  # weight of the first volume; patches are used after it
         share = self.patch_threshold
         if share is None:
             strength = choose_patches(problem, weight, trial, self.trial_steps).strength
@@ -287,8 +287,8 @@ class PnpDct(VoxelMethod):
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape
         patches = 4 * scratch_values((ny, nx, nz)) + bytes_of(self.buffers, geometry, grid, weighted)
-        # In addition to the first volume, tests make volumes from copies of the projections (of all if there are few
-        # rows).
+        # In addition to the first volume, tests make volumes from copies of the projections (of all projections if
+        # there are few rows).
         trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
         first = FistaTv(half_voxels=False).memory(geometry, grid, weighted) + trials
         return max(first, patches)

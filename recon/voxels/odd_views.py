@@ -1,4 +1,4 @@
-"""odd_views: finds projections that differ in a part from the volume made from them, more than their neighbours do."""
+"""odd_views: finds projections in which a part differs from the volume more than in the neighbouring projections."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ from recon.voxels.projector import Projector, project, projection_images, volume
 LIMIT = 12.0
 """Limit of the score, in standard deviations of the usual differences. Clean real scans stay below 9.4."""
 
-_CELLS = 128  # least number of columns of cells, if the detector has that many pixels
-_BLUR = 4  # pixels; reach of a blur by one pixel
-_BAND, _TOGETHER = 16, 32  # rows that are projected together; projections that are compared together
-_AT_A_TIME = 8  # projections of a cone that are computed together
-_BROAD = 3  # side, in cells, of the area over which a difference is averaged
-# projections on either side that define the usual difference; number of nearest ones that are left out
+_CELLS = 128  # fewest columns of cells, if the detector has that many pixels
+_BLUR = 4  # pixels; range of a blur by one pixel
+# number of rows that are projected together; number of projections that are compared together
+_BAND, _TOGETHER = 16, 32
+_AT_A_TIME = 8  # number of projections of a cone beam that are computed together
+_BROAD = 3  # side of the area, in cells, over which a difference is averaged
+# number of projections on either side that define the usual difference; number of nearest projections that are left out
 _AROUND, _BESIDE = 12, 3
-# least noise of a pixel, as a share of the largest line integral; frames and residuals of fits have no less
+# least noise of a pixel as a share of the largest line integral; frames, and residuals of fits, have at least this
+# noise
 _LEAST_NOISE = 2e-3
-_OUTLIER = 3.0  # largest contribution of one projection, in medians of all
-_SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
-_EXTENT = 0.5  # share of the limit above which a cell belongs to the region
+_OUTLIER = 3.0  # largest contribution of one projection, in units of the median over all projections
+_SHARP = 0.1  # a volume may miss an edge by this share of the change that a blur of one pixel causes
+_EXTENT = 0.5  # a cell belongs to the region if its score exceeds this share of the limit
 _LEAST_VIEWS = 2 * _AROUND + 1
 
 
@@ -54,18 +56,18 @@ class OddView:
 def odd_views(
     volume: Volume, views: Views, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> tuple[OddView, ...]:
-    """Projections in which something crossed the beam or the sample was displaced, found in the differences p - A x.
+    """Find projections in which something crossed the beam or the sample was displaced, from the differences p - A x.
 
     The check takes the difference of each projection from that of the volume, minus the common change of its pixels
     (light). It averages the difference over 3 x 3 cells, in standard deviations of the projection's noise and finest
     detail. No volume fits its projections perfectly at edges that it blurs, at rings, or outside the field of view. So
     a difference is compared with the same place in the 18 projections at the nearest angles. It is also compared with
-    the edges of the volume in the projection itself, because a face or a crack parallel to the rays is sharp only in a
-    few projections [our own].
+    the edges of the volume in the projection itself, because a face or a crack that is parallel to the rays is sharp
+    only in a few projections (our own method).
 
     Args:
-        progress: function called with the number of projections compared so far, and their total number. In bands of
-            rows, each band counts with its share.
+        progress: function called with the number of projections compared so far, and their total number. If bands of
+            rows are compared one after the other, each band counts with its share.
 
     Returns:
         The parts in the order of the projections; empty for fewer than 25 projections.
@@ -113,17 +115,18 @@ def _band(geometry: Geometry) -> int:
 def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slice, F32, F32]]:
     """Yields projections, rows, the volume's projection [view, row, col] and its sharp part.
 
-    In bands if rows are slices.
+    In bands of rows if rows show slices.
     """
     rows, band = geometry.detector_shape[0], _band(geometry)
     if not geometry.rows_show_slices or volume.grid != Grid.matching(geometry):
-        lines = volume_lines(volume.data)  # only once, because for a large volume it takes as long as a projection
+        # computed only once, because for a large volume it takes as long as a projection
+        lines = volume_lines(volume.data)
         for view in range(0, geometry.n_views, _AT_A_TIME):
             some = slice(view, view + _AT_A_TIME)
             model = projection_images(Projector(geometry.select(some), volume.grid).forward_lines(lines))
             yield some, slice(0, rows), model, _sharp(model)
         return
-    whole = rows - rows % _side(geometry)  # rows at the end that do not fill a cell do not count
+    whole = rows - rows % _side(geometry)  # rows at the end that do not fill a cell are left out
     for first in range(0, whole, band):
         part = slice(first, min(first + band, whole))
         around = slice(max(first - _BLUR, 0), min(part.stop + _BLUR, rows))

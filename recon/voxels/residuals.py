@@ -17,8 +17,9 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import whitened
 
-RAYS, _ROWS = 2**17, 16  # most pixels used of a projection; rows of a band. Bands of rows represent a large detector
-_GROUPS = 4  # groups of projections that are computed one after the other, if rows do not show slices
+# most pixels of a projection that are used; rows of a band. Bands of rows represent a large detector.
+RAYS, _ROWS = 2**17, 16
+_GROUPS = 4  # number of groups of projections that are computed one after the other, if rows do not show slices
 
 
 class SquaresLeft(NamedTuple):
@@ -43,7 +44,7 @@ class SquaresLeft(NamedTuple):
 
 
 def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> SquaresLeft:
-    """Squares of the residual of each projection, at the resolution of voxels.
+    """Sums of the squared residual of each projection, at the resolution of the voxels.
 
     At this resolution the residual of the true volume is only the noise. At the resolution of the measured projections,
     the true volume would have a larger residual than a sharper one.
@@ -59,15 +60,15 @@ def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewRes
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """Root mean square [view] of the residuals, see `squares_left`, for projections with a measured ray; [inf] if none
-    has.
+    """[view] root mean square of the residuals (see `squares_left`), for projections with a measured ray; [inf] if no
+    projection has one.
     """
     left, _, rays = squares_left(model, views, weight, resolution)
     return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
-    """`unseen_residuals` of a volume in these projections."""
+    """The `unseen_residuals` of a volume in these projections."""
     projector = Projector(views.geometry, volume.grid)
     weights = None if views.weights is None else projection_lines(views.weights[...])
     model = projector.forward_lines(volume_lines(volume.data))

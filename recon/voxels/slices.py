@@ -15,10 +15,12 @@ from recon.base.volume import Grid
 from recon.voxels.fbp import continuation, continued, fbp, filter_projections
 from recon.voxels.view_weights import angular_weights, ray_weights
 
-_SIDE = 511  # largest side in voxels; wider projections are binned
-_VIEWS = 400  # most projections used, enough for this side; of more projections, some are left out, evenly by angle
+_SIDE = 511  # largest side of a slice in voxels; wider projections are binned
+# largest number of projections that are used, enough for this side. If there are more, some are left out, evenly by
+# angle.
+_VIEWS = 400
 _BRIGHT = 0.5  # share of the 99th percentile; the slices cross in the middle of the voxels above it
-_AT_ONCE = 32  # projections that are filtered together
+_AT_ONCE = 32  # number of projections that are filtered together
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class OrthogonalSlices:
 
     Attributes:
         images: float32 [y, x], [z, x] and [z, y], 1/mm.
-        at: z, y and x of the slices in mm.
+        at: z, y and x in mm of the point in which the slices cross.
         pixel: side of a voxel in mm.
         covered: radians of the 180° that the projections cover; π if no wedge is missing.
     """
@@ -41,7 +43,7 @@ class OrthogonalSlices:
 def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSlices:
     """The middle slice perpendicular to the axis, and two slices along the axis through the middle of its bright part.
 
-    Each projection has a weight for its share of the 180°, so projections may come in any order. Only the slices are
+    Each projection is weighted by its share of the 180°, so projections may be in any order. Only the slices are
     back-projected. The time grows with the number of projections up to 400.
 
     Args:
@@ -49,7 +51,7 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
         geometry: geometry of a parallel beam, without roll, tilt and shifts along the axis.
 
     Raises:
-        ValueError: there are fewer than two projections, or the geometry is another one.
+        ValueError: there are fewer than two projections, or the geometry is not of this kind.
     """
     if len(views) != geometry.n_views or len(views) < 2:
         raise ValueError(
