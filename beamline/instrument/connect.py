@@ -170,7 +170,7 @@ class ConnectedDevices:
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
-        """See Simulated.truth; None for a real instrument."""
+        """The ground truth of the scene, see `Simulated.truth`; None for a real instrument."""
         return None if self.simulated is None else self.simulated.truth
 
     def __enter__(self) -> Self:

@@ -20,7 +20,7 @@ from recon.prep.tilt import TiltEstimate, find_tilt
 MATTERS = 0.5
 """A tilt by this many pixels over all rows doubles edges visibly."""
 _BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # bands of rows, rows of each, and projections that the warning is based on
-_FEWEST_ROWS = 32  # half a pixel over fewer rows is too much for a tilt of the stage
+_FEWEST_ROWS = 32  # half a pixel over fewer rows would be a larger tilt than a stage has
 _SURE = 3.0  # standard deviations from which a tilt is significant
 BandsDone = Callable[[int, int], None]  # (n, N): n bands of rows of N are corrected
 

@@ -38,7 +38,7 @@ class Regions:
     resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
-        """[view, row, col] True for rays with reduced weight in these projections."""
+        """True if any of these projections has rays with reduced weight."""
         return bool(np.isin(self.frames, view_ids).any())
 
     def and_unmeasured(self, runs: I64, first_row: int, binning: int) -> Regions:
