@@ -36,7 +36,7 @@ MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
 of the middle between two levels).
 """
-_REFIT_SWEEPS = 16  # iterations of which error bars make a share
+_REFIT_SWEEPS = 16  # number of iterations; error bars make a share of them
 _TRIALS = 6  # usual number of test reconstructions with levels
 
 

@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because more iterations do not improve the volume of this method."""
+        """Empty: a time limit cannot end this method, because more iterations do not improve its volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

@@ -170,7 +170,7 @@ def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
     ]
 
 
-_LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, and volumes from all projections
+_LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, and number of volumes from all projections
 _ROWS = 32  # number of binned rows examined
 _VIEWS = 60  # number of projections examined per energy
 # columns by which a magnification moves the outermost pixel; a smaller one is ignored, so that nothing is interpolated

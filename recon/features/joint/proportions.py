@@ -30,7 +30,7 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 
 # first λ, divided by the mean curvature of the projections; ratio of the next λ to it; number of tests
 _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
-_IN_TIME = 0.03  # τ
+_IN_TIME = 0.03  # the constant τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
 """Largest number of iterations of all tests and of the solution together."""

@@ -1,9 +1,10 @@
-"""How a reference has moved until a state was scanned: an affine map, then cubic splines, estimated from the views.
+"""Estimates from the projections how the sample has moved between the reference and a state: an affine map, then cubic
+splines.
 
     m(r) = v(r + u(r)),    u = Σ_c B_c a_c
 
-v is the reference with a gain for each particle. Each step of Gauss-Newton fits the projected derivatives of m to what
-the views show beside it (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275).
+v is the reference with a gain for each particle. Each Gauss-Newton step fits the projected derivatives of m to the
+residual of the projections (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275).
 """
 
 from __future__ import annotations
@@ -24,17 +25,18 @@ from recon.kernels.cpu.spline_warp import coefficients, pull
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
-_TALL = 8  # slices from which on the motion along the axis is estimated; with fewer, it is taken for 0
-_VIEWS = 40  # most projections from which the motion is estimated
-_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # turns about the axis that are tried first
-_MOST = 16  # least shift in voxels that is tried first; a tenth of the width if that is more
-_ACROSS = 96  # largest number of voxels across with which they are tried
-_BAND = 2.5, 10.0  # widths in voxels of the Gaussians between which structure is compared
-_BLURS = 4, 4, 2, 1, 1  # voxels, of the steps towards the affine map
-_STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of each, for splines and for an affine map
-_BENDING = 160  # columns for which the weight of bending is stated
+# smallest number of slices with which the motion along the axis is estimated; with fewer slices it is assumed to be 0
+_TALL = 8
+_VIEWS = 40  # largest number of projections from which the motion is estimated
+_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # rotations about the axis that are tried first
+_MOST = 16  # largest shift in voxels that is tried first; a tenth of the width if that is larger
+_ACROSS = 96  # largest number of voxels across, with which rotations and shifts are tried
+_BAND = 2.5, 10.0  # widths of two Gaussians in voxels; structure between these widths is compared
+_BLURS = 4, 4, 2, 1, 1  # blur in voxels of the steps towards the affine map
+_STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of a step, for splines and for an affine map
+_BENDING = 160  # number of columns for which the weight of bending is stated
 KNOTS = 8
-"""Intervals of the finest splines across the field."""
+"""Number of intervals of the finest splines across the field of view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +45,9 @@ class Basis:
 
     Attributes:
         y, x, z: functions along each axis, [place, function].
-        used: [p, q, r], 1 for the products of functions that are used.
-        axes: 2: in the plane of the slices; 3: also along the axis.
-        intervals: of the splines; 0: no splines, and nothing to bend.
+        used: [p, q, r], 1 if the product of the functions p, q and r is used, otherwise 0.
+        axes: 2: displacements in the plane of the slices; 3: also along the rotation axis.
+        intervals: number of intervals of the splines; 0: there are no splines, so nothing can bend.
     """
 
     y: F64
@@ -57,7 +59,9 @@ class Basis:
 
     @classmethod
     def affine(cls, grid: Grid, width: float) -> Basis:
-        """1, y, x and z, with coordinates from the rotation axis divided by half of `width` (mm)."""
+        """The functions 1, y, x and z of an affine map. Coordinates are relative to the rotation axis, divided by half
+        of `width` (mm).
+        """
         z, y, x = (np.stack((at**0, 2 * at / width), axis=1) for at in grid.coordinates())
         used = (np.add.outer(np.add.outer(np.arange(2), np.arange(2)), np.arange(2)) <= 1).astype(float)
         if grid.shape[0] < _TALL:
@@ -66,7 +70,9 @@ class Basis:
 
     @classmethod
     def splines(cls, grid: Grid, width: float, intervals: int) -> Basis:
-        """Cubic B-splines with this number of intervals across `width` (mm); as wide along z, at least constant."""
+        """Cubic B-splines with this number of intervals across `width` (mm). Intervals along z have the same length; in
+        a thin volume the functions are constant along z.
+        """
         edge = width / intervals
         z, y, x = grid.coordinates()
         along = round(grid.shape[0] * grid.spacing[0] / edge)
@@ -80,7 +86,7 @@ class Basis:
         return (self.axes, *self.used.shape)
 
     def field(self, c: F64) -> F32:
-        """The displacement [axis, y, x, z]."""
+        """The displacement [axis, y, x, z] for these coefficients."""
         wide = np.einsum("yp,apqr->ayqr", self.y, c * self.used).astype(np.float32)
         wide = np.einsum("xq,ayqr->ayxr", self.x.astype(np.float32), wide)
         return np.ascontiguousarray(wide @ self.z.T.astype(np.float32))
@@ -95,7 +101,7 @@ class Basis:
         return replace(self, z=np.ones((len(self.z), 1)), used=np.ones((*self.used.shape[:2], 1)))
 
     def squared(self) -> Basis:
-        """The basis of the squares of the functions."""
+        """The basis whose functions are the squares of these functions."""
         return replace(self, y=self.y**2, x=self.x**2, z=self.z**2)
 
     def bending(self, c: F64) -> F64:
@@ -125,10 +131,11 @@ class Moved:
     """A reference moved to a state.
 
     Attributes:
-        particles: its parts; `first` is the voxel of them at voxel 0 of the state.
-        u: displacement [3, y, x, z]: from where each voxel of the state takes its value, in voxels.
-        gains: of the ground, then of each particle. Voxels beside particles have the median gain of particles.
-        radius: how far the reference is known around the axis, in voxels.
+        particles: the parts of the reference; `first` is the voxel of the reference at voxel 0 of the state.
+        u: displacement [3, y, x, z] in voxels, from a voxel of the state to the place from which it takes its value.
+        gains: gain of the ground, then of each particle. Voxels next to particles have the median gain of the
+        particles.
+        radius: distance from the axis, in voxels, up to which the reference is known.
     """
 
     particles: Particles
@@ -150,7 +157,7 @@ class Moved:
         return self.with_slopes(volume, False)[0]
 
     def with_slopes(self, volume: F32, slopes: bool = True) -> tuple[F32, F32 | None]:
-        """As `pulled`, and its derivatives [3, y, x, z] with respect to u."""
+        """The same as `pulled`, and the derivatives [3, y, x, z] of the result with respect to u."""
         out = np.empty(self.u.shape[1:], np.float32)
         derivatives = np.empty_like(self.u) if slopes else None
         pull(coefficients(volume), self.u, self.first, out, derivatives)
@@ -170,7 +177,7 @@ class Moved:
         return label[tuple(nearest)]
 
     def known(self) -> np.ndarray:
-        """[y, x, z] whether the reference shows the place of each voxel of the state."""
+        """bool [y, x, z], True for voxels of the state whose place is inside the known part of the reference."""
         places, shape = self._places(), self.particles.label.shape
         inside = np.ones(self.u.shape[1:], bool)
         for at, n in zip(places, shape, strict=True):
@@ -187,7 +194,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class MotionViews:
-    """The projections from which the motion is estimated: at most 40 of a problem."""
+    """The projections from which the motion is estimated: at most 40 projections of a problem."""
 
     projector: Projector
     lines: F32
@@ -205,14 +212,15 @@ class MotionViews:
 
 
 def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside: F32, with_gains: bool) -> Moved:
-    """The reference after a step of Gauss-Newton towards the views, both blurred by `blur` voxels in the plane.
+    """The reference after a Gauss-Newton step towards the projections. Reference and projections are blurred by `blur`
+    voxels in the plane of the slices.
 
-    A bend of a voxel over an eighth of the field costs as much as the mean residual of a ray, so that the splines
-    relax as the fit improves.
+    Bending by a voxel over an eighth of the field of view costs as much as the mean residual of a ray. Therefore the
+    splines get softer as the fit improves.
 
     Args:
-        beside: a volume [y, x, z] that the views show in addition to the moved reference.
-        with_gains: True: also one gain of the ground and one of all particles.
+        beside: a volume [y, x, z] that the projections show in addition to the moved reference.
+        with_gains: True: also fit one gain of the ground and one gain of all particles.
     """
 
     def smooth(volume: F32) -> F32:
@@ -278,9 +286,10 @@ def _conjugate(normal: Callable[[F64], F64], right: F64, scale: F64, steps: int)
 
 
 def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
-    """Coefficients of `Basis.affine` for a turn about the axis and a shift: the best correlation with a volume x.
+    """Coefficients of `Basis.affine` for the rotation about the axis and the shift with which the reference correlates
+    best with a volume x.
 
-    Both volumes are compared between two widths of Gaussians, so that neither levels nor noise count.
+    Both volumes are filtered by the difference of two Gaussians, so that neither levels nor noise count.
     """
     basis, factor = Basis.affine(grid, width), math.ceil(x.shape[1] / _ACROSS)
     still = replace(moved, u=np.zeros_like(moved.u))
@@ -309,7 +318,9 @@ def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
 
 
 def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) -> F64:
-    """Coefficients of a turn about the axis after a shift (y, x, z), both in voxels; `across` voxels in the width."""
+    """Coefficients of a shift (y, x, z) in voxels, followed by a rotation about the axis. `across` is the width in
+    voxels.
+    """
     c = np.zeros(basis.shape)
     cos, sin, half = math.cos(turn), math.sin(turn), across / 2
     dy, dx, dz = shift
@@ -322,12 +333,14 @@ def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) ->
 
 
 def affinely_moved(views: MotionViews, moved: Moved, basis: Basis, beside: F32) -> Moved:
-    """The reference after steps on an affine map and two gains, from coarse to fine; arguments as of `improved`."""
+    """The reference after steps on an affine map and two gains, from coarse to fine. The arguments are those of
+    `improved`.
+    """
     for blur in _BLURS:
         moved = improved(views, moved, basis, blur, beside, True)
     return moved
 
 
 def padded(u: F32) -> F32:
-    """A displacement [3, y, x, z]; 0 along axes that it lacks."""
+    """The displacement with three axes, [3, y, x, z]. It is 0 along an axis that `u` does not have."""
     return np.concatenate((u, np.zeros((3 - len(u), *u.shape[1:]), np.float32)))
