@@ -33,7 +33,7 @@ _EDGE = 25  # at each edge, one of this many columns is too near to the edge to 
 
 
 def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> AxisEstimate:
-    """The rotation axis from two opposite projections. p180 is p0, mirrored about the axis.
+    """The rotation axis from two opposite projections. p180 shows the same as p0, mirrored about the axis.
 
     The normalised correlation of p0 with the mirrored p180 is computed for an axis at every half column, and a parabola
     is fitted to its peak. Mirroring about a half column maps pixels to pixels, so no value is interpolated. The sample
@@ -232,7 +232,7 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         estimate from all projections.
 
     Raises:
-        ValueError, AxisError: as `axis_from_sinogram`.
+        ValueError, AxisError: for the same reasons as `axis_from_sinogram`.
 
     Warns:
         UserWarning: angles look like degrees, or projections look like counts or transmission.

@@ -16,7 +16,7 @@ from recon.base.registry import LibraryError, loaded
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FAINTEST = 1e-30  # density units
+_FAINTEST = 1e-30  # smallest density, in density units
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 

@@ -271,7 +271,7 @@ def fit_state(
 
 
 def _less(estimate: ParticleEstimate) -> NDArray[np.bool_]:
-    """True for bodies that contain less mass than most others."""
+    """bool [body], True if the body has clearly less mass than most bodies."""
     mass = estimate.gain * estimate.scale**3
     middle = float(np.median(mass))
     spread_ = 1.4826 * float(np.median(np.abs(mass - middle)))
