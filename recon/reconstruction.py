@@ -56,13 +56,14 @@ def reconstruct(
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
         masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the measured
         `Counts` instead. The method then gets line integrals, with weights that represent the likelihood of the counts
-        (`recon.prep.counts.line_integrals`). These weights are multiplied by `use.weights`. `Views` contain their
-        geometry, their weights and the reach of the sample, which then is not measured again.
+        (`recon.prep.counts.line_integrals`). The weights from the counts are multiplied by `use.weights`. `Views`
+        contain their geometry, their weights and the reach of the sample, so the reach is not measured again.
         geometry: geometry of the projections; None for `Views`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
-            projections see. So if you ask for a smaller box, its voxels are identical to those of the whole volume.
+            projections see. So if you ask for a smaller box, the voxels in the box are identical to those of the whole
+            volume.
         seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
         of threads.
         device: where the method computes: "cpu" or "cuda" (the current CUDA device).

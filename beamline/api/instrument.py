@@ -57,11 +57,11 @@ class ScanResult(RunResult):
 
 
 class Instrument:
-    """A connected instrument, made by `connect`. Leaving a `with` block closes its devices.
+    """A connected instrument, made by `connect`. The devices are closed at the end of a `with` block.
 
     Attributes:
         config: the configuration of the devices.
-        last: result of the newest scan, even if that scan raised an error. None before the first scan, or if the newest
+        last: result of the newest scan, even if that scan raised an error; None before the first scan, or if the newest
             scan took no frame.
     """
 
@@ -103,13 +103,13 @@ class Instrument:
         Args:
             sample: name of the sample, which is written to the file and into the folder's name; None: the configured
                 name.
-            energy_kev: energy of the beam, written to the file. If a monochromator is configured, it moves to this
-                energy.
+            energy_kev: energy of the beam, written to the file. If a monochromator is configured, the monochromator
+            moves to this energy.
             set: configuration values for this scan only, such as {"scan.angles.views": 90}.
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
             stop: request with which another thread can end the scan.
-            on_event: function that gets every event of the run. A separate thread calls it.
+            on_event: function that gets every event of the run. It is called in a separate thread.
 
         Raises:
             ConfigError: a value is wrong, exceeds a limit, or would require opening the devices again. Nothing has
@@ -189,7 +189,7 @@ def connect(
         config: path of the configuration file.
         set: values that replace values of the file, such as {"scan.angles.views": 90}.
         ask: function that asks the operator to move the shutter or the sample by hand, and returns when the operator
-            has done it. None: ask at the terminal.
+        has done it; None: the operator is asked at the terminal.
         say: function that gets each message that a command would print, for example `print` or the `info` of a logger;
             None: no messages.
 
@@ -227,18 +227,18 @@ def plan(
     a second, not counting the import.
 
     Args:
-        scans: each is one of four things. (1) A configuration file. (2) A table of scans (.csv). (3) A row of such a
-            table as a mapping, such as {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}. (4) A
-            plan of bluesky, such as `fly(scan)`; it is read without running it, and cannot be run afterwards.
+        scans: each is a configuration file, a table of scans (.csv), a row of a table of scans as a mapping, such as
+        {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}, or a plan of bluesky, such as
+        `fly(scan)`. A plan of bluesky is read without running it, and cannot be run afterwards.
         set: values that replace values in all configurations, such as {"scan.angles.views": 90}.
         output: folder in which the scans would create the folders of their runs; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.
         live: False: without live reconstructions, even if `recon.live` is on.
 
     Returns:
-        A plan. Its `scans` are in the order of the argument. Each scan has `valid`, `faults` (each with message, file
-        and line), and `needs`: `duration` (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what the
-        `operator` has to do. The `needs` of the plan itself are the sums over the scans that can run.
+        A plan. The `scans` of the plan are in the order of the argument. Each scan has `valid`, `faults` (each with
+        message, file and line), and `needs`: `duration` (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and
+        what the `operator` has to do. The `needs` of the plan itself are the sums over the scans that can run.
 
     Raises:
         ConfigError: an argument has the wrong type. If a scan has an error, nothing is raised: the error is listed in

@@ -227,7 +227,8 @@ class StopRequest:
         returns.
 
         Args:
-            by_itself: True if the scan itself requests the stop, because its frames show that no more are needed.
+            by_itself: True if the scan itself requests the stop, because the frames so far show that no more frames are
+                needed.
         """
         self.by_person = self.by_person or not by_itself
         self.reason = self.reason or reason

@@ -20,8 +20,8 @@ from beamline.scan.preflight import DryRun
 
 @dataclass(frozen=True)
 class ScanFault:
-    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file. Both are None if the
-    value is not in a file, or if the sentence is about several lines.
+    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file; None if the value is
+    not in a file, or if the sentence is about several lines.
     """
 
     message: str

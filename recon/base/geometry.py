@@ -58,7 +58,8 @@ class Geometry:
         pixel_pitch: size of a detector pixel in mm. For a parallel beam, the size is measured at the sample; for a cone
             beam, on the detector. If the pitch of a parallel beam is 1.0, all lengths are in pixels.
         axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector. For a cone beam,
-            the row is that of the central ray. Both are in pixels, 0 at the centre of the first column or row.
+            the row is that of the central ray. `axis_col` and `axis_row` are in pixels, 0 at the centre of the first
+            column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
         roll: float64 [view], radians; rotation of the detector about the beam. The column number of the rolled detector
@@ -69,7 +70,7 @@ class Geometry:
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
-            source, along the beam of the projection. If left out, this point is the origin.
+            source, along the beam of the projection. If `centres` is left out, this point is the origin.
     """
 
     angles: F64
@@ -241,8 +242,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        This angle is the smallest tilt of the axis along the beam. It is 0 if this tilt moves the edge of the field of
-        view by at most half a pixel.
+        This angle is the smallest tilt of the axis along the beam. The angle is 0 if this tilt moves the edge of the
+        field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
@@ -357,8 +358,8 @@ class Geometry:
         projections.
 
         Raises:
-            ValueError: there are no angles, or an angle is not finite. The error is also raised if the shift, roll,
-                tilt or centre differs between projections, because its value at a new angle is then unknown.
+            ValueError: there are no angles, or an angle is not finite. The error is also raised if shift, roll, tilt or
+                centre differ between projections, because the values at a new angle are then unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -418,8 +419,8 @@ class Geometry:
         """The same geometry for detector rows start..stop.
 
         For a parallel beam, z = 0 moves to the middle of these rows, so that a slab can be treated as a separate scan.
-        For a cone beam, the central ray stays at its position, and so does the point about which projections are rolled
-        and tilted.
+        For a cone beam, the central ray and the point about which projections are rolled and tilted stay where they
+        are.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:

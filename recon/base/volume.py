@@ -52,7 +52,7 @@ class Grid:
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
-        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. Its middle
+        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. The middle
         slice is at the height of the middle detector row.
 
         If projections are shifted, the function counts how many projections see each position along the columns and
@@ -76,8 +76,8 @@ class Grid:
 
         The box includes everything that shifted projections see, and it exists even if the axis is outside the
         detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Few
-        projections see material outside this field of view: it is in the beam only at angles at which it is far from
-        the source. The box of a wide cone ends before its source.
+        projections see material outside this field of view: this material is in the beam only at angles at which it is
+        far from the source. The box of a wide cone ends before it reaches the source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
@@ -90,7 +90,8 @@ class Grid:
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field of view, in voxels of the requested size.
 
-        `wider`: True for a sample that is wider than the field of view. The box is then as wide as the requested box.
+        `wider`: True for a sample that is wider than the field of view. If `wider` is True, the box is as wide as the
+            requested box.
 
         The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
         start from a volume coarser than four pixels.
@@ -113,7 +114,7 @@ class Grid:
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
         """A wider box: voxels are added on all four sides until each side is `radius` mm from the rotation axis.
 
-        For a cone beam, the box is limited so that its corners do not reach the source.
+        For a cone beam, the box is limited so that the corners of the box do not reach the source.
         """
         most = geometry.source_distance / math.sqrt(2) - self.voxel_size
         half = np.asarray(self.shape[1:]) * self.voxel_size / 2
@@ -224,8 +225,8 @@ class Volume:
     def save(self, path: str | Path, **facts: object) -> None:
         """Write the volume to the new file `path`, an .npz; `beamline export` converts it.
 
-        Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z), `centre_zyx_mm`, and
-        `facts`. The file is written completely or not at all.
+        The file contains the arrays `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z),
+            `centre_zyx_mm`, and `facts`. The file is written completely or not at all.
 
         Raises:
             ValueError: the suffix is not .npz.

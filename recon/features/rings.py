@@ -139,8 +139,8 @@ def remove_rings(
     rings: Rings = "auto",
     axis_col: float | None = None,
 ) -> WithoutRings:
-    """A copy of line integrals without the stripes that cause rings. Use it after `recon.correct` and before a
-    reconstruction.
+    """A copy of line integrals without the stripes that cause rings. Call `remove_rings` after `recon.correct` and
+    before a reconstruction.
 
     Args:
         projections: [view, row, col], in any order. The data are not changed if there are fewer than 8 projections

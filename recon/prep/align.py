@@ -219,7 +219,7 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     """The rotation axis (centre of rotation) of a scan, from all projections.
 
-    First, all projections are used together. If they show no axis and the scan covers 360°, pairs of opposite
+    First, all projections are used together. If this shows no axis and the scan covers 360°, pairs of opposite
     projections are used, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a
     sample wider than the field of view, the two ends of the scan are used, or a pair of opposite projections.
 
@@ -227,9 +227,9 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
-    Returns: The estimate from all projections, if it is confident. Otherwise a confident estimate from opposite
-        projections, from the two ends of the scan, or from one pair of projections. If no estimate is confident, the
-        estimate from all projections.
+    Returns: The estimate from all projections, if it is confident. If it is not confident: a confident estimate from
+        opposite projections, from the two ends of the scan, or from one pair of projections. If no estimate is
+        confident, the estimate from all projections.
 
     Raises:
         ValueError, AxisError: for the same reasons as `axis_from_sinogram`.

@@ -57,8 +57,8 @@ class Counts:
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: camera gain, counts per photon, see `photon_transfer`.
-        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. Its causes are the readout,
-            and photons that carry no information about the sample.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. The variance comes from the
+            readout, and from photons that carry no information about the sample.
     """
 
     counts: ArrayLike
@@ -90,10 +90,11 @@ class Counts:
             )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Three images [row, col] of a projection: photons counted plus v, photons without the sample plus v, and v.
+        """Three images [row, col] of a projection: the counted photons plus v, the photons without the sample plus v,
+        and v. Here v is the variance of a dark frame in units of photons², see `Counts`.
 
-        If the flat of a pixel is not above its dark, its photons without the sample are 0. Counts that are NaN stay
-        NaN.
+        If the flat of a pixel is not above the dark, the photons without the sample are 0. If the counts of a pixel are
+        NaN, its photons are NaN.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)

@@ -190,9 +190,9 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
         ssim_weight: weight of 1 - SSIM, which is added to the loss.
-        tv_weight: weight of total variation. None: 3e5 s² / n. Here n is the number of pixels that a Gaussian covers. s
-            is the noise of a pixel, divided by the density unit and by half the width of the field of view. If the
-            sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
+        tv_weight: weight of total variation; None: 3e5 s² / n, where n is the number of pixels that a Gaussian covers,
+            and s is the noise of a pixel, divided by the density unit and by half the width of the field of view. If
+            the sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
             change. The weight is at most 0.25.
         tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
             is lower, see `in_steps`.
@@ -210,12 +210,14 @@ class FitSettings:
         paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
-        truncation: distance at which Gaussians are cut off. A compact kernel has a finite radius, so it is not cut off.
+        truncation: distance at which Gaussians are cut off. A compact kernel is not cut off, because it has a finite
+        radius.
         smallest: smallest standard deviation in pixels. A thinner Gaussian could lie between the points at which pixels
             are sampled.
         views_per_step: number of projections whose gradients are averaged in a step.
-        joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). None: pixels become
-            as wide as the Gaussians, see `initialise.joined_for`. This changes the pixels only in large volumes.
+        joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). If `joined_pixels`
+        is None, pixels become as wide as the Gaussians, see `initialise.joined_for`; this changes the pixels only in
+        large volumes.
         rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
         kernel: radial profile of the Gaussians, or its name. A fit that starts from an existing model keeps the kernel
             of that model.

@@ -46,8 +46,8 @@ class FistaTv(HalfVoxels):
 
     Attributes:
         iterations: largest number of iterations over all projections.
-        tv_weight: None: μ follows from held-out projections, or from the noise of the data, see `choose_weight`. A
-            number: the threshold of one FISTA step in density units, μ = tv_weight x density unit x ||A||².
+        tv_weight: threshold of one FISTA step in density units, so that μ = tv_weight x density unit x ||A||². If
+        `tv_weight` is None, μ follows from held-out projections, or from the noise of the data, see `choose_weight`.
         subsets: largest number of subsets into which the first iterations divide the projections. Each subset is one
         step.
         tv_steps: dual steps of total variation in each step.
@@ -78,13 +78,14 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv` with `share` times its number of iterations."""
+        """The method of the refits for error bars: `EarlyTv` with `share` times the usual number of iterations."""
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections with the weight `tv_weight`; None: with the best weight. The volume
-        has voxels of the full size, not half voxels: the projections are predicted with voxels of the full size.
+        """The residuals in the held-out projections, with the weight `tv_weight`, or with the best weight if
+        `tv_weight` is None. The volume has voxels of the full size, not half voxels: the projections are predicted with
+        voxels of the full size.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))
@@ -139,9 +140,9 @@ class OsSirtTv(VoxelMethod):
 
     The iterations end when the volume has converged. SIRT weighs rays by the inverse of their length in the volume.
     Rays through much material carry fewer photons, so the method suits very few photons (10 to 30 per pixel: up to 2 dB
-    better than FISTA-TV). For a cone beam, the weight of total variation is set from the noise. On a thorax the PSNR is
-    2.3 dB lower than that of FISTA-TV, which chooses its weight by held-out projections. The momentum is that of Kim,
-    Ramani & Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
+    better than FISTA-TV). For a cone beam, the weight of total variation is set from the noise. On a scan of a thorax,
+    the PSNR of OS-SIRT-TV is 2.3 dB lower than that of FISTA-TV, which chooses the weight with held-out projections.
+    The momentum follows Kim, Ramani & Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -215,13 +216,14 @@ class OsSirtTv(VoxelMethod):
 class PnpDct(VoxelMethod):
     """Alternates steps towards the projections with a denoiser of patches of 4 x 4 x 4 voxels (PnP-DCT).
 
-    The denoiser keeps few cosine coefficients of each patch, see `recon.voxels.priors`. The first volume is that of
-    FISTA-TV, unless one is given. Memory: as for `FistaTv`.
+    The denoiser keeps few cosine coefficients of each patch, see `recon.voxels.priors`. The first volume is the
+    FISTA-TV volume, unless a first volume is given. Memory: as for `FistaTv`.
 
     Attributes:
         iterations: steps towards the projections, five for each threshold.
-        patch_threshold: threshold of the last round, in density units. None: held-out projections choose it, see
-            `choose_patches`; if none can be held out, it follows from the noise.
+        patch_threshold: threshold of the last round, in density units. If `patch_threshold` is None, held-out
+            projections choose the threshold, see `choose_patches`; if no projection can be held out, the threshold
+            follows from the noise.
     """
 
     name: ClassVar[str] = "pnp-dct"
@@ -239,8 +241,9 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Iterations of all tests: to choose the weight of total variation, to make the first volume of PnP-DCT, and to
-        try four thresholds."""
+        """Number of iterations of all tests together: they choose the weight of total variation, make the first volume
+        of PnP-DCT, and try four thresholds.
+        """
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
     @property
@@ -250,7 +253,7 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty: no time limit can end the method, because the number of its steps is fixed."""
+        """Empty, because no time limit can end the method: the number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:

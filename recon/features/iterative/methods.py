@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty: a time limit cannot end this method, because more iterations do not improve its volume."""
+        """Empty, because a time limit cannot end this method: more iterations do not improve its volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -127,10 +127,11 @@ class AsdPocs(VoxelMethod):
     times the projections.
 
     Attributes:
-        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. None: 0.15 times the
-            residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone scan. For such a scan
-            the goal is 0.15 times the residual after one iteration of ordered-subset SIRT. Both residuals are similar:
-            0.085 to 0.12 for SIRT, and 0.075 to 0.11 for FDK (a box in a box, 20 to 180 projections, 0 and 2 % noise).
+        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None, it
+            is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone
+            scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset SIRT.
+            The residuals of SIRT and FDK are similar: 0.085 to 0.12 for SIRT, and 0.075 to 0.11 for FDK (a box in a
+            box, 20 to 180 projections, 0 and 2 % noise).
     """
 
     name: ClassVar[str] = "asd-pocs"

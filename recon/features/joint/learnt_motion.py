@@ -187,15 +187,16 @@ def register_energies(
     The energy with the most projections is the reference. The volume at the reference energy, scaled by the mean
     absorption at another energy, predicts the projections at that energy. Six parameters explain the differences (see
     `recon.voxels.displacement`): the sample is shifted along x, y and z and rotated about the axis; the image is
-    shifted along the rows and magnified. The edges determine these parameters, so a material whose absorption differs
-    between two energies does no harm.
+    shifted along the rows and magnified. The edges in the projections determine the parameters, so a material whose
+    absorption differs between two energies does no harm.
 
     Returns:
         The projections (interpolated if their magnification differs), and the displacement at each energy. The
         displacement is 0 if a displacement does not predict held-out projections better.
 
     Raises:
-        ValueError: the beam is a cone, in which a shift of the sample changes the directions of its rays.
+        ValueError: the beam is a cone: a shift of the sample then changes the directions of the rays through the
+            sample.
     """
     check_arguments(register_energies, locals())
     moves: list[Displacement] | None = None

@@ -207,8 +207,8 @@ def fit_share(
         found: result of `fit_materials` from the same projections.
         states: indices of the two materials.
         go_on: function called before each of at most `STEPS` steps, with the number of steps that may still follow. If
-            it returns False, the fit ends with the densities reached so far. stop: function called many times within a
-            step. If it returns True, the fit ends at once, with the densities reached so far.
+            `go_on` returns False, the fit ends with the densities reached so far. stop: function called many times
+            within a step. If `stop` returns True, the fit ends at once, with the densities reached so far.
 
     Raises:
         ValueError: `states` are not two different materials.
