@@ -153,12 +153,12 @@ def _not_installed(item: h5py.Dataset) -> Iterator[str]:
     """The filters that a dataset, or a source of a virtual dataset, needs and that are not installed. Each is the
     beginning of a sentence.
     """
-    made = item.id.get_create_plist()
-    for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
+    properties = item.id.get_create_plist()
+    for number, _, _, filter_name in map(properties.get_filter, range(properties.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
-            name = FILTERS.get(number) or one_line(text(said), 40) or "name unknown"
+            name = FILTERS.get(number) or one_line(text(filter_name), 40) or "name unknown"
             yield f"{item.name} in {item.file.filename} is stored with the HDF5 filter {number} ({name})"
-    for name, where in dict.fromkeys(drawn_on(made)) if item.is_virtual else ():
+    for name, where in dict.fromkeys(drawn_on(properties)) if item.is_virtual else ():
         with suppress(DataError, OSError, LookupError), _source_file(item, name) as file:
             yield from _not_installed(file[where])
 
@@ -312,11 +312,11 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
     """
     for name in source.attrs:
         given = source.attrs.get_id(name)
-        made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
+        copy = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
         if given.get_space().get_simple_extent_type() != h5py.h5s.NULL:
             values = np.empty(given.shape, given.dtype)
             given.read(values)
-            made.write(values)
+            copy.write(values)
 
 
 def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None = None) -> list[str]:

@@ -36,7 +36,7 @@ class UnderHdf5:
 
     def __init__(self, path: Path, mode: str, length: int = 0) -> None:
         self.path, self._file = path, FileIO(path, mode)
-        self._at, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
+        self._position, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
 
     def __del__(self) -> None:
         if file := vars(self).get("_file"):
@@ -46,16 +46,16 @@ class UnderHdf5:
         return str(self.path)  # HDF5 uses this text as the name of the file
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
-        self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._size}[whence]
-        return self._at
+        self._position = offset + {SEEK_SET: 0, SEEK_CUR: self._position, SEEK_END: self._size}[whence]
+        return self._position
 
     def tell(self) -> int:
-        return self._at
+        return self._position
 
     def readinto(self, buffer: Any) -> int:
         """Read into a buffer. Bytes that were not written yet are zero."""
         out = memoryview(buffer).cast("B")
-        self._read(self._at, out)
+        self._read(self._position, out)
         return len(out)
 
     def read(self, n: int) -> bytes:
@@ -127,16 +127,16 @@ class DiskFile(UnderHdf5):
 
     def write(self, buffer: Any) -> int:
         data, put = memoryview(buffer).cast("B"), 0
-        self._size = max(self._size, self._at + len(data))
+        self._size = max(self._size, self._position + len(data))
         try:
             if self._error is None:
-                self._file.seek(self._at)
+                self._file.seek(self._position)
                 while put < len(data):
                     put += self._file.write(data[put:])
         except BaseException as error:  # includes a signal: HDF5 cannot pass it on
             self.keep(error)
         if self._error is not None and len(data) <= _KEPT:
-            self._since.append((self._at, bytes(data)))
+            self._since.append((self._position, bytes(data)))
         return len(data)
 
     def truncate(self, size: int) -> int:

@@ -64,8 +64,8 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
     flags = [flag for flag in flags if flag.level is not Level.INFO]
     scores, regions = np.full(len(CHECKS), np.nan, np.float32), np.full((len(CHECKS), 4), -1, np.int32)
     for flag in flags:
-        at = _PLACES[flag.check]
-        scores[at], regions[at] = flag.score, flag.region or NOWHERE
+        place = _PLACES[flag.check]
+        scores[place], regions[place] = flag.score, flag.region or NOWHERE
     return Mark(bitmask(flags), scores, regions)
 
 
@@ -105,18 +105,20 @@ class FrameFlags:
         )
 
     @classmethod
-    def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
+    def of_flags(cls, flags_of_frames: Sequence[Sequence[Flag]]) -> FrameFlags:
         """The marks of the frames of a file, one for each row. If a flag refers to earlier rows, these rows are marked,
         too.
         """
-        flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
-        for flag in chain.from_iterable(found):
-            rows, at = flag.frames, place_of(flag)
+        flags = cls.of_marks(
+            [mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(flags_of_frames)]
+        )
+        for flag in chain.from_iterable(flags_of_frames):
+            rows, place = flag.frames, place_of(flag)
             flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
             if flag.level is not Level.INFO:
-                flags.scores[flag.frame, at] = flag.score
+                flags.scores[flag.frame, place] = flag.score
                 for row, box in flag.regions().items():
-                    flags.regions[row, at] = box
+                    flags.regions[row, place] = box
         return flags
 
     def mark(self, frame: int) -> Mark:
@@ -124,10 +126,10 @@ class FrameFlags:
         mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
         bits, row = 0, int(self.bits[frame])
         for i, entry in enumerate(self.legend):
-            if (at := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
+            if (place := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
                 continue
-            bits |= 1 << TODAY[at].bit | (row >> entry.alarm_bit & 1) << TODAY[at].alarm_bit
-            mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
+            bits |= 1 << TODAY[place].bit | (row >> entry.alarm_bit & 1) << TODAY[place].alarm_bit
+            mark.scores[place], mark.regions[place] = self.scores[frame, i], self.regions[frame, i]
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
@@ -204,8 +206,8 @@ class FrameFlags:
 
 def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """[check] the score farthest from 0 among the scores [frame, check]; NaN if no frame has a score."""
-    at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
-    return np.asarray(scores[at, np.arange(scores.shape[1])])
+    frame = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
+    return np.asarray(scores[frame, np.arange(scores.shape[1])])
 
 
 def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -95,8 +95,8 @@ def packing(
 
     def values(stored: Any) -> NDArray[Any]:
         numbers = np.asarray(stored, dtype).view(signed)  # a single number has the byte order of this machine
-        made = np.asarray(numbers.astype(real) * scale + offset, real)
-        made[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
-        return made
+        real_values = np.asarray(numbers.astype(real) * scale + offset, real)
+        real_values[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
+        return real_values
 
     return values

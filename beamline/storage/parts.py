@@ -263,11 +263,11 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> tuple[int, ...]:
     for path in _VIRTUAL:
         item = file[path]
         maxshape, chunks = (None, *item.shape[1:]), (1, *item.shape[1:])
-        made = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
-        datasets.copy_attributes(item, made)
+        copy = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
+        datasets.copy_attributes(item, copy)
         for row in range(n):
             with suppress(*hdf5.ALTERED):
-                made[row] = item[row]
+                copy[row] = item[row]
             target.require_taken()
     _complete(file, target, n)
     return tuple(row for row in range(n) if not is_whole(target, row))

@@ -167,24 +167,24 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
             if frames == 0 < committed:
                 raise ValueError(f"all of its {committed} complete frames are damaged")
             ending, lost = ending_in(file), tuple(range(frames, committed))
-            with hdf5.created(target, layout.LIBVER) as made:
-                damaged = copy_rows(file, frames, made)
+            with hdf5.created(target, layout.LIBVER) as copy:
+                damaged = copy_rows(file, frames, copy)
                 if ending.status == RUNNING:
-                    ending = ScanEnding("failed", gaps_in(path, made), DIED)
+                    ending = ScanEnding("failed", gaps_in(path, copy), DIED)
                 if lost:
                     reason = (
                         f"{ending.reason} Lost, because the scan had written them but they did not reach the "
                         f"disk: {frames_text(lost)}."
                     )
                     ending = replace(ending, status="failed", reason=reason.strip())
-                state_ending(made, ending)
-                times = made[layout.TIME][()]
-                if layout.END_TIME in made and not made[layout.END_TIME][()] and np.isfinite(times).any():
-                    made[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
-                planned, dropped = views_planned(made), max(0, len(file[layout.DATA]) - committed)
+                state_ending(copy, ending)
+                times = copy[layout.TIME][()]
+                if layout.END_TIME in copy and not copy[layout.END_TIME][()] and np.isfinite(times).any():
+                    copy[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
+                planned, dropped = views_planned(copy), max(0, len(file[layout.DATA]) - committed)
                 alone = planned is not None and run_of(path.resolve().parent) == path.resolve().parent
-                missing = n_still_to_take(made) if alone else None
-                altered = tuple(altered_rows(made, frames).tolist())
+                missing = n_still_to_take(copy) if alone else None
+                altered = tuple(altered_rows(copy, frames).tolist())
     except hdf5.ALTERED as error:
         if isinstance(error, OSError) and error.filename == str(target):
             raise

@@ -77,34 +77,34 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                     groups.append((h5py.h5g.open(group, name), depth + 1))
                 elif info.type == h5py.h5o.TYPE_DATASET:
                     dataset = h5py.h5d.open(group, name)
-                    made = dataset.get_create_plist()
-                    _refuse_claim(dataset, made, f"{path}: {name.decode('utf-8', 'replace')}")
-                    if made.get_layout() == h5py.h5d.VIRTUAL:
-                        yield from (other for other, _ in drawn_on(made) if other != ".")
+                    properties = dataset.get_create_plist()
+                    _refuse_claim(dataset, properties, f"{path}: {name.decode('utf-8', 'replace')}")
+                    if properties.get_layout() == h5py.h5d.VIRTUAL:
+                        yield from (other for other, _ in drawn_on(properties) if other != ".")
 
 
-def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
+def _refuse_claim(dataset: Any, properties: Any, what: str) -> None:
     """Raise DataError if a dataset states more data than any compression could make of the stored bytes. Also if its
     values are plain bytes in another file, because this could be any file that the user may read.
     """
-    if made.get_external_count():
+    if properties.get_external_count():
         raise DataError(
-            f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not an HDF5 file "
+            f"{what} has its values in {os.fsdecode(properties.get_external(0)[0])}, which is not an HDF5 file "
             "and is not read. Copy the values into the dataset. Nothing was read."
         )
-    chunk, shape = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
+    chunk, shape = properties.get_chunk() if properties.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
     sides = [-(-side // across) * across for side, across in zip(shape, chunk, strict=True)] if chunk else shape
     n, piece = (math.prod(each) * dataset.dtype.itemsize for each in (sides, chunk))
-    if (n < CLAIMED and piece <= _LARGE) or made.get_layout() == h5py.h5d.VIRTUAL:
+    if (n < CLAIMED and piece <= _LARGE) or properties.get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()) or is_blank(n, stored, piece):
         raise DataError(f"{what} states {n / 1e9:.3g} GB, but only {stored} bytes are stored. Nothing was read.")
 
 
-def drawn_on(made: Any) -> Iterator[tuple[str, str]]:
+def drawn_on(properties: Any) -> Iterator[tuple[str, str]]:
     """(file, dataset) of each source of a virtual dataset; "." is the file that contains the virtual dataset."""
-    for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
-        yield plain_name(made.get_virtual_filename(i)), plain_name(made.get_virtual_dsetname(i))
+    for i in range(min(properties.get_virtual_count(), MOST_OBJECTS)):
+        yield plain_name(properties.get_virtual_filename(i)), plain_name(properties.get_virtual_dsetname(i))
 
 
 def plain_name(written: str) -> str:
@@ -182,12 +182,12 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
 
 def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Shape and type of an .npy; raises ValueError unless the file has all its values. The file position is kept."""
-    at, stored = file.tell(), os.fstat(file.fileno()).st_size
+    start, stored = file.tell(), os.fstat(file.fileno()).st_size
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)
     needed = file.tell() + math.prod(map(int, shape)) * dtype.itemsize
-    file.seek(at)
+    file.seek(start)
     if any(n < 0 for n in shape) or needed > stored:
         raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but the file has {stored} bytes")
     return shape, dtype

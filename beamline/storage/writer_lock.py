@@ -124,12 +124,12 @@ class WriterLock:
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
         file = os.open(path, os.O_RDWR)
         self.release = weakref.finalize(self, os.close, file)
-        for left in reversed(range(_TRIES)):
+        for tries_left in reversed(range(_TRIES)):
             try:
                 _lock(file, exclusive=exclusive)
                 return
             except (BlockingIOError, PermissionError):
-                if left:
+                if tries_left:
                     time.sleep(_PAUSE)  # the function `held` briefly holds the lock
                 elif exclusive:
                     self.release()

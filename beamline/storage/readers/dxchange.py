@@ -130,9 +130,9 @@ class ExchangeSource(StacksSource):
         steps = np.diff(views)
         in_turn = bool((steps > 0).all() or (steps < 0).all())
         for kind, theta in thetas.items() if in_turn else ():
-            at = np.abs(views - theta[:, None]).argmin(axis=1)
+            nearest = np.abs(views - theta[:, None]).argmin(axis=1)
             # frames taken after the projections
-            place[table.of_kind(kind)] = np.where(at == views.size - 1, views.size, at - 0.5)
+            place[table.of_kind(kind)] = np.where(nearest == views.size - 1, views.size, nearest - 0.5)
         turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
         # the projections may be in any order; flats were taken at two positions of the stage
         if later is None and not in_turn and turned.size == 1:
@@ -288,8 +288,8 @@ def _of_rotation(file: h5py.File, what: str) -> float | None:
     by_group = datasets.scalar(
         file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}
     )
-    found = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
-    return found.pop() if len(found) == 1 else None
+    numbers = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
+    return numbers.pop() if len(numbers) == 1 else None
 
 
 def _attributes(file: h5py.File) -> dict[str, str | float | int]:
@@ -313,7 +313,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 
-def _at(path: Path, arrays: NamedArrays) -> ExchangeSource | None:
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> ExchangeSource | None:
     own = arrays.alone and arrays.data.strip("/") == "exchange/data" and _recognises(path, Opening())
     return open_exchange(path, own_angles=arrays.own_angles) if own else None
 
@@ -327,6 +327,6 @@ FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
     lambda path, opening: open_exchange(path, follow=opening.follow, own_angles=opening.own_angles),
-    _at,
+    _scan_of_arrays,
     _references,
 )

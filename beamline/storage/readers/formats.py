@@ -36,10 +36,10 @@ _OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
 _MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
 
 
-def _fitting(name: str, found: Any) -> ScanFormat:
-    if not isinstance(found, ScanFormat):
-        raise ValueError(f"it is a {type(found).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
-    return found
+def _fitting(name: str, entry: Any) -> ScanFormat:
+    if not isinstance(entry, ScanFormat):
+        raise ValueError(f"it is a {type(entry).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
+    return entry
 
 
 FORMATS: tuple[ScanFormat, ...] = tuple(
@@ -79,8 +79,8 @@ def open_arrays(path: Path, arrays: NamedArrays) -> ScanSource:
             if own.holds(arrays.data):
                 return own
             own.close()
-        found = (kind.at(path, arrays) for kind in FORMATS)
-        return next(source for source in found if source is not None)  # the reader `stacks` accepts any file
+        sources = (kind.at(path, arrays) for kind in FORMATS)
+        return next(source for source in sources if source is not None)  # the reader `stacks` accepts any file
 
 
 def references_in(path: Path, file: h5py.File, kind: FrameKind) -> ScanSource | None:
@@ -89,8 +89,8 @@ def references_in(path: Path, file: h5py.File, kind: FrameKind) -> ScanSource | 
         if own.table.has(kind):
             return own
         own.close()
-    found = (each.references(path, file, kind) for each in FORMATS)
-    return next((source for source in found if source is not None), None)
+    sources = (each.references(path, file, kind) for each in FORMATS)
+    return next((source for source in sources if source is not None), None)
 
 
 def scan_format(path: Path) -> str | None:

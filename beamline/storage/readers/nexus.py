@@ -134,27 +134,29 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
     return changing or rotations
 
 
-def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
+def choose(file: h5py.File, detectors: list[Places], data: str | None = None) -> Places:
     """The one detector to read: the one whose frames are `data`, or the one named by `default` of file and entry.
 
     Raises DataError if no detector, or more than one, fits.
     """
-    if not found:
+    if not detectors:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
     if data is not None:
-        return next(places for places in found if places.data == datasets.resolve(file, data))
-    if len(found) == 1:
-        return found[0]
+        return next(places for places in detectors if places.data == datasets.resolve(file, data))
+    if len(detectors) == 1:
+        return detectors[0]
     default = datasets.attribute(file, "default").strip("/")
-    named = [places for places in found if str(places.entry.name).strip("/") == default]
+    named = [places for places in detectors if str(places.entry.name).strip("/") == default]
     plotted = [places for places in named if _is_default(places)]
     for some in (named, plotted):
         if len(some) == 1:
             return some[0]
-    names = ", ".join(f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in found[:_LISTED])
+    names = ", ".join(
+        f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in detectors[:_LISTED]
+    )
     raise DataError(
         f"{file.filename} has several detectors with frames, and no attribute `default` names one of "
-        f"them: {names}. Choose one: --data-path {found[0].data.name}."
+        f"them: {names}. Choose one: --data-path {detectors[0].data.name}."
     )
 
 
@@ -225,8 +227,8 @@ def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> 
     """
     pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
     pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
-    at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
-    return math.nan if at is None else places.data.shape[2 - along] - 1 - at if reverse else at
+    pixel = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
+    return math.nan if pixel is None else places.data.shape[2 - along] - 1 - pixel if reverse else pixel
 
 
 def _cone_of(

@@ -59,8 +59,8 @@ class NexusSource(ScanSource):
         """
         self.path, self._file, self._own_angles, self.n = path, file, own_angles, 0
         self._mirrored_by, self._remarks = (False, False), dict[str, str]()
-        found = find(file)
-        self._places = places = choose(file, found, data)
+        detectors = find(file)
+        self._places = places = choose(file, detectors, data)
         self._check()
         shape = places.data.shape
         self.shape = (int(shape[1]), int(shape[2]))
@@ -78,7 +78,7 @@ class NexusSource(ScanSource):
         self.row_pitch_mm = differing(height, self.pixel_size_mm)
         self.pixel_mask = self._mask()
         self.refresh()
-        self._find_unused(found if data is None else [], geometry.turned)
+        self._find_unused(detectors if data is None else [], geometry.turned)
 
     def _mask(self) -> Mask | None:
         """The pixels that the mask of NXdetector marks for any reason. None if there is no mask with the shape of the
@@ -165,10 +165,10 @@ class NexusSource(ScanSource):
         values = np.ravel(datasets.values_of(item))[: self.n].astype(np.float64)
         return np.where(values > 0, values, np.nan)
 
-    def _find_unused(self, found: list[Places], turned: str) -> None:
+    def _find_unused(self, detectors: list[Places], turned: str) -> None:
         """Find the fields, other scans and rotations of the detector that the file states and that are not used."""
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
-        for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
+        for other in {str(each.data.name): each for each in detectors if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
             why = f"it is another scan in this file; --data-path {where} selects it"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
@@ -236,12 +236,12 @@ NUMBERS = (
 def stated_facts(entry: h5py.Group, exposures: NDArray[np.float64]) -> dict[str, str | float | int]:
     """The facts of a scan in an entry: sample, title, times, distances, exposure."""
     facts: dict[str, str | float | int] = {}
-    for name, at in TEXTS.items():
-        value = datasets.text_at(entry, at)[: datasets.NAME]
+    for name, path in TEXTS.items():
+        value = datasets.text_at(entry, path)[: datasets.NAME]
         if value:
             facts[name] = value
-    for name, at, units in NUMBERS:
-        number = datasets.scalar(entry, at, units)
+    for name, path, units in NUMBERS:
+        number = datasets.scalar(entry, path, units)
         if number is not None:
             facts[name] = number
     if "exposure_s" not in facts and np.isfinite(exposures).any():
@@ -282,7 +282,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return bool(find(file))
 
 
-def _at(path: Path, arrays: NamedArrays) -> NexusSource | None:
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> NexusSource | None:
     """The scan of the detector to which these frames belong."""
     if not arrays.alone or holds_arrays(path):
         return None
@@ -303,6 +303,6 @@ FORMAT = ScanFormat(
     "an NXdetector with frames and an image_key (NXtomo)",
     _recognises,
     lambda path, opening: open_nxtomo(path, follow=opening.follow, own_angles=opening.own_angles),
-    _at,
+    _scan_of_arrays,
     _references,
 )

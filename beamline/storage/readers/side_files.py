@@ -172,13 +172,13 @@ def side_of(source: ScanSource) -> SideFile | None:
     """
     if not source.side_files:
         return None
-    views, found = source.table.views.size, []
+    views, sides = source.table.views.size, []
     for path in _candidates(source.path):
         # these files are only read to make a suggestion, so no content of theirs may raise an error
         with suppress(Exception):
-            found.append(read_side_file(path))
-    found = [side for side in found if side.count == views]
-    return found[0] if len(found) == 1 else None
+            sides.append(read_side_file(path))
+    sides = [side for side in sides if side.count == views]
+    return sides[0] if len(sides) == 1 else None
 
 
 def reconstructed_pixel_mm(log: Path) -> float | None:

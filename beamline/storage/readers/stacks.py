@@ -321,8 +321,8 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return isinstance(data, h5py.Dataset) and datasets.attribute(data, "data_type") == "AcquisitionData"
 
 
-def _at(path: Path, arrays: NamedArrays) -> StacksSource:
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> StacksSource:
     return open_stacks(path, arrays.data, arrays.darks, arrays.flats, arrays.angles)
 
 
-FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL), _at)
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL), _scan_of_arrays)

@@ -112,9 +112,9 @@ class CoarseViews:
         cols = one.shape[1]
         for reach in (cols // 4, cols // 2):
             curve = mirror_mismatch(one, other, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
-            at = int(np.argmin(curve))
-            if 0 < at < 2 * reach:
-                below, here, above = curve[at - 1 : at + 2]
+            lowest = int(np.argmin(curve))
+            if 0 < lowest < 2 * reach:
+                below, here, above = curve[lowest - 1 : lowest + 2]
                 return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
         return float(curve.min())
 

@@ -132,26 +132,26 @@ class ScanEvidence:
         """
         if not self.in_counts:
             return ()
-        darks, found = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
+        darks, findings = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
         for start, end in pairwise([*self.table.part_starts.tolist(), len(self.table)]):
             flats = [group for group in self.taken.flats if start <= group[0] < end]
             seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
             if flats or not self.taken.flats:
                 shown = Evidence((*darks, *seen), self._views_beside(views, flats))
-                found |= dict.fromkeys(reference_findings(shown, self.asked.limits))
-        rows = {row for finding in found for row in finding.frames}
+                findings |= dict.fromkeys(reference_findings(shown, self.asked.limits))
+        rows = {row for finding in findings for row in finding.frames}
         good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
         return tuple(
             replace(each, severity="warning") if each.frames and self.table.kind(each.frames[0]) in good else each
-            for each in found
+            for each in findings
         )
 
     def _views_beside(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
         """Some projections from the whole part of the scan, and some next to its flats."""
         chosen = set(spread(views, VIEWS).tolist())
         for group in flats:
-            at = int(np.searchsorted(views, group[0]))
-            chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
+            place = int(np.searchsorted(views, group[0]))
+            chosen.update(views[max(place - BESIDE, 0) : place + BESIDE].tolist())
         return self._readable(np.array(sorted(chosen), np.int64))
 
     def _readable(self, rows: I64) -> tuple[FrameStatistics, ...]:
@@ -175,7 +175,8 @@ class ScanEvidence:
 
         def levelled(part: str) -> F32:
             darks = [
-                (s, np.mean([getattr(self._as_it_is(at), part) for at in rows.tolist()], axis=0)) for s, rows in groups
+                (s, np.mean([getattr(self._as_it_is(dark_row), part) for dark_row in rows.tolist()], axis=0))
+                for s, rows in groups
             ]
             own = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
             level = darks[0][1] + (getattr(frame, part) - own) * np.float32(usual / frame.exposure)

@@ -104,13 +104,13 @@ def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
 def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
     """In a cone beam, the central ray that the file or the caller states meets the middle row and the rotation axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
-    for (side, taken, option), at, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
-        if scan.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
+    for (side, taken, option), position, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
+        if scan.cone is not None and abs(position - (n - 1) / 2) > _OFF_MIDDLE * n:
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"Give {option} {at:.6g} if the file is right: it states that the central ray meets "
-                f"{side} {at:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
+                f"Give {option} {position:.6g} if the file is right: it states that the central ray meets "
+                f"{side} {position:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
                 f"assumes {taken}.",
             )
 

@@ -42,7 +42,7 @@ def entries() -> Registry[FormatEntry]:
     """The formats of this package and of add-ons, by name."""
     taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
 
-    def made(name: str, kind: type[Any]) -> FormatEntry:
+    def entry_of(name: str, kind: type[Any]) -> FormatEntry:
         suffixes = tuple(kind().suffixes)
         if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
             raise ValueError(
@@ -55,7 +55,7 @@ def entries() -> Registry[FormatEntry]:
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)
 
-    return Registry("volume_format", REGISTRY, made)
+    return Registry("volume_format", REGISTRY, entry_of)
 
 
 @cache

@@ -82,10 +82,10 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     stored = data.create_dataset("data", (*several, *shape), np.float32, chunks=chunk)
     if empty:
         stored[-1, -1, -1] = 0  # allocates the space
-    for at, one in zip(np.ndindex(several), voxels, strict=True):
+    for index, one in zip(np.ndindex(several), voxels, strict=True):
         # writes in pieces, so that a signal need not wait for the whole volume
         for first in range(0, 0 if empty else shape[0], _SLAB):
-            stored[(*at, slice(first, first + _SLAB))] = one[first : first + _SLAB]
+            stored[(*index, slice(first, first + _SLAB))] = one[first : first + _SLAB]
             file.require_taken()
     if record.series is not None:
         data["time"] = record.series.seconds
@@ -211,7 +211,7 @@ def volumes_in_time(file: h5py.File) -> int:
     return int(stored.shape[0]) if stored.ndim == 4 else 0
 
 
-def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
+def _read_entry(entry: h5py.Group, number: int | None) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
     z, y, x = (np.asarray(datasets.values_of(data[name])) for name in ("z", "y", "x"))
     # An axis with one voxel does not show the voxel size, and a longer axis shows it more precisely. Slices may be
@@ -221,9 +221,9 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
     pitch = None if height is None or math.isclose(height, size, rel_tol=1e-3) else height
     centre = tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x))
     stored, series = data["data"], None
-    if at is not None:
+    if number is not None:
         series = VolumeSeries(np.asarray(data["time"][:]), stored)
-        stored = series.each()[at]
+        stored = series.each()[number]
     grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
     parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(

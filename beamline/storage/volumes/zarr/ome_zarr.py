@@ -111,7 +111,7 @@ def _ome(record: ReconRecord, levels: list[tuple[int, int, int]]) -> dict[str, A
     for n, shape in enumerate(levels):
         if n:
             halved = [2 if a > b else 1 for a, b in zip(levels[n - 1], shape, strict=True)]
-            first = [at + size * (by - 1) / 2 for at, size, by in zip(first, edge, halved, strict=True)]
+            first = [centre + size * (by - 1) / 2 for centre, size, by in zip(first, edge, halved, strict=True)]
             edge = [size * by for size, by in zip(edge, halved, strict=True)]
         steps = [{"type": "scale", "scale": edge}, {"type": "translation", "translation": first}]
         datasets.append({"path": str(n), "coordinateTransformations": steps})
