@@ -178,7 +178,7 @@ def compare_with_flats(
     evidence = scan.evidence
     if evidence.beam is None or not len(projections.data):
         return {}
-    said = scan.selection.step(Air).model != "auto"  # the user states which columns are air
+    stated_by_user = scan.selection.step(Air).model != "auto"  # the user states which columns are air
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
@@ -188,7 +188,7 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in check_air_level(evidence, level, air, evidence.asked.accepted or said or not refused):
+    for finding in check_air_level(evidence, level, air, evidence.asked.accepted or stated_by_user or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}
@@ -244,10 +244,10 @@ def _steady(
         f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, must be mirror "
         f"images, but they differ by {abs(levels[first] - levels[last]):.2f} in line integral"
     )
-    at, odd = _out_of_line(levels, angles)
+    outlier, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size, more = odd, f"{odd:.2f} in line integral more than these differ from each other"
-        what = f"The intensity of the whole frame {frames[at]} differs from its neighbours in angle, by {more}"
+        what = f"The intensity of the whole frame {frames[outlier]} differs from its neighbours in angle, by {more}"
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
         "filter changed, or projections of another scan are among them. Use --views to choose "
@@ -326,7 +326,7 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     stated = pitch / geometry.sdd if geometry.is_cone else 0.0
     sinogram = data[some][:, rows].mean(axis=1, dtype=np.float64)
     off, least, usual, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
-    told, shown = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
+    stated_angle, best_angle = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
     away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
     check = (
         "Check --cone SOD:SDD: both are in mm, and SDD is the distance from the source to the detector, "
@@ -336,15 +336,15 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     )
     sentence = (
         f"{check} The projections contradict the stated geometry. A 360° scan measures each ray twice, from opposite "
-        f"sides. The two values agree best if the fan angle is {shown:.3g} degrees{away}, but it is {told:.3g} "
-        "degrees with the stated distances."
+        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{away}, but it is "
+        f"{stated_angle:.3g} degrees with the stated distances."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
     is_by_axis = abs(math.atan(best * across) - math.atan(by_axis * across)) <= _SAME_FAN
     often = _OFTEN_BY_AXIS if is_by_axis else _OFTEN
     sure = off > often * least and least < min(_AGREE, usual / 2)  # a round sample agrees with every fan
     return ConsistencyCondition(
-        "rays from both sides", abs(shown - told) if sure else np.nan, _FAN, "degrees of fan", sentence
+        "rays from both sides", abs(best_angle - stated_angle) if sure else np.nan, _FAN, "degrees of fan", sentence
     )
 
 

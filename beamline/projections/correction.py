@@ -236,9 +236,9 @@ def apply(
     if not (n := usable.size):
         raise no_view(plan.scan.evidence, plan.references)
     with refused(plan):
-        order, at = by_angle(plan.source.table, usable), usable.astype(np.float64)
+        order, positions = by_angle(plan.source.table, usable), usable.astype(np.float64)
         lines, _ = correct.apply(
-            data, at, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
+            data, positions, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
             order=order,
         )  # fmt: skip
     return plan.filters.apply(lines, rows)
@@ -287,12 +287,12 @@ def apply_in_batches(
         warn(sentence)
     if not ids.size:
         raise no_view(plan.scan.evidence, plan.references)
-    for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
-        if at != place:
-            out[at] = out[place]
+    for row, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
+        if row != place:
+            out[row] = out[place]
     masked = np.logical_and.reduce([part.masked for part in kept])
-    found = merge_and_empty(kept, out[: ids.size])
-    return replace(found, masked=masked, view_ids=ids, air=found.air[np.argsort(found.view_ids)])
+    merged = merge_and_empty(kept, out[: ids.size])
+    return replace(merged, masked=masked, view_ids=ids, air=merged.air[np.argsort(merged.view_ids)])
 
 
 def _with_air_found(

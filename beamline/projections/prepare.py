@@ -132,8 +132,8 @@ def prepare_projections(
 def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry) -> list[ViewStep]:
     """The steps whose settings follow from the corrected projections, with these settings."""
     steps = [step for step in in_order(scan.selection) if isinstance(step, EstimatedStep)]
-    found = [step.estimated(scan, projections, geometry) for step in steps]
-    return [step for step in found if step is not None]
+    estimated = [step.estimated(scan, projections, geometry) for step in steps]
+    return [step for step in estimated if step is not None]
 
 
 def require_usable(scan: SelectedScan) -> None:

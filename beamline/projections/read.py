@@ -214,8 +214,8 @@ def read_views(
         data, frames = data[alive], frames[alive]
     lit, part = np.ones(len(frames), np.bool_), filters.within(rows)
     beam = None if references is None else (references.dark[part], references.flats[0][1][part])
-    for at in np.flatnonzero(scan.suspect(data, beam)):
-        lit[at] = not scan.unlit(int(frames[at]))
+    for view in np.flatnonzero(scan.suspect(data, beam)):
+        lit[view] = not scan.unlit(int(frames[view]))
     if not lit.all():
         data, frames = data[lit], frames[lit]
     if warn is not None:
@@ -233,7 +233,7 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
     middle = data.shape[1] // 2
     # the middle row is enough to distinguish most projections quickly
     alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))
-    copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
+    copies = [int(frames[view + 1]) for view in alike if np.array_equal(data[view], data[view + 1])]
     if not copies or 2 * len(copies) >= len(frames):  # if most projections are equal, the images were computed
         return []
     return [

@@ -59,10 +59,10 @@ class _Reading:
                     used.append(frame)
                     yield image
 
-        for at, (image, n) in enumerate(without_spots(good(), self.light)):
+        for number, (image, n) in enumerate(without_spots(good(), self.light)):
             if n:
-                self.spots[used[at]] = n
-            yield used[at], image
+                self.spots[used[number]] = n
+            yield used[number], image
 
     def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
         """Mean of the usable frames, each multiplied by its weight [frame of the scan]. None if no frame is usable."""

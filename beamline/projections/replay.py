@@ -170,14 +170,14 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(source.table.replaced.tolist())
-    found = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
+    findings = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
-        references=tuple(finding.message for finding in found if finding.frames),
+        references=tuple(finding.message for finding in findings if finding.frames),
         altered=altered_sentence(source) if source.table.altered.any() else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
     )

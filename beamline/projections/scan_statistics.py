@@ -108,12 +108,12 @@ def _of_kind(
         absolute += float(np.abs(away + low).sum()) / rows.size
     mean = total / finite
     below = np.cumsum(pixels)
-    at = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
+    bins = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
     middles = (edges[1:] + edges[:-1]) / 2
     full = float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
     return KindStatistics(
         kind, rows.size, of, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
-        tuple(float(middles[i]) for i in at), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
+        tuple(float(middles[i]) for i in bins), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
         edges, pixels, absolute,
     )  # fmt: skip
 

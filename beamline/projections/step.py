@@ -56,8 +56,8 @@ def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
     """A field of a step that the option `name` sets. `rest` are the other attributes of `Option`. Field and option have
     the same default.
     """
-    made = Option(name, help, default, **rest)
-    return field(default=None if default is None else made.parse(default), metadata={"option": made})
+    description = Option(name, help, default, **rest)
+    return field(default=None if default is None else description.parse(default), metadata={"option": description})
 
 
 def options_of(step: type[NamedStep]) -> dict[str, Option]:

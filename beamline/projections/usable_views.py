@@ -63,22 +63,22 @@ class Regions:
         height, width = shape
         weights = np.ones((view_ids.size, height, width), np.float32)
         seen = None if self.resampling is None else self.resampling.places(shape, rows.start)
-        at = {int(frame): view for view, frame in enumerate(view_ids)}
+        view_of = {int(frame): view for view, frame in enumerate(view_ids)}
         for frame, (top, bottom, left, right), share in zip(
             self.frames[chosen].tolist(), self.boxes[chosen].tolist(), self.shares[chosen].tolist(), strict=True
         ):
             if seen is not None:
                 row, col = seen
                 inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
-                weights[at[frame]][inside] *= share
+                weights[view_of[frame]][inside] *= share
                 continue
             first, end = max(top - rows.start, 0), max(bottom - rows.start, 0)
             if not any(edge % binning for edge in (first, end, left, right)):
-                weights[at[frame], first // binning : end // binning, left // binning : right // binning] *= share
+                weights[view_of[frame], first // binning : end // binning, left // binning : right // binning] *= share
                 continue
             fine = np.ones((1, height * binning, width * binning), np.float32)
             fine[0, first:end, left:right] = share
-            weights[at[frame]] *= bin_views(fine, binning)[0]
+            weights[view_of[frame]] *= bin_views(fine, binning)[0]
         return weights
 
 

@@ -271,11 +271,11 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
             both = frames[row_of_frame[frames] >= 0]
             off = np.abs(table.angles_deg[row_of_frame[both]] - degrees[both])
             if (off > tolerance).any():
-                at = int(both[off > tolerance][0])
-                stated = table.angles_deg[row_of_frame[at]]
+                frame = int(both[off > tolerance][0])
+                stated = table.angles_deg[row_of_frame[frame]]
                 raise DataError(
-                    f"{table.path} states frame {at} at {stated:.6g} degrees, but {source.path} at "
-                    f"{degrees[at]:.6g}; expected the poses of the same scan."
+                    f"{table.path} states frame {frame} at {stated:.6g} degrees, but {source.path} at "
+                    f"{degrees[frame]:.6g}; expected the poses of the same scan."
                 )
     return row_of_frame
 

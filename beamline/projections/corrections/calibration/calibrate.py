@@ -164,8 +164,8 @@ class Calibrated:
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The calibrated geometry of these rows of the file, which may be binned."""
-        at = np.searchsorted(self.frames, view_ids)
-        change = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
+        index = np.searchsorted(self.frames, view_ids)
+        change = replace(self.change, shifts=self.change.shifts[index], axis=self.axis)
         return with_pivot(change.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
 
 

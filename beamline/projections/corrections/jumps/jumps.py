@@ -117,9 +117,9 @@ def find_jumps(
     runs, most = [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # projections between two alarms are left out of the comparison
-    real, at, n = list[int](), 0, 0
-    while at < len(runs):
-        run, clearest, best = np.intersect1d(runs[at], steady), 1.0, 0
+    real, number, n = list[int](), 0, 0
+    while number < len(runs):
+        run, clearest, best = np.intersect1d(runs[number], steady), 1.0, 0
         for row in jumps.tolist():
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
@@ -128,9 +128,9 @@ def find_jumps(
                     clearest, best = clear, row
         if best:
             real.append(best)
-            runs[at : at + 1] = [runs[at][runs[at] < best], runs[at][runs[at] >= best]]
+            runs[number : number + 1] = [runs[number][runs[number] < best], runs[number][runs[number] >= best]]
         else:
-            at += 1
+            number += 1
     kept = max(runs, key=len)
     if real:  # it is not known either to which side these projections belong
         inner = np.intersect1d(kept, steady)
