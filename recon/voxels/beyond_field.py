@@ -125,8 +125,8 @@ def _is_tall(views: Views) -> bool:
     if not geometry.is_cone or not len(data) or geometry.is_fan:
         return False
     if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows in most projections
-        at = geometry.offsets[:, 1]
-        lowest, highest = np.nan_to_num(data[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
+        heights = geometry.offsets[:, 1]
+        lowest, highest = np.nan_to_num(data[[heights.argmax(), heights.argmin()]], posinf=0, neginf=0).mean(axis=2)
         return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
     rows = np.nan_to_num(data[spread(np.arange(len(data)), _ROWS_FROM)], posinf=0, neginf=0).mean(axis=(0, 2))
     return bool(ends_in_matter(rows[None]).any())

@@ -95,7 +95,7 @@ class TrialChoice(NamedTuple):
     def of(cls, values: Sequence[Any]) -> TrialChoice:
         """Convert a choice, or its values from a file (see `Decisions`), to a choice."""
         where, least_gain, predictions = values
-        named = ((name, left, prior and Prior.of(prior), remark) for name, left, prior, remark in predictions)
+        named = ((name, residuals, prior and Prior.of(prior), remark) for name, residuals, prior, remark in predictions)
         return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> TrialChoice:
@@ -108,14 +108,14 @@ class TrialChoice(NamedTuple):
 
         A candidate whose residual is not finite was stopped or diverged, and counts as not tried.
         """
-        given = {at: each.residuals for at, each in enumerate(self.predictions) if each.residuals is not None}
-        return {at: np.asarray(left) for at, left in given.items() if np.isfinite(left).all()}
+        given = {number: each.residuals for number, each in enumerate(self.predictions) if each.residuals is not None}
+        return {number: np.asarray(residuals) for number, residuals in given.items() if np.isfinite(residuals).all()}
 
     @property
     def best(self) -> int | None:
         """Number of the candidate with the smallest mean residual; None: no candidate was tried."""
         tried = self.tried
-        return min(tried, key=lambda at: float(tried[at].mean()), default=None)
+        return min(tried, key=lambda number: float(tried[number].mean()), default=None)
 
     @property
     def least(self) -> F64 | None:
@@ -135,7 +135,9 @@ class TrialChoice(NamedTuple):
         """Number of the simplest candidate that the best one does not beat significantly; None: none was tried."""
         if (least := self.least) is None:
             return None
-        return next(at for at, each in self.tried.items() if not significantly_better(least, each, self.least_gain))
+        return next(
+            number for number, each in self.tried.items() if not significantly_better(least, each, self.least_gain)
+        )
 
     @property
     def verdicts(self) -> list[str]:
@@ -145,8 +147,8 @@ class TrialChoice(NamedTuple):
         tried, least, words = self.tried, self.least, [""] * len(self.predictions)
         if least is None or all((1 - self.least_gain) * each.mean() <= least.mean() for each in tried.values()):
             return words
-        for at, each in tried.items():
-            words[at] = "best" if at == self.best else "alike" * predicts_as_well(each, least)
+        for number, each in tried.items():
+            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, least)
         return words
 
     @property
@@ -174,7 +176,7 @@ class TrialChoice(NamedTuple):
         if self.at is None or self.best is None or self.at == self.best:
             return ""
         (simple, of_simple), (best, of_best) = (
-            (self.predictions[at].name, self.tried[at]) for at in (self.at, self.best)
+            (self.predictions[number].name, self.tried[number]) for number in (self.at, self.best)
         )
         improvement, error = (
             (of_simple - of_best).mean() / of_simple.mean(),
@@ -219,13 +221,13 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Be
     if math.isinf(mean(1)) or math.isinf(mean(0)):
         return None
     up = not exceeds_standard_error(tried[1] - tried[0], _ERRORS)
-    at, towards = (1, 1) if up else (0, -1)
-    while abs(at + towards) <= _OCTAVES:
-        if math.isinf(mean(at + towards)):
+    place, towards = (1, 1) if up else (0, -1)
+    while abs(place + towards) <= _OCTAVES:
+        if math.isinf(mean(place + towards)):
             return None
-        if exceeds_standard_error(tried[at + towards] - tried[at], _ERRORS if up else 0.0):
+        if exceeds_standard_error(tried[place + towards] - tried[place], _ERRORS if up else 0.0):
             break
-        at += towards
+        place += towards
     octave = min(tried, key=mean)
     vertex = float(octave)
     if octave - 1 in tried and octave + 1 in tried:

@@ -71,9 +71,9 @@ class Damping:
         ]
         side = max(rows, cols)
         cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
-        left = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
-        left = np.minimum(left / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
-        return (left / self.width**2).astype(np.float32)
+        transfer = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
+        transfer = np.minimum(transfer / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
+        return (transfer / self.width**2).astype(np.float32)
 
     def cells(self, device: VoxelDevice[Any], x: Any) -> Any:
         """The sums of a volume [y, x, z] in coarse cells, on which L acts."""

@@ -112,10 +112,10 @@ def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: 
     """
     if factor == 1:
         return images
-    scale, made = np.full(2, factor), np.empty_like(images)
+    scale, resampled = np.full(2, factor), np.empty_like(images)
     for view, image in enumerate(images):
-        affine_transform(image, scale, (1 - scale) * centre, output=made[view], order=order)
-    return made
+        affine_transform(image, scale, (1 - scale) * centre, output=resampled[view], order=order)
+    return resampled
 
 
 def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
@@ -182,8 +182,8 @@ def judge(
     alone = problem.volume(moves, used[parts[used] == problem.longest])
 
     def deviations(volume: Volume) -> NDArray[np.float64]:
-        left, weight = problem.residual(volume, moves, held)
-        return np.sqrt((left**2).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1))
+        residual, weight = problem.residual(volume, moves, held)
+        return np.sqrt((residual**2).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1))
 
     def typical(each: NDArray[np.float64], part: int) -> float:
         own = each[parts[held] == part]
@@ -260,15 +260,15 @@ class _Problem:
         trial = TRIAL * np.array([pitch, pitch, pitch, 1 / half, pitch, 1 / half])
         now = np.array([move.x, move.y, move.z, move.turn, move.image, move.magnification])
 
-        def shown(at: NDArray[np.float64]) -> F32:
-            moved = displaced(geometry, all_one, [Displacement(*at.tolist())])
+        def shown(values: NDArray[np.float64]) -> F32:
+            moved = displaced(geometry, all_one, [Displacement(*values.tolist())])
             return Projector(moved, self.grid).forward(volume.data)
 
         data, _, rays = _Problem(self.projections[views], geometry, all_one, self.known).corrected(
             [move], np.arange(views.size)
         )
         image = shown(now)
-        left = _without_smooth(data - image, rays)
+        residual = _without_smooth(data - image, rays)
         change: list[NDArray[np.floating]] = []
         for i in range(5 if self.optics else 4):
             step = np.where(np.arange(now.size) == i, trial, 0)
@@ -277,7 +277,7 @@ class _Problem:
             change.append(_without_smooth(trial[5] * _outwards(image, geometry), rays))
         across = np.stack(change).reshape(len(change), views.size, -1)
         normal = np.einsum("avp,bvp,v->ab", across, across, weight, optimize=True)
-        slope = np.einsum("avp,vp,v->a", across, left.reshape(views.size, -1), weight, optimize=True)
+        slope = np.einsum("avp,vp,v->a", across, residual.reshape(views.size, -1), weight, optimize=True)
         best = np.zeros(now.size)
         best[: len(change)] = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
         longest = float(np.abs(best).max()) * TRIAL

@@ -73,8 +73,8 @@ class HalfVoxels(VoxelMethod):
         """For "best", the method ends nearer to the minimum and uses half voxels; for "preview", it ends farther from
         the minimum.
         """
-        made, wanted = with_quality(self, quality), _BY_QUALITY[quality]
-        return made if wanted is None else with_halves(made, wanted)
+        changed, wanted = with_quality(self, quality), _BY_QUALITY[quality]
+        return changed if wanted is None else with_halves(changed, wanted)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory in bytes: on half voxels, volumes are four times as large, and no FBP is made."""
@@ -105,14 +105,14 @@ class HalfVoxels(VoxelMethod):
             return x
         before = 0 if decide.ended is None else decide.ended.after
         fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
-        made = ordered_fista(
+        on_halves = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
             prox=tv_prox(fine, tv_steps), pull=None if pull is None else pull(fine, start), still=self.still,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
         ny, nx, nz = x.shape
-        return made.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
+        return on_halves.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
 
 
 def with_halves(method: MethodT, wanted: bool) -> MethodT:

@@ -120,8 +120,8 @@ def solve_views(
     """`solve` for projections in the projector's geometry, with their weights and the reach of the sample."""
     problem, lines = scaled_problem(projector, views, start, nonnegative, go_on or GoesOn(), decide or Decisions())
     with threads_for(projector.grid):
-        found = method.iterate(problem, lines)
-    return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
+        solution = method.iterate(problem, lines)
+    return Volume(volume_slices(times_power(solution, problem.units.density)), projector.grid)
 
 
 @contextmanager

@@ -106,15 +106,15 @@ class Subsets:
             step = cls.of(problem.with_all_columns(), count, to_the_end=False).step
         nz, ny, nx = projector.grid.shape
         undamped = Damping((ny, nx, nz), 1.0)
-        made = cls(views, projectors, step, norm, to_the_end, undamped, step, undamped)
+        subsets = cls(views, projectors, step, norm, to_the_end, undamped, step, undamped)
         of_subset, of_all = (Damping.of(undamped.shape, n) for n in (len(views[heaviest]), projector.geometry.n_views))
         covered = float(angular_weights(projector.geometry.angles).sum()) / math.pi
         if not to_the_end or of_subset.gain == 1 or covered < _LEAST_COVERED:
-            return made
+            return subsets
         longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], of_subset)
         if longest == 0 or longest < _LEAST_PACE * own:  # 0: no ray crosses the box
-            return made
-        return replace(made, damping=of_subset, damped_step=longest, damping_of_all=of_all)
+            return subsets
+        return replace(subsets, damping=of_subset, damped_step=longest, damping_of_all=of_all)
 
     @property
     def is_damped(self) -> bool:
@@ -215,13 +215,13 @@ class _Descent:
         """One pass over all projections. `go_ahead` adds the momentum after its last step."""
         self.error, self.seen = 0.0, []
         parts = self._parts if on_subsets else [self._all]
-        count, made = len(parts), self._subsets
-        damping, share = (made.damping, 1.0) if on_subsets else (made.damping_of_all, 1 / len(self._parts))
+        count, subsets = len(parts), self._subsets
+        damping, share = (subsets.damping, 1.0) if on_subsets else (subsets.damping_of_all, 1 / len(self._parts))
         mu = weight.value / count
-        for at, s in enumerate(self._problem.rng.permutation(count)):
+        for step, s in enumerate(self._problem.rng.permutation(count)):
             self._residual(parts[s], count, looked_at)
-            self._step(mu, count, damping, made.step * share, made.damped_step * share)
-            if at + 1 < count:
+            self._step(mu, count, damping, subsets.step * share, subsets.damped_step * share)
+            if step + 1 < count:
                 self._ahead(self.x)
 
     def go_ahead(self) -> None:

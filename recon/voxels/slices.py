@@ -102,11 +102,11 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
             filtered += continued(beyond, data[part], weights[part])
         columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))
         for angle, shift, view in zip(geometry.angles[part], geometry.shifts[part, 0], columns, strict=True):
-            at = (points[0] * math.cos(angle) + points[1] * math.sin(angle)) / pitch
-            at += geometry.axis_col + shift + zeros[0]
-            low = np.clip(np.floor(at).astype(np.intp), 0, len(view) - 2)
-            near = (at - low).astype(np.float32)[:, None]
-            seen = ((at >= -0.5) & (at <= len(view) - 0.5)).astype(np.float32)[:, None]
+            cols = (points[0] * math.cos(angle) + points[1] * math.sin(angle)) / pitch
+            cols += geometry.axis_col + shift + zeros[0]
+            low = np.clip(np.floor(cols).astype(np.intp), 0, len(view) - 2)
+            near = (cols - low).astype(np.float32)[:, None]
+            seen = ((cols >= -0.5) & (cols <= len(view) - 0.5)).astype(np.float32)[:, None]
             np.clip(near, 0, 1, out=near)
             out += seen * ((1 - near) * view[low] + near * view[low + 1])
     return out

@@ -81,5 +81,5 @@ def with_quality(method: MethodT, quality: Quality) -> MethodT:
     """
     still, longer = _QUALITIES[quality]
     settings: Any = method
-    made: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
-    return made
+    changed: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
+    return changed

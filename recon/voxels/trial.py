@@ -294,10 +294,10 @@ class Trial:
         """
         smooth = self.volume_of_weight(weight) if self.smooth is None else self.smooth
 
-        def made(strength: float) -> F32:
+        def volume_of(strength: float) -> F32:
             return self.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), smooth)
 
-        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, made), first)
+        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, volume_of), first)
         if best is not None:
             self._known["patches", best.strength] = best.residuals
         return best
@@ -375,15 +375,15 @@ class Trial:
     def predicted(self, method: Method) -> Prediction:
         """The prediction of a method's own volume, made from the projections that are not held out."""
         views = self.views_of(method)
-        made = method.run(views, self.control)
-        return self.prediction(method.name, self.residuals(self.lines_of(made.volume)))
+        result = method.run(views, self.control)
+        return self.prediction(method.name, self.residuals(self.lines_of(result.volume)))
 
     def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
         """A prediction in the units of the scan; `prior` is in the units of the problem."""
         weighed = self.problem.weight is not None
         of_scan = None if prior is None or self.settings.all_rows else self.problem.units.prior(prior, weighed, 1)
-        left = None if residuals is None else self.in_line_integrals(residuals).tolist()
-        return Prediction(name, left, of_scan, remark)
+        values = None if residuals is None else self.in_line_integrals(residuals).tolist()
+        return Prediction(name, values, of_scan, remark)
 
     def in_line_integrals(self, residuals: F64) -> F64:
         """Residuals in the units of the scan, including the root of the weights."""
