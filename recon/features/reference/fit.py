@@ -135,9 +135,9 @@ class StateFit:
         self._prox.about(self.m, a, np.where(inner, change, np.float32(0)).astype(np.float32))
         done = self._done
 
-        def go_on(sweep: int, left: float) -> bool:
+        def go_on(sweep: int, residual: float) -> bool:
             self._done = done + sweep
-            return self.going(self._done, left)
+            return self.going(self._done, residual)
 
         self.x = ordered_fista(
             replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=most,

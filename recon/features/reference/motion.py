@@ -62,7 +62,7 @@ class Basis:
         """The functions 1, y, x and z of an affine map. Coordinates are relative to the rotation axis, divided by half
         of `width` (mm).
         """
-        z, y, x = (np.stack((at**0, 2 * at / width), axis=1) for at in grid.coordinates())
+        z, y, x = (np.stack((coordinate**0, 2 * coordinate / width), axis=1) for coordinate in grid.coordinates())
         used = (np.add.outer(np.add.outer(np.arange(2), np.arange(2)), np.arange(2)) <= 1).astype(float)
         if grid.shape[0] < _TALL:
             used[:, :, 1] = 0
@@ -77,7 +77,7 @@ class Basis:
         z, y, x = grid.coordinates()
         along = round(grid.shape[0] * grid.spacing[0] / edge)
         functions = np.ones((z.size, 1)) if along < 2 else _splines(z - z.mean(), edge, along)
-        rows, cols = (_splines(at, edge, intervals) for at in (y, x))
+        rows, cols = (_splines(coordinate, edge, intervals) for coordinate in (y, x))
         used = np.ones((intervals + 3, intervals + 3, functions.shape[1]))
         return cls(rows, cols, functions, used, 2 + (grid.shape[0] >= _TALL), intervals)
 
@@ -120,9 +120,9 @@ class Basis:
         return np.einsum("py,qx,rz,ayxz->apqr", y, x, z, u[: self.axes], optimize=True)
 
 
-def _splines(at: F64, edge: float, intervals: int) -> F64:
+def _splines(coordinate: F64, edge: float, intervals: int) -> F64:
     """Cubic B-splines [place, function] on intervals as long as `edge`, around 0."""
-    t = np.abs(at[:, None] / edge - (np.arange(intervals + 3) - (intervals + 2) / 2))
+    t = np.abs(coordinate[:, None] / edge - (np.arange(intervals + 3) - (intervals + 2) / 2))
     return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0) ** 3 / 6)
 
 
@@ -165,25 +165,27 @@ class Moved:
 
     def _places(self) -> list[F32]:
         places = []
-        for axis, (at, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
-            own = (np.arange(n, dtype=np.float32) + at).reshape([-1 if a == axis else 1 for a in range(3)])
+        for axis, (start, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
+            own = (np.arange(n, dtype=np.float32) + start).reshape([-1 if a == axis else 1 for a in range(3)])
             places.append(own + self.u[axis])
         return places
 
     def labels(self) -> np.ndarray:
         """The particle of each voxel [y, x, z] of the state."""
         label = self.particles.label
-        nearest = (np.rint(at).astype(int).clip(0, n - 1) for at, n in zip(self._places(), label.shape, strict=True))
+        nearest = (
+            np.rint(place).astype(int).clip(0, n - 1) for place, n in zip(self._places(), label.shape, strict=True)
+        )
         return label[tuple(nearest)]
 
     def known(self) -> np.ndarray:
         """bool [y, x, z], True for voxels of the state whose place is inside the known part of the reference."""
         places, shape = self._places(), self.particles.label.shape
         inside = np.ones(self.u.shape[1:], bool)
-        for at, n in zip(places, shape, strict=True):
-            inside &= (at > -0.5) & (at < n - 0.5)
+        for place, n in zip(places, shape, strict=True):
+            inside &= (place > -0.5) & (place < n - 0.5)
         if self.radius < math.inf:
-            y, x = (at - (n - 1) / 2 for at, n in zip(places[:2], shape[:2], strict=True))
+            y, x = (place - (n - 1) / 2 for place, n in zip(places[:2], shape[:2], strict=True))
             inside &= np.hypot(y, x) < self.radius
         return inside
 
@@ -232,12 +234,12 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     slopes = slopes[: basis.axes] * known
     parts = [moved.pulled(smooth(part)) * known for part in (own.ground, own.above)] if with_gains else []
     lines = views.lines - views.projector.forward_lines(beside) if beside.any() else views.lines
-    left = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
-    left = left - views.projector.forward_lines(now * known)
-    n, n_views = slopes.shape[2], len(left)
+    residual = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
+    residual = residual - views.projector.forward_lines(now * known)
+    n, n_views = slopes.shape[2], len(residual)
     kept, size = basis.squared().back(slopes**2), math.prod(basis.shape)
     share = 1.0 if views.weight is None else float(views.weight.mean())
-    stiff = float(views.weighed(left**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
+    stiff = float(views.weighed(residual**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
 
     def forward(v: F64) -> F32:
         change = np.einsum("ayxz,ayxz->yxz", slopes, basis.field(v[:size].reshape(basis.shape)))
@@ -258,7 +260,7 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     of_u = share * 4 * kept + 6 * stiff / n_views
     scale = np.concatenate((of_u.ravel(), [share * float(np.square(part).sum()) * n / 4 for part in parts]))
     step = _conjugate(
-        normal, back(views.weighed(left)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
+        normal, back(views.weighed(residual)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
     )
     u, gains = moved.u.copy(), moved.gains.copy()
     u[: basis.axes] += basis.field(step[:size].reshape(basis.shape))
@@ -308,10 +310,10 @@ def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
         c = _turned(basis, turn, (0.0, 0.0, 0.0), width / grid.voxel_size)
         there = replace(still, u=padded(basis.field(c)))
         product = fft.irfftn(target * np.conj(fft.rfftn(band(there.pulled(reference)))), s=band(x).shape)
-        at = [np.arange(-m, m + 1) for m in (most, most, along)]
-        some = product[np.ix_(*at)]
+        offsets = [np.arange(-m, m + 1) for m in (most, most, along)]
+        some = product[np.ix_(*offsets)]
         j, i, k = np.unravel_index(some.argmax(), some.shape)
-        shift = (-factor * float(at[0][j]), -factor * float(at[1][i]), -float(at[2][k]))
+        shift = (-factor * float(offsets[0][j]), -factor * float(offsets[1][i]), -float(offsets[2][k]))
         if some.max() > best[0]:
             best = float(some.max()), _turned(basis, turn, shift, width / grid.voxel_size)
     return np.asarray(best[1])

@@ -109,9 +109,9 @@ def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape
         (np.roll(wider, -1, axis) - np.roll(wider, 1, axis))[1:-1, 1:-1, 1:-1] / 2 for axis in range(3)
     ])  # fmt: skip
     laplacian = 6 * shown - sum(np.roll(wider, s, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for s in (-1, 1))
-    at = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
+    distances = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
           for axis, (a, b, c) in enumerate(zip(low, high, place, strict=True))]  # fmt: skip
-    growth = -sum(away * slope for away, slope in zip(at, slopes, strict=True)) / scale
+    growth = -sum(away * slope for away, slope in zip(distances, slopes, strict=True)) / scale
     columns = np.concatenate((shown[None], gain * growth[None], -gain * slopes)).astype(np.float32)
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
     return Patch((box[0], box[1], box[2]), columns, laplacian.astype(np.float32))
@@ -152,7 +152,7 @@ class Linear:
 
     Attributes:
         patches: the particles in the state; None for a particle outside.
-        left: residual of the projections for the estimate.
+        residual: projections minus the projections of the estimate.
         blocks: [particle, 5, 5], approximate normal matrix of each particle without the others.
     """
 
@@ -160,7 +160,7 @@ class Linear:
     bodies: Sequence[Body]
     now: ParticleEstimate
     patches: list[Patch | None]
-    left: F32
+    residual: F32
     blocks: F64
     others: F64
     prior: F64
@@ -175,7 +175,7 @@ class Linear:
         for patch, gain in zip(patches, now.gain, strict=True):
             if patch is not None:
                 volume[patch.box] += np.float32(gain) * (patch.columns[0] + np.float32(now.sharper) * patch.laplacian)
-        left = views.lines - views.projector.forward_lines(volume)
+        residual = views.lines - views.projector.forward_lines(volume)
         mean = float(views.weight[views.weight > 0].mean()) * views.projector.geometry.n_views
         edge = views.projector.grid.voxel_size
         blocks = np.stack([
@@ -184,9 +184,9 @@ class Linear:
             else mean * edge**2 * gram(patch.columns[..., views.known[patch.box[2]]])
             for patch in patches
         ])  # fmt: skip
-        noise = float((views.weight * left**2).sum() / max(views.weight.sum(), 1e-30)) * float(views.weight.mean())
+        noise = float((views.weight * residual**2).sum() / max(views.weight.sum(), 1e-30)) * float(views.weight.mean())
         prior = noise / np.square(_PRIOR)
-        linear = cls(views, bodies, now, patches, left, blocks, np.ones(2), prior)
+        linear = cls(views, bodies, now, patches, residual, blocks, np.ones(2), prior)
         units = []
         for k in range(2):
             rays = views.projector.forward_lines(linear._volume(np.zeros((len(patches), UNKNOWNS)), np.eye(2)[k]))
@@ -252,11 +252,11 @@ class Linear:
         for k in (0, 1):
             some = np.sort(order[k::2])
             half = replace(
-                self, views=self.views.subset(some), left=self.left[some], blocks=self.blocks / 2,
+                self, views=self.views.subset(some), residual=self.residual[some], blocks=self.blocks / 2,
                 others=self.others / 2, prior=self.prior / 2,
             )  # fmt: skip
-            halves.append(half.solved(half.left, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
-        noise = float((self.views.weight * self.left**2).sum() / max(self.views.weight.sum(), 1e-30))
+            halves.append(half.solved(half.residual, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
+        noise = float((self.views.weight * self.residual**2).sum() / max(self.views.weight.sum(), 1e-30))
         inverse = np.linalg.inv(self.blocks + self.prior * np.eye(UNKNOWNS))
         alone = np.sqrt(noise * np.einsum("mi,kij,mj->km", MEASURED, inverse, MEASURED))
         ratio = np.abs(halves[0] - halves[1]) / 2 / alone
@@ -303,7 +303,7 @@ def improved_rounds(
     """The estimate after Gauss-Newton rounds. `iterations` has the number of iterations of each round."""
     for each in iterations:
         linear = Linear.of(views, bodies, now)
-        step = linear.solved(linear.left, each)
+        step = linear.solved(linear.residual, each)
         theta = np.clip(step[:-2].reshape(-1, UNKNOWNS), -np.array(_LARGEST), _LARGEST)
         theta[[patch is None for patch in linear.patches]] = 0
         now = replace(
@@ -330,7 +330,7 @@ def unexplained(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate
     It is subtracted so that it does not disturb the fit of the other particles. It is orthogonal to the unknowns of its
     own particle.
     """
-    left, weight = Linear.of(views, bodies, now).left, views.weight
+    residual, weight = Linear.of(views, bodies, now).residual, views.weight
 
     def back(rays: F32) -> F64:
         return (mask * views.projector.adjoint_lines(rays * weight)).ravel().astype(np.float64)
@@ -338,5 +338,5 @@ def unexplained(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate
     def normal(v: F64) -> F64:
         return back(views.projector.forward_lines(mask * v.reshape(mask.shape).astype(np.float32)))
 
-    found = conjugate(normal, back(left), lambda r: r, _CRACK)
-    return mask * found.reshape(mask.shape).astype(np.float32)
+    crack = conjugate(normal, back(residual), lambda r: r, _CRACK)
+    return mask * crack.reshape(mask.shape).astype(np.float32)

@@ -187,26 +187,26 @@ def numbers_of(reference: ReferenceParticles, fit: ParticleFit) -> StateNumbers:
     standard deviations, and its change of mass is below the median by more than one: a dark core looks like a lower
     grey level in a larger volume.
     """
-    found, deviation = fit.measured, fit.noise
+    changes, deviation = fit.measured, fit.noise
     seen = (fit.seen >= _SEEN) & fit.matches
-    gone = seen & (found[:, 0] + 1 < _GONE)
+    gone = seen & (changes[:, 0] + 1 < _GONE)
     some = seen & ~gone
     verdict = np.where(seen, np.where(gone, "gone", "as before"), "not seen").astype("<U9")
     if some.any():
         typical = some & ~reference.cut if (some & ~reference.cut).sum() >= _TYPICAL else some
-        (lost, of_mass), (wider, of_scale) = (_away(found[:, j], deviation[:, j], typical) for j in (5, 1))
+        (lost, of_mass), (wider, of_scale) = (_away(changes[:, j], deviation[:, j], typical) for j in (5, 1))
         least = np.maximum(_CLEAR * of_mass, _LEAST_CRACK)
         for name, sign in (("cracked", 1), ("closed", -1)):
             outlier = (sign * wider > _CLEAR * of_scale) & (sign * lost < -of_mass)
             verdict[some & ((sign * lost < -least) | outlier)] = name
-    found, edge = np.where(seen[:, None], found, np.nan), reference.grid.voxel_size
-    found[gone, 1:] = np.nan
+    changes, edge = np.where(seen[:, None], changes, np.nan), reference.grid.voxel_size
+    changes[gone, 1:] = np.nan
     level = np.array([body.level for body in reference.bodies])
     before = (level + reference.around) / edge
     around = reference.around * (1 + fit.estimate.rest)
-    grey = _interval((around + level * (1 + found[:, 0])) / edge, level * deviation[:, 0] / edge)
-    scale = _interval(1 + found[:, 1], deviation[:, 1])
-    shift = edge * _interval(found[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
+    grey = _interval((around + level * (1 + changes[:, 0])) / edge, level * deviation[:, 0] / edge)
+    scale = _interval(1 + changes[:, 1], deviation[:, 1])
+    shift = edge * _interval(changes[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
     return StateNumbers(grey, grey / before[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
 
 
@@ -247,9 +247,9 @@ def fit_state(
     u, turn = _moved(reference, projector, p, weight, offset)
     tell()
     places = _places_of(reference, u, offset)
-    at = _sampled(u, offset)
-    rest = ndimage.map_coordinates(reference.rest, at, order=1, mode="nearest")
-    known = ((at[2] > -0.5) & (at[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
+    sampled = _sampled(u, offset)
+    rest = ndimage.map_coordinates(reference.rest, sampled, order=1, mode="nearest")
+    known = ((sampled[2] > -0.5) & (sampled[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
     weight[:, :, ~_rows_of(known, geometry, grid)] = 0
     views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _SMOOTH), known)
     n = len(reference.bodies)
@@ -312,8 +312,8 @@ def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: 
     c = affine.nearest(moved.u)
     # Places in the reference change by the identity plus these slopes from one voxel of the state to the next.
     slopes = np.eye(3)
-    for axis, at in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
-        slopes[: affine.axes, axis] += c[:, *at] * 2 / width
+    for axis, direction in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+        slopes[: affine.axes, axis] += c[:, *direction] * 2 / width
     left, _, right = np.linalg.svd(slopes)
     for intervals, blur in _SPLINES:
         moved = improved(views, moved, Basis.splines(grid, width, intervals), blur, nothing, False)

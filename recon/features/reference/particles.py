@@ -59,9 +59,9 @@ def particles_of(volume: F32) -> Particles | None:
     if seen.size < 2 or seen.min() == seen.max():
         return None
     counts, edges = np.histogram(seen, 200)
-    at, w = (edges[1:] + edges[:-1]) / 2, np.cumsum(counts)
-    mean = np.cumsum(counts * at)
-    split = at[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
+    levels, w = (edges[1:] + edges[:-1]) / 2, np.cumsum(counts)
+    mean = np.cumsum(counts * levels)
+    split = levels[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
     solid, cross, wide = v > split, ndi.generate_binary_structure(2, 1)[..., None], _HULL + 4
     rim = ((wide, wide), (wide, wide), (0, 0))
     hull = ndi.binary_closing(np.pad(solid, rim), cross, iterations=_HULL)[wide:-wide, wide:-wide]
@@ -82,8 +82,8 @@ def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
     apart = depth + 1e-6 * np.arange(depth.size).reshape(depth.shape) / depth.size  # no two voxels have the same depth
     uphill, best = np.arange(depth.size).reshape(depth.shape), apart.copy()
     box, index = np.pad(apart, 1), np.pad(uphill, 1)
-    for at in np.ndindex(3, 3, 3):
-        part = tuple(slice(o, o + n) for o, n in zip(at, depth.shape, strict=True))
+    for corner in np.ndindex(3, 3, 3):
+        part = tuple(slice(o, o + n) for o, n in zip(corner, depth.shape, strict=True))
         better = box[part] > best
         best[better], uphill[better] = box[part][better], index[part][better]
     flat = uphill.ravel()

@@ -70,10 +70,10 @@ def _rest(problem: VoxelProblem, x: F32) -> tuple[F32, float]:
     """FBP [y, x, z] of the residual of a volume in the projections, and the norm of the residual divided by the norm of
     the projections.
     """
-    left = problem.views - problem.projector.forward_lines(x)
+    residual = problem.views - problem.projector.forward_lines(x)
     of_rays = 1.0 if problem.weight is None else problem.weight > 0
     share = math.sqrt(
-        float(np.square(left * of_rays).sum()) / max(float(np.square(problem.views * of_rays).sum()), 1e-30)
+        float(np.square(residual * of_rays).sum()) / max(float(np.square(problem.views * of_rays).sum()), 1e-30)
     )
-    filtered = replace(problem, data=left, measured=None).filtered("hann")
+    filtered = replace(problem, data=residual, measured=None).filtered("hann")
     return np.zeros_like(x) if filtered is None else filtered, share

@@ -45,8 +45,8 @@ def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
     particles.
     """
     own = moved.particles
-    left = problem.views - problem.projector.forward_lines(x)
-    d, missing = x - m, replace(problem, data=left, measured=None).filtered("hann")
+    residual = problem.views - problem.projector.forward_lines(x)
+    d, missing = x - m, replace(problem, data=residual, measured=None).filtered("hann")
     if missing is not None:
         d = d + missing
     d = ndi.uniform_filter1d(d, min(3, d.shape[2]), axis=2, mode="nearest")
