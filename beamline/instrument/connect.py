@@ -191,7 +191,8 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer. The devices that are already open are closed again.
+        DeviceError: a device does not answer. Before the error is raised, the devices that were opened are closed
+        again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

@@ -109,7 +109,7 @@ class Gaussians:
         return replace(self, **some)
 
     def widened(self, variance: float) -> Gaussians:
-        """The same Gaussians, widened by adding `variance` (mm²) in every direction. Their mass stays the same."""
+        """The same Gaussians, widened by adding `variance` (mm²) in every direction. Each Gaussian keeps its mass."""
         import torch
 
         if variance <= 0:

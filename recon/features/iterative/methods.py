@@ -130,8 +130,8 @@ class AsdPocs(VoxelMethod):
         goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None, it
             is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone
             scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset SIRT.
-            The residuals of SIRT and FDK are similar: 0.085 to 0.12 for SIRT, and 0.075 to 0.11 for FDK (a box in a
-            box, 20 to 180 projections, 0 and 2 % noise).
+            This residual is similar to the residual of FDK. (A box in a box, 20 to 180 projections, 0 and 2 % noise:
+            0.085 to 0.12 for SIRT, 0.075 to 0.11 for FDK.)
     """
 
     name: ClassVar[str] = "asd-pocs"

@@ -80,10 +80,10 @@ def fit_materials(
 
     U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
     projections). The densities are V S⁻¹ z. U has orthonormal columns. Therefore all components z_k have the same
-    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as an iteration
-    with the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`. After
-    each step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE TMI 33, 1614, also fit materials to spectra in
-    one step.)
+    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as it would for
+    the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`. After each
+    step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE TMI 33, 1614, also fit materials to spectra in one
+    step.)
     Memory: seven volumes per material, three times the projections.
 
     Args:
