@@ -197,8 +197,8 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
     if geometry.climbs:  # few projections see the slices in between
-        rows_of_slices = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
-        first = int(np.convolve(mass * seen_by(geometry, rows_of_slices).sum(axis=0), np.ones(n), "valid").argmax())
+        at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
+        first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
     rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
@@ -210,20 +210,20 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
     if seen.weights is not None:
         unseen = unseen | (seen.weights[:, rows] == 0)
     lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, like the model
-    residual = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
-    residual = residual - projector.forward(part.data)
-    residual[unseen] = 0
-    residual -= ring_offsets(residual, views)
-    residual[unseen] = 0
+    left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = left - projector.forward(part.data)
+    left[unseen] = 0
+    left -= ring_offsets(left, views)
+    left[unseen] = 0
 
-    signs = np.where(np.arange(len(residual)) % 2, np.float32(1), np.float32(-1))
+    signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
     kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
-    first_kind, *flipped = _fbp_of_each(residual, kinds, views, box)
-    detail, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
+    first_kind, *flipped = _fbp_of_each(left, kinds, views, box)
+    found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
-    significance = np.divide(detail, noise, out=np.zeros_like(detail), where=noise > 0)
+    significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
     return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGNIFICANT)), first, significance)
 
 

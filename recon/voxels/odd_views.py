@@ -77,7 +77,7 @@ def odd_views(
         return ()
     order = np.argsort(views.geometry.angles, kind="stable")
     differences, edges = (each[order] for each in _differences(volume, views, side, progress))
-    flagged = []
+    found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
         neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
@@ -90,8 +90,8 @@ def odd_views(
             parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
             region = np.nonzero(parts == parts[worst])
             spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in region]
-            flagged.append(OddView(int(order[place]), peak, spans[0], spans[1]))
-    return tuple(sorted(flagged, key=lambda odd: odd.view))
+            found.append(OddView(int(order[place]), peak, spans[0], spans[1]))
+    return tuple(sorted(found, key=lambda odd: odd.view))
 
 
 def odd_views_memory(geometry: Geometry) -> int:

@@ -63,8 +63,8 @@ def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: Vie
     """[view] root mean square of the residuals (see `squares_left`), for projections with a measured ray; [inf] if no
     projection has one.
     """
-    squares, _, rays = squares_left(model, views, weight, resolution)
-    return np.sqrt(squares[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
+    left, _, rays = squares_left(model, views, weight, resolution)
+    return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
@@ -75,9 +75,9 @@ def residuals_of(volume: Volume, views: Views) -> F64:
     return unseen_residuals(model, projection_lines(views.data), weights, projector.resolution)
 
 
-def _summed(residual: F32, views: F32, counts: Mask) -> SquaresLeft:
+def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
     sums = [[np.square(view[counted], dtype=np.float64).sum() for view, counted in zip(images, counts, strict=True)]
-            for images in (residual, views)]  # fmt: skip
+            for images in (left, views)]  # fmt: skip
     return SquaresLeft(np.array(sums[0]), np.array(sums[1]), counts.sum(axis=(1, 2), dtype=np.float64))
 
 
@@ -103,7 +103,7 @@ def left_by_volume(
     some, grid = spread(np.arange(views.geometry.n_views), most), volume.grid
     _, y, x = grid.coordinates()
     inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
-    uniform = [Volume(np.broadcast_to(np.float32(density), grid.shape), grid) for density in (inside, True)]
+    uniform = [Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True)]
     volumes = [volume, *uniform] if beside_uniform else [volume]
     bands = _bands(views, some, grid)
     # Without bands of rows, groups of projections save memory.

@@ -124,13 +124,11 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     others = [("total variation of the same kind without it", trial.in_line_integrals(alone.residuals))]
     others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
     own = trial.in_line_integrals(best.residuals)
-    residuals_in_words = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"
+    told = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"
     for name, residuals in others:
-        residuals_in_words += f", by {name} {residuals.mean():#.4g}"
+        told += f", by {name} {residuals.mean():#.4g}"
         if not significantly_better(own, residuals, LEAST_GAIN):
-            return ReferenceVerdict(
-                False, f"it does not predict held-out projections better than {name} ({residuals_in_words})"
-            )
+            return ReferenceVerdict(False, f"it does not predict held-out projections better than {name} ({told})")
     if (where := _better_displaced(trial, fit)) is not None:
         return ReferenceVerdict(
             False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}"
@@ -141,7 +139,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
     mm = [(edge * each).ravel().tolist() for each in (about_all, bent.mean(-1, keepdims=True))]
-    return ReferenceVerdict(True, residuals_in_words, of_scan, mm[0], mm[1], gains)
+    return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 
 def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:

@@ -83,11 +83,9 @@ class FromReference(Method):
         verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials, in_slabs)))
         if verdict.used:
             return self._from_reference(verdict, problem, control)
-        result = self.otherwise.run_chosen(choice, problem, control)
-        settings = {**result.settings, "reference_used": False, "reference_because": verdict.because}
-        return replace(
-            result, settings=settings, chosen=f"The reference was not used: {verdict.because}. {result.chosen}"
-        )
+        made = self.otherwise.run_chosen(choice, problem, control)
+        settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
+        return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
     def _asked(self, choice: TrialChoice, trials: list[Trial | None], in_slabs: bool) -> ReferenceVerdict:
         trial = trials[0] if trials else None
