@@ -56,7 +56,7 @@ def _exchanged(scan: ScanEvidence) -> str:
     )
     others = ""
     if scan.source.format == "data_exchange":
-        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{path}" for name, path in _EXCHANGE)
+        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
     say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
     return "" if data is None else say
