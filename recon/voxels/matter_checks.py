@@ -198,7 +198,7 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Check[
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
-    if geometry.climbs:  # few projections see the slices in between
+    if geometry.climbs:  # few projections see the slices between the ends
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
         first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
     rows, _, box = part_of(geometry, volume.grid, slice(first, first + n))
@@ -217,7 +217,9 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Check[
 def _structure(
     shown: Views, model: F32, part: Volume, first: int, matter: Mask, rng: np.random.Generator
 ) -> Unexplained:
-    """See `unexplained`; the part starts at slice `first`, and `model` is its projection [view, row, col]."""
+    """Compute the result of `unexplained` for the slices from `first` on, whose projection is `model` [view, row,
+    col].
+    """
     geometry, box = shown.geometry, part.grid
     unseen = np.broadcast_to(~seen_rays(geometry, box), model.shape)
     if shown.weights is not None:

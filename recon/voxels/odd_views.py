@@ -85,7 +85,7 @@ def odd_views(grid: Grid, views: Views) -> Check[tuple[OddView, ...]]:
 
 
 def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
-    """The odd projections, by `_differences` of all."""
+    """The odd projections, found in the `_differences` of all projections."""
     n, order, found = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
     differences, edges = differences[order], edges[order]
     for place in range(n):
@@ -108,7 +108,7 @@ def odd_views_memory(geometry: Geometry) -> int:
     """Approximate memory of `odd_views` in bytes, without projections and volume."""
     views, (rows, cols) = geometry.n_views, geometry.detector_shape
     side, height = _side(geometry), min(_band(geometry), rows)
-    # two bands with their surroundings wait for rows, and the rows that both need are computed and copied
+    # while two bands wait for rows, the rows that both need are computed and copied
     band = (height + 2 * _BLUR) * cols * (cols + 4 * views + 8 * _TOGETHER)
     return 4 * (band + 7 * views * (rows // side) * (cols // side))
 
@@ -129,10 +129,9 @@ def _sharp(models: F32) -> F32:
 
 
 class _Cells(NamedTuple):
-    """Means over cells [view, cell, cell], weighted with the square root of the intensity, 0 in unknown pixels.
-
-    The difference of the projections from the volume, the part of it that edges explain, the known pixels, the
-    projection, the weight, and the difference without weight.
+    """Means over cells [view, cell, cell]. Pixels are weighted with the square root of the intensity; unknown pixels
+    have the weight 0. The means are: the difference of the projections from the volume, the part of the difference that
+    edges explain, the known pixels, the projection, the weight, and the difference without weight.
     """
 
     difference: F32
@@ -144,7 +143,9 @@ class _Cells(NamedTuple):
 
 
 def _fill(cells: _Cells, whole: Views, some: I64, own: slice, around: slice, lines: F32) -> None:
-    """The cells of some projections in their own rows, from the volume's projection in the rows around these."""
+    """Compute the cells of some projections in the rows `own`, from the projection of the volume in these and the
+    neighbouring rows (`around`).
+    """
     side, rows = _side(whole.geometry), slice(own.start - around.start, own.stop - around.start)
     for first in range(0, some.size, _TOGETHER):
         views = slice(int(some[0]) + first, int(some[0]) + min(first + _TOGETHER, some.size))

@@ -84,7 +84,7 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
 
 
 class _Compared(NamedTuple):
-    """Rays of some projections that are compared together, and the voxels that explain them."""
+    """Rays of some projections that are compared together, and the voxels through which they pass."""
 
     geometry: Geometry
     grid: Grid
@@ -117,13 +117,13 @@ def residual(grid: Grid, views: Views, most: int) -> Check[tuple[SquaresLeft, fl
 def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
     """The residual along rows of a volume of uniform density, in the projections that `residual` compares.
 
-    A residual along rows is that of the differences of rays from the mean of their row. The means are left out, because
-    they also contain material outside the field of view, which a correct volume does not contain. The uniform volume is
-    a box or a cylinder that fills the slices, with the best density; the smaller residual counts. A volume with a
-    larger residual shows nothing of the sample yet.
+    A residual along rows is computed after the mean of each row is subtracted, because the mean also contains material
+    outside the field of view, which a correct volume does not contain. The uniform volume is a box or a cylinder that
+    fills the slices, with the best density; the smaller of the two residuals counts. A volume with a larger residual
+    does not show the sample yet.
 
     Returns:
-        The residual, 0 if the rays do not differ from the mean of their row; and the number of projected rays.
+        The residual (0 if the rays do not differ from the mean of their row), and the number of projected rays.
     """
     _, y, x = grid.coordinates()
     inside = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
@@ -153,7 +153,9 @@ def _compared(grid: Grid, views: Views, most: int) -> Iterator[_Compared]:
 
 
 def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:
-    """The measured lines [view, col, row], which of them count, and the lines at the resolution of voxels."""
+    """The measured lines [view, col, row], a mask of the lines that count, and the lines at the resolution of
+    voxels.
+    """
     lines = views.data[part.views, part.rows].swapaxes(1, 2)
     counts = np.isfinite(lines)
     if views.weights is not None:
