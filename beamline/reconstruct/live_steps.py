@@ -164,7 +164,8 @@ def fed(live: LiveScan, state: Feeds, file: Cursor) -> tuple[Feeds, Cursor]:
 
 def _in_part(live: LiveScan, state: Feeds, part: int) -> Feeds:
     """Begin a later part of the file, whose projections are corrected with their own references. The last projection of
-    the part before waited for the next projection. Now the fit takes it, and uses all projections again.
+    the part before waited for the next projection. Now its correction becomes final, and the fit learns all projections
+    again.
     """
     state = settled(live, replace(state, part=part))
     if state.batches:
